@@ -1,0 +1,46 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Errors that a user can mend; each message says what was found, expected and what to do."""
+
+
+class AccelCalibError(Exception):
+    """
+    Something the user gave cannot be used.
+
+    Parameters
+    ----------
+    message : str
+        One line: what was found and what was expected.
+    advice : str
+        One line: what to do.
+
+    """
+
+    def __init__(self, message: str, advice: str) -> None:
+        super().__init__(f'{message}; {advice}')
+        self.message = message
+        self.advice = advice
+
+
+class InputError(AccelCalibError):
+    """A file, a column or a number cannot be read as what it should be."""
+
+
+class RefusedFitError(AccelCalibError):
+    """The poses cannot carry the fit that was asked for."""
+
+
+class StoredCalibrationError(AccelCalibError):
+    """A stored calibration is damaged, newer than this package, or not of this sensor."""

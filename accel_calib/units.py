@@ -1,0 +1,80 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Units of readings, converted to g at the edge of the package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import get_args, Literal, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .table import Floats
+
+UnitName = Literal['m/s2', 'g', 'native']
+UNIT_NAMES: tuple[str, ...] = get_args(UnitName)
+
+STANDARD_GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s²], ISO 80000-3."""
+
+MG = 1e3
+"""Milli-g in one g."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """
+    The unit of a sensor's readings.
+
+    Parameters
+    ----------
+    name : {'m/s2', 'g', 'native'}
+        Native is whatever the sensor gives: counts, volts.
+    per_g : float
+        Readings in this unit that make 1 g of local gravity: the local gravity [m/s²] for
+        ``m/s2``, 1 for ``g``, and for ``native`` the sensitivity, found by the fit.
+
+    """
+
+    name: UnitName
+    per_g: float
+
+    def __post_init__(self) -> None:
+        if self.name not in UNIT_NAMES:
+            raise ValueError(f'unit {self.name!r} is none of {UNIT_NAMES}')
+        if not self.per_g > 0.0:
+            raise ValueError(f'per_g is {self.per_g}, expected a positive number')
+
+    def to_g(self, reading: Floats) -> Floats:
+        """Give readings of this unit in g."""
+        return reading / self.per_g
+
+    def from_g(self, reading_g: Floats) -> Floats:
+        """Give readings in g in this unit."""
+        return reading_g * self.per_g
+
+
+def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:
+    """
+    Give the unit of that name, with the sensitivity of native units still open (1).
+
+    Parameters
+    ----------
+    name : {'m/s2', 'g', 'native'}
+        The unit.
+    gravity : float
+        Local gravity [m/s²], used by ``m/s2``.
+
+    """
+    return Units(name, gravity if name == 'm/s2' else 1.0)
