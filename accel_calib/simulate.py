@@ -1,0 +1,234 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Seeded poses and recordings from a model: the forward equation with noise.
+
+All readings are in g; `accel_calib.units` takes them to another unit. Directions are unit
+vectors of specific force in the levelled frame: the direction that points up.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .effects import Context, EFFECTS
+from .errors import InputError
+from .model import Model, predict
+from .table import Floats, numbered, Poses, Recording
+
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def spread_directions(count: int) -> Floats:
+    """
+    Spread directions evenly over the sphere (Fibonacci lattice).
+
+    Returns
+    -------
+    (count, 3) array
+        Unit vectors.
+
+    """
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    radius, angle = np.sqrt(1.0 - z ** 2), _GOLDEN_ANGLE * np.arange(count)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Floats:
+    """
+    Draw directions evenly over the sphere.
+
+    Returns
+    -------
+    (count, 3) array
+        Unit vectors.
+
+    """
+    drawn = rng.normal(size=(count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def parse_effect(text: str) -> tuple[str, Floats]:
+    """
+    Read ``NAME=VALUE,…``, values in the unit that the catalogue gives for the effect.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``offset=0.01,-0.02,0.03`` or ``quadratic=0.002``: one value serves all axes.
+
+    Returns
+    -------
+    str, (p,) array
+        Name of the effect and its values.
+
+    Raises
+    ------
+    InputError
+        If the name is not in the catalogue, or the values are not that many finite numbers.
+
+    """
+    name, equals, values_text = text.partition('=')
+    if name not in EFFECTS or not equals:
+        raise InputError(f'effect {text!r} is not NAME=VALUE,… with a NAME of the catalogue',
+                         f'use one of {", ".join(EFFECTS)}')
+    parameters = EFFECTS[name].parameters
+    try:
+        values = np.array([float(part) for part in values_text.split(',')])
+    except ValueError:
+        values = np.array([np.nan])
+    if not np.all(np.isfinite(values)) or len(values) not in (1, len(parameters)):
+        raise InputError(f'effect {name} has values {values_text!r}, expected 1 or '
+                         f'{len(parameters)} numbers ({", ".join(parameters)}) in '
+                         f'{EFFECTS[name].unit}',
+                         f'write {name}={",".join(["0.001"] * len(parameters))}, for instance')
+    return name, np.broadcast_to(values, len(parameters)).copy()
+
+
+def model_with(effects: Mapping[str, Floats], rotation: Floats | None = None) -> Model:
+    """Make the model with these effects, in the order of the catalogue."""
+    ordered = {name: effects[name] for name in EFFECTS if name in effects}
+    return Model(ordered, np.eye(3) if rotation is None else rotation)
+
+
+def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *,
+                   noise_g: float = 0.003, samples: int = 100,
+                   context: Context | None = None) -> Poses:
+    """
+    Simulate averaged still poses.
+
+    Parameters
+    ----------
+    model : Model
+        The sensor.
+    directions : (n, 3) array
+        Specific force [g], unit vectors at rest.
+    rng : numpy.random.Generator
+        Source of the noise.
+    noise_g : float
+        Standard deviation of a sample [g].
+    samples : int
+        Independent samples a pose.
+    context : mapping of str to array, optional
+        What the effects need, n rows each.
+
+    Returns
+    -------
+    Poses
+        In g, with std, count and context.
+
+    """
+    known = {'std': np.full_like(directions, noise_g), **(context or {})}
+    reading = predict(model, directions, known)
+    reading = reading + rng.normal(size=reading.shape) * noise_g / np.sqrt(samples)
+    columns = {**known, 'reading': reading, 'count': np.full(len(directions), float(samples))}
+    return Poses(columns, numbered(columns))
+
+
+def _between(start: Floats, end: Floats) -> Floats:
+    """Give the unit vector, normal to start, along which the arc to `end` sets out."""
+    normal = end - start * (start @ end)
+    if np.linalg.norm(normal) < 1e-9:
+        normal = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+    return normal / np.linalg.norm(normal)
+
+
+def _turn(start: Floats, end: Floats, seconds: float, count: int) -> tuple[Floats, Floats]:
+    """Turn along the shortest arc, at rest at both ends: force and angular rate, (count, 3)."""
+    tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
+    share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
+    speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
+    along = _between(start, end)
+    arc = np.arctan2(np.linalg.norm(np.cross(start, end)), start @ end)
+    force = np.cos(arc * share) * start + np.sin(arc * share) * along
+    # The direction of up turns against the body: df/dt = -ω × f.
+    change = arc * speed * (np.cos(arc * share) * along - np.sin(arc * share) * start)
+    return force, np.cross(change, force)
+
+
+def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple[Floats, Floats]:
+    """
+    Rest in each direction and turn smoothly to the next.
+
+    Parameters
+    ----------
+    directions : (n, 3) array
+        Unit vectors.
+    rate_hz : float
+        Samples a second.
+    dwell, turn : float
+        Seconds of each rest and of each turn.
+
+    Returns
+    -------
+    (m, 3) array, (m, 3) array
+        Specific force [g] and angular rate [rad/s] of each sample, both in the levelled frame.
+
+    """
+    resting, turning = max(1, round(dwell * rate_hz)), max(1, round(turn * rate_hz))
+    forces: list[Floats] = []
+    rates: list[Floats] = []
+    for k, direction in enumerate(directions):
+        if k:
+            force, rate = _turn(directions[k - 1], direction, turn, turning)
+            forces.append(force)
+            rates.append(rate)
+        forces.append(np.tile(direction, (resting, 1)))
+        rates.append(np.zeros((resting, 3)))
+    return np.concatenate(forces), np.concatenate(rates)
+
+
+def simulate_recording(model: Model, directions: Floats, rng: np.random.Generator, *,
+                       noise_g: float = 0.003, rate_hz: float = 100.0, dwell: float = 3.0,
+                       turn: float = 1.0, gyro_noise: float = 0.002,
+                       temperatures: Sequence[float] = ()) -> Recording:
+    """
+    Simulate a sensor that is turned through poses.
+
+    Parameters
+    ----------
+    model : Model
+        The sensor.
+    directions : (n, 3) array
+        Where up is in each pose, unit vectors in the levelled frame.
+    rng : numpy.random.Generator
+        Source of the noise.
+    noise_g, gyro_noise : float
+        Standard deviation of a sample [g], [rad/s].
+    rate_hz, dwell, turn : float
+        As `path`.
+    temperatures : sequence of float
+        First and last temperature [°C]; between them it changes in proportion to time.
+
+    Returns
+    -------
+    Recording
+        In g, with angular rate and the true force as reference.
+
+    """
+    force, rate = path(directions, rate_hz, dwell, turn)
+    count = len(force)
+    columns = {'time': np.arange(count) / rate_hz, 'reference': force,
+               'std': np.full((count, 3), noise_g)}
+    if temperatures:
+        columns['temperature'] = np.linspace(temperatures[0], temperatures[-1], count)
+    reading = predict(model, force, columns)
+    del columns['std']
+    columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
+    columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise
+    return Recording(columns, numbered(columns))
