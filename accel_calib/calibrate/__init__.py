@@ -1,0 +1,46 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses to calibration: closed forms, maximum likelihood, mounting, and the record of it."""
+
+from .calibration import Calibration, level, Quality, Rejected
+from .fit import check_units, directions_of, fit_poses, METHODS, MODEL_NAMES
+from .geometry import coverage, next_pose, NextPose
+from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
+from .quality import in_g, Verification, verify
+from .sensing_axes import sensing_axes, SensingAxes
+
+__all__ = [
+           'FRAMES',
+           'METHODS',
+           'MODEL_NAMES',
+           'Calibration',
+           'FrameName',
+           'NextPose',
+           'Quality',
+           'Rejected',
+           'SensingAxes',
+           'Verification',
+           'check_units',
+           'coverage',
+           'directions_of',
+           'fit_poses',
+           'in_g',
+           'level',
+           'mounting',
+           'mounting_with_heading',
+           'next_pose',
+           'sensing_axes',
+           'verify',
+]

@@ -1,0 +1,242 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Closed forms: the documents' own costs, without iteration and without weights.
+
+Poses of unknown orientation obey |W⁻¹ (reading - V)| = 1, a quadric in the reading (NXP AN5286):
+
+    readingᵀ A reading - 2 readingᵀ A V + VᵀA V - B² = 0,   W⁻¹ = (A / B²)^(1/2)
+
+The 4-parameter model (A = I) is linear least squares; 7 (A diagonal) and 10 (A symmetric) take
+the eigenvector of XᵀX with the smallest eigenvalue, where a row of X holds the monomials of a
+reading. That cost depends on origin and scale, so the readings are first shifted and scaled by
+the 4-parameter result: then counts and volts give what m/s² give, without a loss of digits.
+
+Poses of known orientation obey reading = X force + y, linear in X and y (ESGI'95 report, 3).
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import RefusedFitError
+from ..table import Floats
+
+_FACE_COSINE = np.cos(np.radians(20.0))
+"""A reading within 20° of an axis of the sensor is one of the six faces."""
+
+_TURN_MORE = 'take poses with each side of the sensor up and down, and some edges'
+
+
+def fit_4(reading: Floats) -> tuple[Floats, Floats]:
+    """
+    Fit offset and one gain (AN5286 eq. 10-14).
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Readings in any unit, n >= 4.
+
+    Returns
+    -------
+    (3, 3) array, (3,) array
+        W, in the unit of the readings per g, and V.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses lie on no sphere.
+
+    """
+    centre = reading.mean(axis=0)
+    scale = np.sqrt(np.mean((reading - centre) ** 2)) or 1.0
+    r = (reading - centre) / scale
+    # |r|² = 2 V·r + (W² - |V|²)
+    beta = np.linalg.lstsq(np.column_stack([2.0 * r, np.ones(len(r))]), np.sum(r ** 2, axis=1),
+                           rcond=None)[0]
+    gain_squared = beta[3] + beta[:3] @ beta[:3]
+    if not gain_squared > 0.0:
+        raise RefusedFitError('the poses lie on no sphere', _TURN_MORE)
+    return np.sqrt(gain_squared) * scale * np.eye(3), centre + beta[:3] * scale
+
+
+def fit_7(reading: Floats) -> tuple[Floats, Floats]:
+    """
+    Fit offset and a gain for each axis (AN5286 eq. 24-30).
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Readings in any unit, n >= 6.
+
+    Returns
+    -------
+    (3, 3) array, (3,) array
+        W, diagonal, in the unit of the readings per g, and V.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses lie on no ellipsoid.
+
+    """
+    return _fit_quadric(reading, [(0, 0), (1, 1), (2, 2)])
+
+
+def fit_10(reading: Floats) -> tuple[Floats, Floats]:
+    """
+    Fit offset and symmetric gain (AN5286 eq. 40-46).
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Readings in any unit, n >= 9.
+
+    Returns
+    -------
+    (3, 3) array, (3,) array
+        W, symmetric, in the unit of the readings per g, and V.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses lie on no ellipsoid.
+
+    """
+    return _fit_quadric(reading, [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
+
+
+def _fit_quadric(reading: Floats, terms: list[tuple[int, int]]) -> tuple[Floats, Floats]:
+    """Fit the quadric whose matrix A has these entries; others are zero."""
+    mat_scale, centre = fit_4(reading)
+    r = (reading - centre) / mat_scale[0, 0]
+    monomials = [r[:, i] * r[:, j] * (1.0 if i == j else 2.0) for i, j in terms]
+    mat_x = np.column_stack([*monomials, r, np.ones(len(r))])
+    beta = np.linalg.eigh(mat_x.T @ mat_x)[1][:, 0]
+    mat_a = np.zeros((3, 3))
+    for value, (i, j) in zip(beta, terms, strict=False):
+        mat_a[i, j] = mat_a[j, i] = value
+    if np.linalg.det(mat_a) < 0.0:  # AN5286: negate the whole vector
+        beta, mat_a = -beta, -mat_a
+    if np.min(np.linalg.eigvalsh(mat_a)) <= 0.0:
+        raise RefusedFitError('the poses lie on no ellipsoid', _TURN_MORE)
+    offset = -np.linalg.solve(mat_a, beta[len(terms):-1]) / 2.0
+    field_squared = offset @ mat_a @ offset - beta[-1]  # B²
+    if not field_squared > 0.0:
+        raise RefusedFitError('the poses lie on no ellipsoid', _TURN_MORE)
+    values, vectors = np.linalg.eigh(mat_a / field_squared)
+    mat_w = (vectors / np.sqrt(values)) @ vectors.T
+    return mat_w * mat_scale[0, 0], centre + offset * mat_scale[0, 0]
+
+
+def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
+    """
+    Fit m = X a + y to poses of known orientation (ESGI'95 report, section 3).
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Readings m in any unit.
+    reference : (n, 3) array
+        True specific force a.
+
+    Returns
+    -------
+    (3, 3) array, (3,) array
+        X and y.
+
+    Raises
+    ------
+    RefusedFitError
+        If the known forces all lie in a plane.
+
+    """
+    design = np.column_stack([reference, np.ones(len(reference))])
+    solution, _, rank, _ = np.linalg.lstsq(design, reading, rcond=1e-6)
+    if rank < 4:
+        raise RefusedFitError(f'the {len(reading)} known orientations lie in a plane', _TURN_MORE)
+    return solution[:3].T, solution[3]
+
+
+def faces(reading: Floats) -> Floats | None:
+    """
+    Tell which face is up in each pose, where all six faces are there and nothing else is.
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Readings in any unit.
+
+    Returns
+    -------
+    (n, 3) array or None
+        Unit vectors along the axes; None if the poses are not the six faces.
+
+    """
+    centre = (reading.max(axis=0) + reading.min(axis=0)) / 2.0
+    r = reading - centre
+    axis = np.argmax(np.abs(r), axis=1)
+    along = np.take_along_axis(r, axis[:, np.newaxis], axis=1)[:, 0]
+    reference = np.eye(3)[axis] * np.sign(along)[:, np.newaxis]
+    aligned = np.all(np.abs(along) >= _FACE_COSINE * np.linalg.norm(r, axis=1))
+    return reference if aligned and len(np.unique(reference, axis=0)) == 6 else None
+
+
+def fit_six_faces(faces_up: Floats, faces_down: Floats, gravity: float = 1.0
+                  ) -> tuple[Floats, Floats]:
+    """
+    Give X and y of m = X a + y from the six faces (ESGI'95 report, section 3).
+
+    Parameters
+    ----------
+    faces_up, faces_down : (3, 3) array
+        Row i: the reading with axis i up, and down.
+    gravity : float
+        Local gravity in the unit in which forces are meant.
+
+    Returns
+    -------
+    (3, 3) array, (3,) array
+        X and y.
+
+    """
+    mat_x = (faces_up - faces_down).T / (2.0 * gravity)
+    return mat_x, (faces_up + faces_down).mean(axis=0) / 2.0
+
+
+def two_position(reading_up: Floats | float, reading_down: Floats | float
+                 ) -> tuple[Floats | float, Floats | float]:
+    """
+    Calibrate an axis from +1 g and -1 g, in native units (Intan RHD2000 note).
+
+    Parameters
+    ----------
+    reading_up, reading_down : float or array
+        Readings with the axis up and down, in V or counts.
+
+    Returns
+    -------
+    float or array, float or array
+        Sensitivity per g and zero-g offset, in the unit of the readings.
+
+    Examples
+    --------
+    >>> sensitivity, offset = two_position(2.1218, 1.4282)
+    >>> round(sensitivity, 4), round(offset, 4)
+    (0.3468, 1.775)
+
+    """
+    return (reading_up - reading_down) / 2.0, (reading_up + reading_down) / 2.0

@@ -1,0 +1,190 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How well a calibration does: on the poses it was fitted to, and on poses it has not seen.
+
+The error of a pose is |force| - 1 g; of a pose of known orientation under model 12, which knows
+the axes, it is the length of the vector error. The gap is its RMS over the poses.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .calibration import Calibration, Quality
+from .geometry import coverage
+from .likelihood import believable, Fit, norm_rows
+from ..model import correct, sensor_force
+from ..table import Floats, Poses
+from ..units import MG, Units
+
+
+@dataclass(frozen=True)
+class Verification:
+    """
+    How well a calibration does on poses it has not seen; fields as `Quality`.
+
+    Parameters
+    ----------
+    rms_before_mg, rms_after_mg : float
+        Gap without and with the calibration [mg].
+    max_before_percent, max_after_percent : float
+        Largest error without and with the calibration [% of 1 g].
+    noise_floor_mg : float or None
+        Gap that the noise of the pose means alone would leave [mg]; None where it is not known.
+
+    """
+
+    rms_before_mg: float
+    rms_after_mg: float
+    max_before_percent: float
+    max_after_percent: float
+    noise_floor_mg: float | None
+
+
+def in_g(poses: Poses, units: Units) -> Poses:
+    """Give the same poses with readings, std and reference in g (native references are)."""
+    scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
+    if 'reference' in poses and units.name != 'native':
+        scaled['reference'] = units.to_g(poses['reference'])
+    return poses.with_columns(**scaled)
+
+
+def verify(calibration: Calibration, poses: Poses) -> Verification:
+    """
+    Say how well a calibration does on these poses.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    poses : Poses
+        In the unit of its readings.
+
+    Returns
+    -------
+    Verification
+        Gaps before and after.
+
+    """
+    poses_g = in_g(poses, calibration.units)
+    vectors = calibration.name == '12' and 'reference' in poses
+    before = _before(poses_g, calibration.units, vectors=vectors)
+    model = calibration.model
+    if vectors:
+        after = np.linalg.norm(correct(model, poses_g.reading, poses_g.columns)
+                               - poses_g['reference'], axis=1)
+    else:
+        after = _norm_errors(sensor_force(model, poses_g.reading, poses_g.columns))
+    return Verification(_rms_mg(before), _rms_mg(after), _largest_percent(before),
+                        _largest_percent(after), _noise_floor_mg(calibration, poses_g, vectors))
+
+
+def _noise_floor_mg(calibration: Calibration, poses_g: Poses, vectors: bool) -> float | None:
+    """Give the gap that the noise of the pose means alone would leave [mg]."""
+    noise = None if poses_g.noise is None else believable(poses_g.noise)
+    if noise is None:
+        return None
+    if vectors:
+        inverse = np.linalg.inv(calibration.model.linear_part[0])
+        return _rms_mg(np.sqrt(np.sum(noise ** 2 @ (inverse ** 2).T, axis=1)))
+    u = sensor_force(calibration.model, poses_g.reading, poses_g.columns)
+    rows = norm_rows(calibration.model, u, poses_g.columns)
+    return _rms_mg(np.linalg.norm(rows * noise, axis=1))
+
+
+def quality_of(fit: Fit, poses_g: Poses, units: Units, directions: Floats) -> Quality:
+    """
+    Say how well a fit does.
+
+    Parameters
+    ----------
+    fit : Fit
+        To these poses; with three residuals a pose where their orientations are known.
+    poses_g : Poses
+        The poses, in g.
+    units : Units
+        Unit of the sensor's readings.
+    directions : (n, 3) array
+        Where up is in each pose, unit vectors.
+
+    """
+    count = len(poses_g)
+    before = _before(poses_g, units, vectors=len(fit.residual) > count)
+    errors = _by_pose(fit.residual, count)
+    held_out = _held_out(fit, count)
+    floor = None
+    if fit.noise_known:
+        left = fit.sigma * np.sqrt(np.maximum(1.0 - fit.leverage, 0.0))
+        floor = _rms_mg(_by_pose(left, count))
+    return Quality(_rms_mg(before), _rms_mg(errors), _largest_percent(before),
+                   _largest_percent(errors),
+                   None if np.any(np.isnan(held_out)) else _rms_mg(held_out), floor,
+                   fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
+                   coverage(directions))
+
+
+def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
+    """
+    Give the errors without a calibration, (n,) in g.
+
+    Native readings mean nothing without one; they are seen from the middle of their range.
+
+    """
+    reading = poses_g.reading
+    if units.name == 'native':
+        reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
+    if vectors:
+        return np.linalg.norm(reading - poses_g['reference'], axis=1)
+    return _norm_errors(reading)
+
+
+def _norm_errors(force: Floats) -> Floats:
+    """Give |force| - 1 of each row."""
+    errors: Floats = np.linalg.norm(force, axis=1) - 1.0
+    return errors
+
+
+def _by_pose(residual: Floats, count: int) -> Floats:
+    """Give the size of each pose's residual, (count,), from one or three numbers a pose."""
+    return np.linalg.norm(residual.reshape(count, -1), axis=1)
+
+
+def _held_out(fit: Fit, count: int) -> Floats:
+    """
+    Give the size of each pose's error when it is left out of the fit, (count,) [g].
+
+    With H the hat matrix the error of a pose is (I - H_ii)⁻¹ times its residual (PRESS, Allen
+    1974); NaN where the pose alone determines a parameter.
+
+    """
+    orthonormal = np.linalg.qr(fit.jacobian)[0].reshape(count, -1, fit.jacobian.shape[1])
+    own = np.eye(orthonormal.shape[1]) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
+    if np.any(np.linalg.svd(own, compute_uv=False) < 1e-9):
+        return np.full(count, np.nan)
+    weighted = fit.weighted.reshape(count, -1, 1)
+    left_out = np.linalg.solve(own, weighted)[:, :, 0] * fit.sigma.reshape(count, -1)
+    return np.linalg.norm(left_out, axis=1)
+
+
+def _rms_mg(errors_g: Floats) -> float:
+    return float(np.sqrt(np.mean(errors_g ** 2))) * MG
+
+
+def _largest_percent(errors_g: Floats) -> float:
+    return float(np.max(np.abs(errors_g))) * 100.0
