@@ -49,6 +49,7 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 _LARGEST_ITERATIONS = 100
 _CONVERGED_G = 1e-13
+_LARGEST_FORCE_G = 1e6
 
 
 def _identity() -> Floats:
@@ -226,6 +227,8 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     linear = u
     for _ in range(_LARGEST_ITERATIONS):
         before = u
+        if np.max(np.abs(u), initial=0.0) > _LARGEST_FORCE_G:
+            break
         u = linear - model._added(u, context, linear=False) @ model._inverse_gain.T
         if np.max(np.abs(u - before), initial=0.0) < _CONVERGED_G:
             return u

@@ -125,13 +125,16 @@ def quality_of(fit: Fit, poses_g: Poses, units: Units, directions: Floats) -> Qu
 
     """
     count = len(poses_g)
-    before = _before(poses_g, units, vectors=len(fit.residual) > count)
-    errors = _by_pose(fit.residual, count)
-    held_out = _held_out(fit, count)
+    vectors = len(fit.residual) > count
+    before = _before(poses_g, units, vectors=vectors)
+    # Residuals of known orientation are differences of readings; W⁻¹ makes them forces.
+    to_force = np.linalg.inv(fit.model.linear_part[0]) if vectors else np.eye(1)
+    errors = np.linalg.norm(fit.residual.reshape(count, -1) @ to_force.T, axis=1)
+    held_out = np.linalg.norm(_held_out(fit, count) @ to_force.T, axis=1)
     floor = None
     if fit.noise_known:
         left = fit.sigma * np.sqrt(np.maximum(1.0 - fit.leverage, 0.0))
-        floor = _rms_mg(_by_pose(left, count))
+        floor = _rms_mg(np.linalg.norm(left.reshape(count, -1), axis=1))
     return Quality(_rms_mg(before), _rms_mg(errors), _largest_percent(before),
                    _largest_percent(errors),
                    None if np.any(np.isnan(held_out)) else _rms_mg(held_out), floor,
@@ -160,14 +163,9 @@ def _norm_errors(force: Floats) -> Floats:
     return errors
 
 
-def _by_pose(residual: Floats, count: int) -> Floats:
-    """Give the size of each pose's residual, (count,), from one or three numbers a pose."""
-    return np.linalg.norm(residual.reshape(count, -1), axis=1)
-
-
 def _held_out(fit: Fit, count: int) -> Floats:
     """
-    Give the size of each pose's error when it is left out of the fit, (count,) [g].
+    Give each pose's residual when it is left out of the fit, (count, 1 or 3) [g].
 
     With H the hat matrix the error of a pose is (I - H_ii)⁻¹ times its residual (PRESS, Allen
     1974); NaN where the pose alone determines a parameter.
@@ -176,10 +174,10 @@ def _held_out(fit: Fit, count: int) -> Floats:
     orthonormal = np.linalg.qr(fit.jacobian)[0].reshape(count, -1, fit.jacobian.shape[1])
     own = np.eye(orthonormal.shape[1]) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
     if np.any(np.linalg.svd(own, compute_uv=False) < 1e-9):
-        return np.full(count, np.nan)
+        return np.full((count, own.shape[1]), np.nan)
     weighted = fit.weighted.reshape(count, -1, 1)
-    left_out = np.linalg.solve(own, weighted)[:, :, 0] * fit.sigma.reshape(count, -1)
-    return np.linalg.norm(left_out, axis=1)
+    left_out: Floats = np.linalg.solve(own, weighted)[:, :, 0] * fit.sigma.reshape(count, -1)
+    return left_out
 
 
 def _rms_mg(errors_g: Floats) -> float:

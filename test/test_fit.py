@@ -1,0 +1,292 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses to calibration: known sensors recovered inside the stated uncertainty, or refused."""
+
+import numpy as np
+import pytest
+
+from accel_calib.calibrate import fit_poses, in_g, level, sensing_axes, verify
+from accel_calib.calibrate.sensing_axes import gain_of, lower_triangular
+from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.model import predict
+from accel_calib.simulate import (random_directions, rotation_from_rpy, simulate_poses,
+                                  spread_directions)
+from accel_calib.table import Poses, numbered
+from accel_calib.units import Units, units_of
+
+from shared import sensor
+
+G = units_of('g')
+
+
+def simulated(seed, count, *effects, **settings):
+    rng = np.random.default_rng(seed)
+    model = sensor(rng, *effects)
+    directions = spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
+    return model, simulate_poses(model, directions, rng, **settings)
+
+
+def in_units(poses, units):
+    return poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
+
+
+@pytest.mark.parametrize(('name', 'effects'), [
+    ('4', ('offset', 'gain')), ('7', ('offset', 'axis_gain')),
+    ('10', ('offset', 'axis_gain', 'cross_axis'))])
+def test_stated_deviations_hold_the_truth(name, effects):
+    pulls = []
+    for seed in range(40):
+        model, poses = simulated(seed, 24, *effects)
+        fit = fit_poses(poses, G, model=name)
+        pulls.append((fit.model.vector - model.vector) / np.sqrt(np.diag(fit.covariance)))
+    assert np.mean(np.abs(pulls) < 1.96) > 0.92
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize('model', ['4', '7', '10'])
+def test_auto_takes_the_model_that_the_sensor_has(model):
+    effects = {'4': ('offset', 'gain'), '7': ('offset', 'axis_gain'),
+               '10': ('offset', 'axis_gain', 'cross_axis')}[model]
+    names = [fit_poses(simulated(seed, 20, *effects)[1], G).name for seed in range(20)]
+    assert names.count(model) >= 17
+
+
+def test_auto_says_why():
+    calibration = fit_poses(simulated(1, 20)[1], G)
+    assert 'model 10 lowers the gap of model 7 from' in calibration.reason
+
+
+@pytest.mark.parametrize('units', [units_of('m/s2'), units_of('m/s2', 9.78), G])
+def test_fit_is_the_same_in_every_unit(units):
+    poses = simulated(2, 20)[1]
+    found, expected = fit_poses(in_units(poses, units), units), fit_poses(poses, G)
+    np.testing.assert_allclose(found.model.vector, expected.model.vector, atol=1e-9)
+    np.testing.assert_allclose(found.offset, units.from_g(expected.offset), atol=1e-8)
+    np.testing.assert_allclose(found.offset_sd, units.from_g(expected.offset_sd), rtol=1e-5)
+    np.testing.assert_allclose(found.gain_sd, expected.gain_sd, rtol=1e-5)
+
+
+def test_native_units_find_their_own_scale():
+    model, poses = simulated(3, 20)
+    counts = Units('native', 4060.0)
+    shifted = in_units(poses, counts)
+    shifted = shifted.with_columns(reading=shifted.reading + 33000.0)
+    calibration = fit_poses(shifted, units_of('native'))
+    true_w, true_v = model.linear_part
+    np.testing.assert_allclose(calibration.gain, true_w * 4060.0, atol=4 * np.max(
+        calibration.gain_sd))
+    np.testing.assert_allclose(calibration.offset, true_v * 4060.0 + 33000.0,
+                               atol=4 * np.max(calibration.offset_sd))
+    force = calibration.correct(shifted.reading)
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), 1.0, atol=2e-3)
+
+
+def test_nine_parameters_are_ten_in_the_sensing_axes():
+    poses = simulated(4, 20)[1]
+    nine, ten = fit_poses(poses, G, model='9'), fit_poses(poses, G, model='10')
+    np.testing.assert_allclose(nine.gain, lower_triangular(ten.gain), atol=1e-7)
+    axes = sensing_axes(ten.gain, ten.offset)
+    np.testing.assert_allclose(gain_of(axes), nine.gain, atol=1e-7)
+    assert np.linalg.matrix_rank(nine.covariance, tol=1e-14) == 9
+
+
+def test_known_orientation_shows_the_rotation_of_the_axes():
+    model, poses = simulated(5, 12, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
+    directions = spread_directions(12)
+    rng = np.random.default_rng(6)
+    poses = simulate_poses(model, directions, rng, context={'reference': directions})
+    calibration = fit_poses(poses, G)
+    assert calibration.name == '12'
+    pull = (calibration.model.vector - model.vector) / np.sqrt(np.diag(calibration.covariance))
+    assert np.max(np.abs(pull)) < 4.0
+
+
+@pytest.mark.parametrize(('count', 'limit_mg'), [(12, 0.33), (36, 0.2)])
+def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
+    found, errors = 0, []
+    for seed in range(20):
+        model, poses = simulated(seed, count)
+        rng = np.random.default_rng(seed)
+        reading = poses.reading.copy()
+        reading[4] *= 1.0 + 0.05 * rng.choice([-1, 1])
+        calibration = fit_poses(poses.with_columns(reading=reading), G, model='10')
+        found += [rejected.row for rejected in calibration.rejected] == [5]
+        fresh = random_directions(300, rng)
+        force = calibration.correct(predict(model, fresh, {}))
+        errors.append(np.std(np.linalg.norm(force, axis=1)) * 1e3)
+    assert found >= 19
+    assert np.median(errors) <= limit_mg
+
+
+def test_clean_poses_are_all_kept():
+    kept = [not fit_poses(simulated(seed, 24)[1], G, model='10').rejected for seed in range(40)]
+    assert sum(kept) >= 38
+
+
+def test_algebraic_keeps_every_row():
+    _, poses = simulated(1, 24)
+    reading = poses.reading.copy()
+    reading[3] *= 1.1
+    calibration = fit_poses(poses.with_columns(reading=reading), G, method='algebraic')
+    assert calibration.rejected == ()
+
+
+def test_noisy_poses_weigh_less():
+    model, poses = simulated(8, 30)
+    rng = np.random.default_rng(8)
+    std = poses['std'].copy()
+    std[::3] *= 30
+    noisy = poses.with_columns(std=std, reading=poses.reading + rng.normal(
+        size=poses.reading.shape) * np.sqrt(np.maximum(std ** 2 - poses['std'] ** 2, 0) / 100))
+    weighted, equal = (fit_poses(p, G, model='10') for p in (noisy, without(noisy, 'std')))
+    truth = model.vector
+    assert (np.linalg.norm(weighted.model.vector - truth)
+            < 0.5 * np.linalg.norm(equal.model.vector - truth))
+
+
+def without(poses, *keys):
+    return Poses({key: poses[key] for key in poses.columns if key not in keys}, poses.row)
+
+
+def test_unknown_noise_is_taken_from_the_residuals():
+    model, poses = simulated(9, 60)
+    known, unknown = fit_poses(poses, G, model='10'), fit_poses(without(poses, 'std'), G,
+                                                               model='10')
+    assert unknown.quality.noise_floor_mg is None
+    np.testing.assert_allclose(unknown.offset_sd, known.offset_sd, rtol=0.4)
+    assert any('uncertainty comes from the residuals' in text for text in unknown.warnings)
+
+
+def test_held_out_gap_is_that_of_fitting_without_the_pose():
+    poses = without(simulated(10, 16)[1], 'std')
+    errors = []
+    for k in range(16):
+        others = fit_poses(poses.take(np.delete(np.arange(16), k)), G, model='7')
+        errors.append(verify(others, poses.take(slice(k, k + 1))).rms_after_mg)
+    held_out = fit_poses(poses, G, model='7').quality.held_out_rms_mg
+    assert held_out == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.02)
+
+
+def test_noise_floor_is_the_gap_of_the_right_model():
+    gaps, floors = [], []
+    for seed in range(30):
+        quality = fit_poses(simulated(seed, 24)[1], G, model='10').quality
+        gaps.append(quality.rms_after_mg ** 2)
+        floors.append(quality.noise_floor_mg ** 2)
+    assert np.sqrt(np.mean(gaps)) == pytest.approx(np.sqrt(np.mean(floors)), rel=0.1)
+
+
+def test_verify_on_fresh_poses_finds_the_noise():
+    model, poses = simulated(11, 36)
+    fresh = simulate_poses(model, random_directions(200, np.random.default_rng(1)),
+                           np.random.default_rng(2))
+    found = verify(fit_poses(poses, G), fresh)
+    assert found.rms_after_mg < 1.2 * found.noise_floor_mg
+    assert found.rms_before_mg > 10.0
+
+
+def cone(degrees, count=12):
+    rng = np.random.default_rng(3)
+    z = rng.uniform(np.cos(np.radians(degrees)), 1.0, count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.column_stack([np.sqrt(1 - z ** 2) * np.cos(angle),
+                            np.sqrt(1 - z ** 2) * np.sin(angle), z])
+
+
+RING = np.column_stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)])
+SAME = np.tile([[0.0, 0.6, 0.8]], (12, 1))
+FIVE = np.repeat(spread_directions(5), 3, axis=0)
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+
+
+@pytest.mark.parametrize(('directions', 'says'), [
+    (cone(45), 'within'), (RING, 'lie in a plane'), (SAME, 'all have the same orientation'),
+    (FIVE, 'point in 5 directions'), (np.repeat(FACES, 2, axis=0), 'point in 6 directions'),
+    (FACES, '6 poses, model 10 needs at least 9'), (SAME[:1], '1 pose, model 10')])
+@pytest.mark.parametrize('units', ['g', 'm/s2'])
+def test_poses_that_cannot_carry_the_model_are_refused_with_the_way_to_turn(directions, says,
+                                                                           units):
+    rng = np.random.default_rng(12)
+    poses = in_units(simulate_poses(sensor(rng), directions, rng), units_of(units))
+    with pytest.raises(RefusedFitError, match=says) as refusal:
+        fit_poses(poses, units_of(units), model='10')
+    assert 'turn the sensor so that' in refusal.value.advice
+
+
+@pytest.mark.parametrize('directions', [cone(45), RING, SAME, FACES[:3]])
+def test_poses_in_counts_that_cannot_carry_the_model_are_refused(directions):
+    rng = np.random.default_rng(12)
+    poses = simulate_poses(sensor(rng), directions, rng)
+    poses = poses.with_columns(reading=poses.reading * 400 + 2000, std=poses['std'] * 400)
+    with pytest.raises(RefusedFitError):
+        fit_poses(poses, units_of('native'), model='10')
+
+
+def test_six_faces_are_offered_the_smaller_model():
+    rng = np.random.default_rng(13)
+    poses = simulate_poses(sensor(rng), np.repeat(FACES, 2, axis=0), rng)
+    with pytest.raises(RefusedFitError, match='or use model 7, which these poses carry'):
+        fit_poses(poses, G, model='10')
+    assert fit_poses(poses, G).name in ('4', '7')
+
+
+@pytest.mark.parametrize(('scale', 'units', 'says'), [
+    (16384.0, 'm/s2', 'native'), (1.0, 'm/s2', 'readings: g'), (9.81, 'g', 'readings: m/s2')])
+def test_readings_plainly_in_another_unit_are_refused(scale, units, says):
+    poses = simulated(14, 20)[1]
+    with pytest.raises(InputError, match=says):
+        fit_poses(poses.with_columns(reading=poses.reading * scale), units_of(units))
+
+
+def test_model_12_without_orientations_is_refused():
+    with pytest.raises(RefusedFitError, match='needs known orientations'):
+        fit_poses(simulated(15, 20)[1], G, model='12')
+
+
+@pytest.mark.parametrize('frame', ['ros', 'ned', 'android', 'win8'])
+def test_levelled_calibration_gives_flat_in_its_frame(frame):
+    rng = np.random.default_rng(16)
+    tilted = rotation_from_rpy(0.3, -0.2, 1.0) @ np.array([0.0, 0.0, 1.0])
+    model, poses = simulated(16, 30)
+    flat = predict(model, tilted[np.newaxis], {})[0]
+    calibration = level(fit_poses(poses, G), flat, frame)
+    down = -1.0 if frame == 'win8' else 1.0
+    np.testing.assert_allclose(calibration.correct(flat[np.newaxis])[0], (0, 0, down), atol=2e-3)
+    assert calibration.frame == frame
+    force = calibration.correct(rng.normal(size=(5, 3)))
+    np.testing.assert_allclose(calibration.correct(calibration.predict(force)), force, atol=1e-12)
+
+
+def test_force_covariance_is_that_of_repeated_fits():
+    force = np.array([[0.6, 0.0, 0.8]])
+    model, _ = simulated(17, 14)
+    reading = predict(model, force, {})
+    fits = []
+    for seed in range(150):
+        rng = np.random.default_rng(1000 + seed)
+        fits.append(fit_poses(simulate_poses(model, spread_directions(14), rng), G, model='10'))
+    scatter = np.cov(np.vstack([fit.correct(reading) for fit in fits]).T)
+    stated = np.mean([fit.force_covariance(force)[0] for fit in fits], axis=0)
+    np.testing.assert_allclose(np.diag(stated), np.diag(scatter), rtol=0.4)
+
+
+def test_poses_are_left_as_they_were():
+    poses = simulated(18, 20)[1]
+    before = {key: values.copy() for key, values in poses.columns.items()}
+    fit_poses(poses, G)
+    in_g(poses, units_of('m/s2'))
+    for key, values in poses.columns.items():
+        np.testing.assert_array_equal(values, before[key])
+    assert list(poses.row) == list(numbered(poses.columns))

@@ -1,0 +1,128 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The measurement equation: predict and correct undo each other."""
+
+import numpy as np
+import pytest
+
+from accel_calib.effects import EFFECTS
+from accel_calib.errors import InputError
+from accel_calib.model import (correct, force_slope, Model, MODELS, parameter_basis,
+                               parameter_names, predict, reading_of, with_linear_part, with_vector)
+from accel_calib.simulate import parse_effect, random_directions, rotation_from_rpy
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def context(rng):
+    return {'temperature': rng.uniform(0, 50, 40), 'std': rng.uniform(0, 0.2, (40, 3))}
+
+
+def everything(rng):
+    values = {name: rng.normal(size=len(effect.parameters)) * effect.typical
+              for name, effect in EFFECTS.items()}
+    return Model(values, rotation_from_rpy(0.3, -0.4, 2.0))
+
+
+def test_predict_and_correct_undo_each_other_with_every_effect(rng, context):
+    model, force = everything(rng), random_directions(40, rng)
+    np.testing.assert_allclose(correct(model, predict(model, force, context), context), force,
+                               atol=1e-12)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_effect_adds_its_basis_times_its_values(name, rng, context):
+    force = random_directions(40, rng)
+    values = rng.normal(size=len(EFFECTS[name].parameters)) * 0.01
+    model = Model({name: values})
+    added = predict(model, force, context) - force
+    np.testing.assert_allclose(added, parameter_basis((name,), force, context) @ values,
+                               atol=1e-15)
+    assert np.any(np.abs(added) > 0)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_slope_is_the_derivative_of_the_reading(name, rng, context):
+    force, step = random_directions(40, rng), 1e-6
+    model = Model({name: rng.normal(size=len(EFFECTS[name].parameters))})
+    numeric = np.stack([(reading_of(model, force + step * axis, context)
+                         - reading_of(model, force - step * axis, context)) / (2 * step)
+                        for axis in np.eye(3)], axis=2)
+    np.testing.assert_allclose(force_slope(model, force, context), numeric, atol=1e-7)
+
+
+def test_effects_by_hand():
+    force, context = np.array([[0.5, -2.0, 3.0]]), {'temperature': np.array([35.0]),
+                                                    'std': np.array([[0.1, 0.2, 0.3]])}
+    cases = {
+        'offset=1,2,3': (1, 2, 3), 'gain=0.1': (0.05, -0.2, 0.3),
+        'axis_gain=0.1,0.2,0.3': (0.05, -0.4, 0.9), 'cross_axis=1,0,0': (-2.0, 0.5, 0),
+        'misalignment=0,0,1': (2.0, 0.5, 0), 'quadratic=1': (0.25, 4, 9),
+        'cubic=1': (0.125, -8, 27), 'odd_quadratic=1': (0.25, -4, 9),
+        'gain_asymmetry=1': (0.5, 2, 3), 'cross_coupling=1,0,0,0,0,10': (-1, 0, -60),
+        'offset_temperature=1': (10, 10, 10), 'gain_temperature=1': (5, -20, 30),
+        'vibration_rectification=1': (0.01, 0.04, 0.09),
+    }
+    assert {case.partition('=')[0] for case in cases} == set(EFFECTS)
+    for text, added in cases.items():
+        model = Model(dict([parse_effect(text)]))
+        np.testing.assert_allclose(predict(model, force, context)[0] - force[0], added,
+                                   atol=1e-12, err_msg=text)
+
+
+def test_gain_and_offset_make_the_equation_of_an5286(rng):
+    mat_w, vec_v = np.eye(3) + rng.normal(size=(3, 3)) * 0.1, rng.normal(size=3)
+    rotation = rotation_from_rpy(0.1, 0.2, 0.3)
+    model = with_linear_part(mat_w, vec_v, rotation)
+    force = random_directions(5, rng)
+    np.testing.assert_allclose(predict(model, force, {}), force @ (mat_w @ rotation).T + vec_v)
+    for found, given in zip(model.linear_part, (mat_w, vec_v), strict=True):
+        np.testing.assert_allclose(found, given, atol=1e-15)
+
+
+def test_missing_context_is_named():
+    model = Model({'offset_temperature': np.ones(3)})
+    with pytest.raises(InputError, match='need temperature, which is not given'):
+        correct(model, np.ones((1, 3)), {})
+
+
+def test_effects_too_large_to_undo_are_refused():
+    with pytest.raises(InputError, match='too large to be undone'):
+        correct(Model({'quadratic': np.full(3, 5.0)}), np.full((1, 3), -3.0), {})
+
+
+@pytest.mark.parametrize('values', [{'offest': np.ones(3)}, {'offset': np.ones(2)}])
+def test_model_refuses_what_is_not_in_the_catalogue(values):
+    with pytest.raises(ValueError, match='off'):
+        Model(values)
+
+
+@pytest.mark.parametrize('name', MODELS)
+def test_vector_and_names_go_together(name):
+    names = parameter_names(MODELS[name])
+    model = with_vector(MODELS[name], np.arange(float(len(names))))
+    assert model.effects == MODELS[name]
+    np.testing.assert_array_equal(model.vector, np.arange(len(names)))
+
+
+@pytest.mark.parametrize('text', ['offset', 'offset=', 'offset=1,2', 'offset=1,2,x',
+                                  'offset=1,2,nan', 'tilt=1'])
+def test_effect_text_that_cannot_be_read_is_refused(text):
+    with pytest.raises(InputError, match='expected|NAME=VALUE'):
+        parse_effect(text)

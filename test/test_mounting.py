@@ -1,0 +1,83 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Mounting from a flat pose: every frame, every attitude, the singular ones too."""
+
+import numpy as np
+import pytest
+
+from accel_calib.calibrate.mounting import (flat_direction, FRAMES, mounting,
+                                            mounting_with_heading)
+from accel_calib.errors import InputError
+from accel_calib.simulate import random_directions, rotation_from_rpy
+
+ATTITUDES = [(0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0),
+             (0, 180, 0), (0, 0, 90), (20, -30, 40), (90, 90, 90), (179.9, 0.1, 0)]
+
+
+@pytest.mark.parametrize('frame', FRAMES)
+@pytest.mark.parametrize('rpy', ATTITUDES)
+def test_flat_pose_is_levelled_by_a_proper_rotation(frame, rpy):
+    flat = rotation_from_rpy(*np.radians(rpy)) @ flat_direction(frame) * 9.81
+    rotation = mounting(flat, frame)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(rotation.T @ flat / 9.81, flat_direction(frame), atol=1e-12)
+
+
+@pytest.mark.parametrize('frame', FRAMES)
+def test_a_sensor_mounted_straight_is_left_alone(frame):
+    np.testing.assert_allclose(mounting(flat_direction(frame), frame), np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize('frame', ['ned', 'android', 'ros'])
+def test_columns_are_those_of_an5286(frame):
+    for x, y, z in random_directions(50, np.random.default_rng(1)) * 2.0:
+        rotation, root, size = mounting(np.array([x, y, z]), frame), np.hypot(y, z), 2.0
+        np.testing.assert_allclose(rotation[:, 2] * size, (x, y, z))
+        np.testing.assert_allclose(rotation[:, 0] * size, (root, -x * y / root, -x * z / root))
+
+
+def test_win8_has_the_negated_reading_and_no_y_in_its_x_column():
+    for reading in random_directions(50, np.random.default_rng(2)):
+        rotation = mounting(reading, 'win8')
+        np.testing.assert_allclose(rotation[:, 2], -reading)
+        assert rotation[1, 0] == 0.0
+        assert rotation[0, 0] >= 0.0
+
+
+def test_pure_roll_and_pitch_are_found_without_yaw():
+    rotation = rotation_from_rpy(*np.radians((25.0, 0.0, 0.0)))
+    np.testing.assert_allclose(mounting(rotation.T @ [0, 0, 1]), rotation.T, atol=1e-12)
+    rotation = rotation_from_rpy(*np.radians((-160.0, 40.0, 0.0)))
+    np.testing.assert_allclose(mounting(rotation.T @ [0, 0, 1]), rotation.T, atol=1e-12)
+
+
+def test_a_second_pose_fixes_the_heading():
+    truth = rotation_from_rpy(*np.radians((170.0, 35.0, -120.0)))
+    nose_down = np.array([-0.8, 0.0, 0.6])
+    found = mounting_with_heading(truth @ [0, 0, 1], truth @ nose_down, nose_down)
+    np.testing.assert_allclose(found, truth, atol=1e-12)
+
+
+def test_a_second_pose_that_is_the_first_is_refused():
+    with pytest.raises(InputError, match='within 10° of the flat one'):
+        mounting_with_heading(np.array([0, 0, 1.0]), np.array([0, 0.05, 1.0]),
+                              np.array([0, 0.05, 1.0]))
+
+
+@pytest.mark.parametrize('flat', [(0, 0, 0), (np.nan, 0, 1)])
+def test_a_flat_pose_without_gravity_is_refused(flat):
+    with pytest.raises(InputError, match='expected about 1 g'):
+        mounting(np.array(flat, float))

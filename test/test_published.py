@@ -1,0 +1,118 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The documents' own numbers, and what the real recordings are known to give."""
+
+import json
+
+import numpy as np
+import pytest
+
+from accel_calib.calibrate import fit_poses, sensing_axes, verify
+from accel_calib.calibrate.closed_form import fit_six_faces, two_position
+from accel_calib.cli.main import main
+from accel_calib.files import read_poses
+from accel_calib.units import units_of
+
+from shared import data
+
+HUAWEI, SECOND, THIRD = (f'esgi95_dataset{name}.csv' for name in ('1_huawei', '2', '3_gt'))
+
+
+def fit(name, first, last, gravity, model, method='algebraic'):
+    table = read_poses(data(name))
+    calibration = fit_poses(table.take(slice(first - 1, last)), units_of('m/s2', gravity),
+                            model=model, method=method)
+    return calibration, table
+
+
+@pytest.mark.parametrize(('name', 'first', 'last', 'shifts', 'scales', 'angles'), [
+    (HUAWEI, 1, 20, (0.304496, 0.321482, -1.08995), (1.00457, 1.00147, 0.989292),
+     (1.57646, 1.57096, 1.57301)),
+    (HUAWEI, 3, 23, (0.318321, 0.322794, -1.09059), None, (1.56932, 1.5709, 1.57296)),
+    (SECOND, 1, 20, (-0.469784, 0.608425, 0.208206), (0.999573, 0.989443, 1.01176),
+     (1.56219, 1.56969, 1.57057)),
+])
+def test_nine_parameters_are_those_of_the_report(name, first, last, shifts, scales, angles):
+    calibration, _ = fit(name, first, last, 9.8061, '9')
+    axes = sensing_axes(calibration.gain, calibration.offset)
+    np.testing.assert_allclose(axes.shifts, shifts, atol=1e-3)
+    if scales:
+        np.testing.assert_allclose(axes.scales, scales, atol=5e-4)
+    np.testing.assert_allclose((axes.phi, axes.psi, axes.theta), angles, atol=5e-4)
+
+
+@pytest.mark.parametrize(('first', 'last', 'percent'), [(1, 20, 0.27), (3, 23, 0.99)])
+def test_repeated_poses_bias_the_fit_as_the_report_found(first, last, percent):
+    calibration, table = fit(THIRD, first, last, 9.81, '9')
+    assert verify(calibration, table).max_after_percent == pytest.approx(percent, abs=0.005)
+
+
+@pytest.mark.parametrize(('name', 'diagonal', 'shift', 'six', 'every'), [
+    (HUAWEI, (1.00381, 1.00003, 0.98831), (0.35323, 0.36347, -1.18129), (0.173860, 0.010602),
+     (0.122076, 0.031542)),
+    (THIRD, (0.990908, 0.981047, 0.998542), (0.482181, 0.058771, 0.044096), (None, 0.015846),
+     (None, 0.013898)),
+])
+def test_twelve_parameters_from_six_faces_are_those_of_the_report(name, diagonal, shift, six,
+                                                                  every):
+    calibration, table = fit(name, 1, 6, 9.81, '12')
+    np.testing.assert_allclose(np.diag(calibration.gain), diagonal, atol=1e-5)
+    np.testing.assert_allclose(calibration.offset, shift, atol=1e-5)
+    faces, rows = calibration.quality, verify(calibration, table)
+    for found, published in ((faces, six), (rows, every)):
+        assert found.max_after_percent / 100 == pytest.approx(published[1], abs=1e-6)
+        if published[0]:
+            assert found.max_before_percent / 100 == pytest.approx(published[0], abs=1e-6)
+
+
+def test_closed_form_of_six_faces_is_least_squares():
+    calibration, table = fit(HUAWEI, 1, 6, 9.81, '12')
+    down, up = table.reading[[0, 2, 4]], table.reading[[1, 3, 5]]
+    mat_x, shift = fit_six_faces(up, down, 9.81)
+    np.testing.assert_allclose(mat_x, calibration.gain, atol=1e-12)
+    np.testing.assert_allclose(shift, calibration.offset, atol=1e-12)
+
+
+def test_two_positions_of_the_rhd2000_note():
+    sensitivity, offset = two_position(2.1218, 1.4282)
+    assert sensitivity == pytest.approx(0.3468)
+    assert offset == pytest.approx(1.775)
+
+
+@pytest.mark.parametrize('name', ['mpu9150_imu0', 'mpu9150_imu1'])
+@pytest.mark.parametrize('method', ['ml', 'algebraic'])
+def test_mpu9150_is_calibrated_to_its_noise(name, method, tmp_path):
+    result = captured_and_fitted(name, 'm/s2', method, tmp_path)
+    assert 8.0 < result['rms_before_mg'] < 25.0
+    assert result['rms_after_mg'] <= 0.30
+    assert result['captured'] == 21
+
+
+@pytest.mark.parametrize('method', ['ml', 'algebraic'])
+def test_xsens_counts_are_calibrated_as_well_as_imu_tk_does(method, tmp_path):
+    result = captured_and_fitted('xsens_mti_counts', 'native', method, tmp_path)
+    assert result['captured'] == 38
+    assert result['poses_used'] == 38
+    assert result['rms_after_mg'] <= 0.115
+
+
+def captured_and_fitted(name, units, method, folder):
+    poses, captured, fitted = (folder / part for part in ('p.csv', 'c.json', 'f.json'))
+    assert main(['capture', str(data(f'{name}.csv')), '-o', str(poses), '--units', units,
+                 '--json', str(captured)]) == 0
+    assert main(['fit', str(poses), '--units', units, '--model', '10', '--method', method,
+                 '--json', str(fitted)]) == 0
+    result = json.loads(fitted.read_text())
+    return {**result, 'captured': json.loads(captured.read_text())['poses']}
