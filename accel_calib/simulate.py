@@ -100,6 +100,22 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     return name, np.broadcast_to(values, len(parameters)).copy()
 
 
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """
+    Give the rotation of fixed-axis roll, pitch and yaw [rad], as in URDF.
+
+    Returns
+    -------
+    (3, 3) array
+        From the axes of the turned body to those it is turned in.
+
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                     [-sp, cp * sr, cp * cr]])
+
+
 def model_with(effects: Mapping[str, Floats], rotation: Floats | None = None) -> Model:
     """Make the model with these effects, in the order of the catalogue."""
     ordered = {name: effects[name] for name in EFFECTS if name in effects}

@@ -14,14 +14,18 @@
 
 """Pose tables, recordings and calibrations on disk: one reader and one writer each."""
 
+from .bag import is_bag
+from .bag_correction import correct_bag
 from .calibration_yaml import (
-                               check_sensor,
-                               format_calibration,
-                               parse_calibration,
-                               read_calibration,
-                               write_calibration,
+    check_sensor,
+    format_calibration,
+    parse_calibration,
+    read_calibration,
+    write_calibration,
 )
+from .recording import read_recording, Source
 from .table_csv import read_poses, read_samples, write_table
 
-__all__ = ['check_sensor', 'format_calibration', 'parse_calibration', 'read_calibration',
-           'read_poses', 'read_samples', 'write_calibration', 'write_table']
+__all__ = ['Source', 'check_sensor', 'correct_bag', 'format_calibration', 'is_bag',
+           'parse_calibration', 'read_calibration', 'read_poses', 'read_recording', 'read_samples',
+           'write_calibration', 'write_table']

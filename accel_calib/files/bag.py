@@ -95,7 +95,7 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             yield reader
-    except (AnyReaderError, AssertionError, struct.error) as err:
+    except (AnyReaderError, FileNotFoundError, AssertionError, struct.error) as err:
         raise InputError(f'{path} is not a whole bag ({err})',
                          'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may mend '
                          'it') from err
@@ -159,7 +159,7 @@ def read_bag(path: Path, topic: str = '') -> BagRecording:
         fields = np.frombuffer(b''.join(tails), '<f8').reshape(-1, FIELDS)
         columns = {'time': np.array(stamps), 'reading': fields[:, ACCELERATION],
                    'rate': fields[:, ANGULAR_VELOCITY]}
-        temperature = _temperature(reader, columns['time'])
+        temperature = temperature_at(reader, columns['time'])
         if temperature is not None:
             columns['temperature'] = temperature
     _check_finite(path, columns['reading'])
@@ -202,7 +202,7 @@ def tail_of(raw: bytes | memoryview, path: Path, *, ros2: bool) -> bytes:
     return bytes(raw[-_TAIL:])
 
 
-def _temperature(reader: AnyReader, time: Floats) -> Floats | None:
+def temperature_at(reader: AnyReader, time: Floats) -> Floats | None:
     """Give the temperature [°C] at these times, where the bag has a Temperature topic."""
     connections = [c for c in reader.connections if c.msgtype == TEMPERATURE]
     stamps: list[float] = []

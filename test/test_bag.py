@@ -1,0 +1,187 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bags of every kind, written by `rosbags`, read and corrected without ROS."""
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
+from rosbags.typesys import get_typestore, Stores
+
+from accel_calib.capture import capture
+from accel_calib.calibrate import fit_poses
+from accel_calib.errors import InputError, StoredCalibrationError
+from accel_calib.files import correct_bag, read_recording
+from accel_calib.simulate import simulate_recording, spread_directions
+from accel_calib.units import units_of
+
+from shared import sensor
+
+KINDS = ['mcap', 'sqlite3', 'bag']
+UNITS = units_of('m/s2')
+
+
+@pytest.fixture(scope='module')
+def recording():
+    rng = np.random.default_rng(5)
+    return simulate_recording(sensor(rng), spread_directions(12), rng, dwell=2.0, turn=0.5,
+                              temperatures=(20.0, 30.0))
+
+
+def imu_message(store, k, recording, frame_id='imu_link'):
+    types = store.types
+    nanoseconds = round(recording['time'][k] * 1e9)
+    stamp = types['builtin_interfaces/msg/Time'](
+        sec=int(nanoseconds // 10 ** 9) + 100, nanosec=int(nanoseconds % 10 ** 9))
+    ros1 = 'seq' in types['std_msgs/msg/Header'].__annotations__
+    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id,
+                                            **({'seq': k} if ros1 else {}))
+    vector = types['geometry_msgs/msg/Vector3']
+    covariance = np.zeros(9)
+    quaternion = types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0)
+    reading, rate = UNITS.from_g(recording.reading[k]), recording['rate'][k]
+    return types['sensor_msgs/msg/Imu'](
+        header=header, orientation=quaternion, orientation_covariance=covariance,
+        angular_velocity=vector(*rate.tolist()), angular_velocity_covariance=covariance,
+        linear_acceleration=vector(*reading.tolist()), linear_acceleration_covariance=covariance
+    ), header
+
+
+def write_bag(path, kind, recording, topics=('/imu/data_raw',)):
+    """Write Imu, temperature and a string topic that must pass untouched."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == 'bag' else Stores.ROS2_JAZZY)
+    writer = Writer1(path) if kind == 'bag' else Writer2(
+        path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    serialize = store.serialize_ros1 if kind == 'bag' else store.serialize_cdr
+    with writer:
+        imus = [writer.add_connection(topic, 'sensor_msgs/msg/Imu', typestore=store)
+                for topic in topics]
+        warm = writer.add_connection('/temperature', 'sensor_msgs/msg/Temperature',
+                                     typestore=store)
+        words = writer.add_connection('/words', 'std_msgs/msg/String', typestore=store)
+        for k in range(len(recording)):
+            receipt = 100 * 10 ** 9 + round(recording['time'][k] * 1e9)
+            message, header = imu_message(store, k, recording)
+            for connection in imus:
+                writer.write(connection, receipt, serialize(message, connection.msgtype))
+            if k % 50 == 0:
+                value = store.types['sensor_msgs/msg/Temperature'](
+                    header=header, temperature=float(recording['temperature'][k]), variance=0.0)
+                writer.write(warm, receipt, serialize(value, warm.msgtype))
+                text = store.types['std_msgs/msg/String'](data=f'word {k}')
+                writer.write(words, receipt, serialize(text, words.msgtype))
+    return path
+
+
+def name(folder, kind):
+    return folder / ('recording.bag' if kind == 'bag' else kind)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_every_kind_of_bag_gives_the_same_samples(kind, recording, tmp_path):
+    source = read_recording(write_bag(name(tmp_path, kind), kind, recording))
+    assert (source.units, source.sensor) == ('m/s2', 'imu_link')
+    found = source.recording
+    np.testing.assert_array_equal(found.reading, UNITS.from_g(recording.reading))
+    np.testing.assert_array_equal(found['rate'], recording['rate'])
+    np.testing.assert_allclose(found['time'], recording['time'] + 100.0, atol=1e-6)
+    np.testing.assert_allclose(found['temperature'], recording['temperature'], atol=0.2)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
+def test_the_file_inside_a_rosbag2_folder_is_enough(kind, recording, tmp_path):
+    folder = write_bag(name(tmp_path, kind), kind, recording)
+    file = next(path for path in folder.iterdir() if path.suffix in ('.mcap', '.db3'))
+    assert len(read_recording(file).recording) == len(recording)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_corrected_bag_differs_in_the_acceleration_alone(kind, recording, tmp_path):
+    path = write_bag(name(tmp_path, kind), kind, recording)
+    source = read_recording(path)
+    poses = capture(source.recording, UNITS).poses
+    calibration = fit_poses(poses, UNITS, sensor='imu_link')
+    out = tmp_path / ('out.bag' if kind == 'bag' else 'out')
+    assert correct_bag(path, calibration, out) == len(recording)
+    with AnyReader([path]) as before, AnyReader([out]) as after:
+        assert [c.topic for c in before.connections] == [c.topic for c in after.connections]
+        for (c0, t0, raw0), (c1, t1, raw1) in zip(before.messages(), after.messages(),
+                                                 strict=True):
+            assert (c0.topic, c0.msgtype, t0) == (c1.topic, c1.msgtype, t1)
+            if c0.topic != '/imu/data_raw':
+                assert bytes(raw0) == bytes(raw1)
+                continue
+            assert bytes(raw0[:-96]) == bytes(raw1[:-96])
+            assert bytes(raw0[-72:]) == bytes(raw1[-72:])
+            m0, m1 = (reader.deserialize(raw, c0.msgtype)
+                      for reader, raw in ((before, raw0), (after, raw1)))
+            force = calibration.correct(np.array([[
+                m0.linear_acceleration.x, m0.linear_acceleration.y, m0.linear_acceleration.z]]))[0]
+            assert (m1.linear_acceleration.x, m1.linear_acceleration.y,
+                    m1.linear_acceleration.z) == pytest.approx(tuple(force), abs=1e-12)
+    still = capture(read_recording(out).recording, UNITS).poses
+    assert np.linalg.norm(still.reading, axis=1) == pytest.approx(9.80665, abs=0.01)
+
+
+def test_two_imu_topics_need_a_choice(recording, tmp_path):
+    path = write_bag(tmp_path / 'two', 'mcap', recording.take(slice(0, 60)), ('/a', '/b'))
+    with pytest.raises(InputError, match='has 2 Imu topics: /a, /b; choose one with --topic'):
+        read_recording(path)
+    assert len(read_recording(path, '/b').recording) == 60
+    with pytest.raises(InputError, match='has no Imu topic /c'):
+        read_recording(path, '/c')
+
+
+def test_a_bag_without_imu_is_refused(recording, tmp_path):
+    path = write_bag(tmp_path / 'none', 'mcap', recording.take(slice(0, 60)), ())
+    with pytest.raises(InputError, match='has no topic of type sensor_msgs/msg/Imu'):
+        read_recording(path)
+
+
+@pytest.mark.parametrize('file', ['x.bag', 'x.mcap', 'x.db3'])
+def test_what_is_no_bag_is_refused_in_one_line(file, tmp_path):
+    path = tmp_path / file
+    path.write_bytes(b'not a bag at all')
+    with pytest.raises(InputError, match='is not a whole bag'):
+        read_recording(path)
+    with pytest.raises(FileNotFoundError):
+        read_recording(tmp_path / f'missing{file}')
+
+
+def test_an_empty_folder_is_no_bag(tmp_path):
+    with pytest.raises(InputError, match='is not a whole bag'):
+        read_recording(tmp_path)
+
+
+def test_a_message_with_nan_is_refused(recording, tmp_path):
+    reading = recording.reading[:60].copy()
+    reading[40, 1] = np.nan
+    path = write_bag(tmp_path / 'nan', 'mcap',
+                     recording.take(slice(0, 60)).with_columns(reading=reading))
+    with pytest.raises(InputError, match='1 of 60 Imu messages hold NaN or infinity, the first '
+                                         'is message 41'):
+        read_recording(path)
+
+
+def test_a_calibration_of_another_sensor_leaves_no_bag_behind(recording, tmp_path):
+    path = write_bag(tmp_path / 'in', 'mcap', recording)
+    poses = capture(read_recording(path).recording, UNITS).poses
+    other = fit_poses(poses, UNITS, sensor='imu_rear')
+    with pytest.raises(StoredCalibrationError, match='imu_rear'):
+        correct_bag(path, other, tmp_path / 'out')
+    with pytest.raises(InputError, match='is there already'):
+        correct_bag(path, other, path)
+    assert [item.name for item in tmp_path.iterdir()] == ['in']

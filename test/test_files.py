@@ -1,0 +1,183 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tables and calibrations on disk: what is written is read; what is wrong is said in one line."""
+
+import os
+
+import numpy as np
+import pytest
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.errors import InputError, StoredCalibrationError
+from accel_calib.files import (check_sensor, format_calibration, parse_calibration,
+                               read_calibration, read_poses, read_samples, write_calibration,
+                               write_table)
+from accel_calib.files.atomic import before
+from accel_calib.simulate import simulate_poses, spread_directions
+from accel_calib.table import COLUMNS, numbered, Poses
+from accel_calib.units import units_of
+
+from shared import sensor
+
+GOOD = '# a comment\nax,ay,az\n1,2,3\n4,5,6\n'
+
+
+def write(folder, text):
+    path = folder / 'table.csv'
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def every_column(count=4):
+    rng = np.random.default_rng(1)
+    columns = {key: rng.uniform(1, 2, count if len(column.names) == 1 else (count, 3))
+               for key, column in COLUMNS.items()}
+    columns['label'] = np.array(['flat', 'left, side up', 'nose "down"', ''])
+    columns['time'] = 1.7e9 + np.arange(count) * 0.0025
+    return Poses(columns, numbered(columns))
+
+
+def test_every_column_is_read_back_as_it_was_written(tmp_path):
+    table = every_column()
+    write_table(tmp_path / 'poses.csv', table)
+    found = read_poses(tmp_path / 'poses.csv')
+    assert set(found.columns) == set(COLUMNS)
+    for key, values in table.columns.items():
+        if key == 'label':
+            assert found[key].tolist() == values.tolist()
+        else:
+            np.testing.assert_allclose(found[key], values, rtol=1e-11)
+    np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
+
+
+def test_columns_may_come_in_any_order_among_others(tmp_path):
+    poses = read_poses(write(tmp_path, 'az,what,ay,ax\n3,x,2,1\n6,y,5,4\n'))
+    np.testing.assert_array_equal(poses.reading, [[1, 2, 3], [4, 5, 6]])
+    assert list(poses.row) == [1, 2]
+
+
+@pytest.mark.parametrize(('text', 'says'), [
+    ('', 'is empty'), ('# only a comment\n\n', 'is empty'),
+    ('ax,ay,az\n', 'a header line and no rows'),
+    ('ax,ay\n1,2\n', 'lacks az'), ('x,y,z\n1,2,3\n', 'lacks ax, ay, az'),
+    ('1,2,3\n4,5,6\n', 'lacks ax, ay, az'),
+    ('ax,ay,az,std_x\n1,2,3,4\n', 'lacks std_y, std_z'),
+    ('ax,ay,az,ax\n1,2,3,4\n', '2 columns ax'),
+    ('ax,ay,az\n1,2,three\n', "row 1, column az is 'three', expected a finite number"),
+    ('ax,ay,az\n1,2,3\n1,nan,3\n', "row 2, column ay is 'nan'"),
+    ('ax,ay,az\n1,2,3\n1,2,inf\n', "row 2, column az is 'inf'"),
+    ('ax,ay,az\n1,2,3\n1,,3\n', "row 2, column ay is ''"),
+    ('ax,ay,az\n1,2,3\n1,2\n', 'row 2 has 2 values, expected 3'),
+    ('ax,ay,az,count\n1,2,3,0\n', 'not above 0'),
+    ('ax,ay,az,std_x,std_y,std_z\n1,2,3,1,1,-1\n', 'negative'),
+    (b'\x80\x04\x95\xff\xfe', 'is not a text file'),
+])
+def test_a_bad_pose_table_is_refused_in_one_line(text, says, tmp_path):
+    with pytest.raises(InputError, match=says) as refusal:
+        read_poses(write(tmp_path, text))
+    assert '\n' not in str(refusal.value)
+
+
+def test_a_recording_needs_times(tmp_path):
+    with pytest.raises(InputError, match='lacks time'):
+        read_samples(write(tmp_path, GOOD))
+
+
+def test_a_missing_file_is_the_systems_own_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_poses(tmp_path / 'none.csv')
+
+
+@pytest.fixture(params=['4', '9', '10', '12'])
+def calibration(request):
+    rng, directions = np.random.default_rng(2), spread_directions(16)
+    context = {'reference': directions} if request.param == '12' else {}
+    poses = simulate_poses(sensor(rng), directions, rng, context=context)
+    return fit_poses(poses, units_of('g'), model=request.param, sensor='imu_link',
+                     date='2026-11-21T00:00:00+00:00')
+
+
+def test_a_calibration_is_read_back_to_the_last_digit(calibration, tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    write_calibration(path, calibration)
+    found = read_calibration(path)
+    assert format_calibration(found) == format_calibration(calibration)
+    reading = np.random.default_rng(3).normal(size=(5, 3))
+    np.testing.assert_array_equal(found.correct(reading), calibration.correct(reading))
+    np.testing.assert_array_equal(found.gain_sd, calibration.gain_sd)
+
+
+def test_the_calibration_before_is_kept(calibration, tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    path.write_text('the one before')
+    write_calibration(path, calibration)
+    assert before(path).read_text() == 'the one before'
+    assert sorted(item.name for item in tmp_path.iterdir()) == [path.name, before(path).name]
+
+
+def test_a_calibration_that_cannot_be_written_leaves_what_was_there(calibration, tmp_path,
+                                                                    monkeypatch):
+    path = tmp_path / 'calibration.yaml'
+    write_calibration(path, calibration)
+    stored = path.read_text()
+
+    def full(_: int) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(os, 'fsync', full)
+    with pytest.raises(OSError, match='No space left'):
+        write_calibration(path, calibration)
+    assert path.read_text() == stored
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(('old', 'new', 'says'), [
+    ('version: 1\n', 'version: 2\n', 'has version 2, this package reads up to 1'),
+    ('version: 1\n', 'version: x\n', 'not a whole calibration'),
+    ('format: accel_calib calibration', 'format: other', 'is not a calibration of accel_calib'),
+    ('frame: ros', 'frame: moon', "frame 'moon' is none of"),
+    ('effects:', 'causes:', 'not a whole calibration'),
+    ('offset: {', 'offste: {', 'not a whole calibration'),
+    ('unit: g, x: ', 'unit: g, x: .nan #', 'not a whole calibration'),
+    ('[1.0, 0.0, 0.0]', '[2.0, 0.0, 0.0]', 'rotation is not a rotation matrix'),
+    ('covariance:\n', 'covariance: [[1.0]]\nwas:\n', 'not a whole calibration'),
+])
+def test_a_damaged_or_newer_calibration_is_refused_in_one_line(old, new, says, calibration):
+    text = format_calibration(calibration)
+    assert old in text
+    with pytest.raises(StoredCalibrationError, match=says) as refusal:
+        parse_calibration(text.replace(old, new, 1), 'calibration.yaml')
+    assert '\n' not in str(refusal.value)
+
+
+@pytest.mark.parametrize('text', ['', 'a: [', '- 1\n- 2\n', 'format: accel_calib calibration\n'])
+def test_what_is_no_calibration_is_refused(text):
+    with pytest.raises(StoredCalibrationError):
+        parse_calibration(text, 'x.yaml')
+
+
+def test_half_a_calibration_is_refused(calibration):
+    text = format_calibration(calibration)
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9, 0.97):
+        with pytest.raises(StoredCalibrationError):
+            parse_calibration(text[:int(share * len(text))], 'x.yaml')
+
+
+def test_a_calibration_of_another_sensor_is_refused(calibration):
+    check_sensor(calibration, 'imu_link')
+    check_sensor(calibration, '')
+    with pytest.raises(StoredCalibrationError, match="sensor 'imu_link', the readings come from "
+                                                     "'imu_rear'"):
+        check_sensor(calibration, 'imu_rear')
