@@ -1,0 +1,68 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib apply``: correct a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from . import options
+
+_SUMMARY = 'correct a recording with a calibration'
+_EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    made = options.command(commands, 'apply', _SUMMARY, _EXAMPLE)
+    made.add_argument('recording', type=Path, metavar='RECORDING',
+                      help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
+    made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
+                      help='stored calibration')
+    made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
+                      help='a CSV table, or a new bag of the kind of the recording')
+    made.add_argument('--topic', default='', help='Imu topic, where a bag has several')
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Correct and say how many samples there were."""
+    from ..files import correct_bag, is_bag, read_calibration
+
+    calibration = read_calibration(args.calibration)
+    if is_bag(args.recording):
+        count = correct_bag(args.recording, calibration, args.output, args.topic)
+    else:
+        count = _correct_table(args.recording, calibration, args.output)
+    options.say(args).print(f'{count} samples corrected, stored in {args.output}', markup=False)
+    return 0
+
+
+def _correct_table(path: Path, calibration: Any, out: Path) -> int:
+    from ..calibrate import check_units
+    from ..files import read_samples, write_table
+
+    if out.exists() and out.samefile(path):
+        raise InputError(f'{out} is the recording itself', 'give another name')
+    recording = read_samples(path)
+    check_units(recording, calibration.units)
+    columns = {'reading': calibration.correct(recording.reading, recording.columns)}
+    if 'rate' in recording:
+        columns['rate'] = recording['rate'] @ calibration.model.rotation
+    write_table(out, recording.with_columns(**columns))
+    return len(recording)

@@ -1,0 +1,151 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib fit``: poses to calibration."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from ..errors import AccelCalibError, InputError
+from . import options
+
+if TYPE_CHECKING:
+    from ..calibrate import Calibration
+
+_MODELS = ('auto', '4', '7', '9', '10', '12')
+_METHODS = ('ml', 'algebraic')
+_FRAMES = ('ros', 'ned', 'android', 'win8')
+_SUMMARY = 'fit a calibration to still poses'
+_EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    made = options.command(commands, 'fit', _SUMMARY, _EXAMPLE)
+    made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
+    made.add_argument('-o', '--output', type=Path, metavar='FILE',
+                      help='where to store the calibration (YAML); a folder for several POSES')
+    made.add_argument('--model', choices=_MODELS, default='auto',
+                      help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
+                      'cross-axis; 12: known orientation; auto (default): the smallest that the '
+                      'data call for')
+    made.add_argument('--method', choices=_METHODS, default='ml',
+                      help='ml (default) weighs poses by their noise and leaves out disturbed '
+                      "ones; algebraic is the documents' own costs, every row kept")
+    made.add_argument('--rows', metavar='A:B', help='use these rows alone, from 1, both ends held')
+    made.add_argument('--flat', type=int, metavar='ROW', help='the pose in which the robot was '
+                      'level: the mounting is taken out')
+    made.add_argument('--frame', choices=_FRAMES, default='ros',
+                      help='levelled frame (default: ros, z up)')
+    made.add_argument('--sensor', default='', help='which sensor this is (frame_id of its Imu)')
+    made.add_argument('--jobs', type=int, default=1, metavar='N', help='fit N tables at a time')
+    options.add_units(made)
+    options.add_json(made)
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, store, and say how well it went."""
+    if len(args.poses) == 1:
+        return _run_one(args)
+    if args.output is not None and not args.output.is_dir():
+        raise InputError(f'-o {args.output} is not a folder, and there are {len(args.poses)} pose '
+                         'tables', 'give a folder that is there')
+    results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
+    options.write_json(args.json, results)
+    console = options.say(args)
+    for result in results:
+        console.print(result['file'], _in_a_line(result), markup=False)
+    return 2 if any('error' in result for result in results) else 0
+
+
+def _run_one(args: argparse.Namespace) -> int:
+    try:
+        calibration = fit_file(args, args.poses[0])
+    except AccelCalibError as err:
+        options.write_json(args.json, {'error': err.message, 'advice': err.advice})
+        raise
+    _store(calibration, args.output)
+    from .results import fit_result
+
+    options.write_json(args.json, {'file': args.poses[0], **fit_result(calibration)})
+    _show(args, calibration)
+    return 0
+
+
+def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
+    """Fit one pose table as the options say."""
+    from ..calibrate import fit_poses, level
+    from ..files import read_poses
+
+    table = read_poses(path)
+    units = options.units_from(args)
+    date = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    flat = None if args.flat is None else options.row_of(table, args.flat, '--flat')
+    calibration = fit_poses(options.rows_between(table, args.rows), units, model=args.model,
+                            method=args.method, sensor=args.sensor, date=date)
+    if flat is None:
+        return replace(calibration, frame=args.frame)
+    return level(calibration, flat.reading[0], args.frame)
+
+
+def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    """Fit one of several pose tables; what is wrong with it becomes its result."""
+    from .results import fit_result
+
+    try:
+        calibration = fit_file(args, path)
+        _store(calibration, args.output and args.output / f'{path.stem}.yaml')
+    except AccelCalibError as err:
+        return {'file': path, 'error': err.message, 'advice': err.advice}
+    except OSError as err:
+        return {'file': path, 'error': f'{path}: {err.strerror}', 'advice': 'check its name'}
+    result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration)})
+    return result
+
+
+def _store(calibration: Calibration, output: Path | None) -> None:
+    if output is not None:
+        from ..files import write_calibration
+
+        write_calibration(output, calibration)
+
+
+def _in_a_line(result: dict[str, Any]) -> str:
+    if 'error' in result:
+        return f'{result["error"]}; {result["advice"]}'
+    return (f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+            f'{result["rms_after_mg"]:.3g} mg')
+
+
+def _show(args: argparse.Namespace, calibration: Calibration) -> None:
+    """Tell a person what came out."""
+    from .results import parameter_table, quality_table
+
+    console = options.say(args)
+    console.print(quality_table(calibration))
+    console.print(parameter_table(calibration))
+    console.print(f'why model {calibration.name}: {calibration.reason}', markup=False)
+    for rejected in calibration.rejected:
+        console.print(f'left out: row {rejected.row}, {rejected.reason}', markup=False)
+    for warning in calibration.warnings:
+        console.print(f'note: {warning}', markup=False)
+    if args.output is not None:
+        console.print(f'stored in {args.output}', markup=False)

@@ -1,0 +1,148 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Options that several commands share, and the writing of results."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+import json
+from pathlib import Path
+import sys
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..table import Poses
+from ..units import STANDARD_GRAVITY, UNIT_NAMES, Units, units_of
+
+
+def command(commands: Any, name: str, summary: str, example: str, **described: Any
+            ) -> argparse.ArgumentParser:
+    """Add a command with an example to its help."""
+    made: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f'{summary[0].upper()}{summary[1:]}.',
+        epilog=f'example:\n  {example}', formatter_class=argparse.RawDescriptionHelpFormatter,
+        **described)
+    return made
+
+
+def positive(text: str) -> float:
+    """Read a number above zero."""
+    value = float(text)
+    if not 0.0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not a positive number')
+    return value
+
+
+def add_units(made: argparse.ArgumentParser) -> None:
+    """Add ``--units`` and ``--gravity``."""
+    made.add_argument('--units', choices=UNIT_NAMES, default='m/s2',
+                      help='unit of ax,ay,az; native is counts or volts (default: m/s2)')
+    made.add_argument('--gravity', type=positive, default=STANDARD_GRAVITY, metavar='M/S2',
+                      help='local gravity [m/s2] (default: %(default)s)')
+
+
+def units_from(args: argparse.Namespace) -> Units:
+    """Give the unit that was asked for."""
+    return units_of(args.units, args.gravity)
+
+
+def add_json(made: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    made.add_argument('--json', metavar='FILE', help='write the result as JSON; - for standard '
+                      'output')
+
+
+def write_json(target: str | None, result: object) -> None:
+    """Write a result as JSON to a file, to standard output for ``-``, or nowhere for None."""
+    if target is None:
+        return
+    text = json.dumps(plain(result), indent=2, allow_nan=False)
+    if target == '-':
+        print(text)
+    else:
+        write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
+
+
+def plain(value: object) -> Any:
+    """Give arrays as lists, numbers that are not finite as null, and paths as text."""
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def say(args: argparse.Namespace) -> Any:
+    """Give the console for a person: standard error when JSON goes to standard output."""
+    from rich.console import Console
+
+    return Console(stderr=getattr(args, 'json', None) == '-', highlight=False, soft_wrap=True)
+
+
+def rows_between(poses: Poses, text: str | None) -> Poses:
+    """
+    Take the rows ``A:B`` of a table: from 1, both ends held, an open end is the table's.
+
+    Raises
+    ------
+    InputError
+        If it is not of that form, or not in the table.
+
+    """
+    if text is None:
+        return poses
+    first, colon, last = text.partition(':')
+    try:
+        start, stop = int(first or 1), int((last if colon else first) or len(poses))
+    except ValueError:
+        start, stop = 0, 0
+    if not 1 <= start <= stop <= len(poses):
+        raise InputError(f'--rows {text} is not A:B within rows 1:{len(poses)} of the table',
+                         'give the first and the last row, both from 1')
+    return poses.take(slice(start - 1, stop))
+
+
+def row_of(poses: Poses, row: int, option: str) -> Poses:
+    """
+    Take one row of a table, counted from 1.
+
+    Raises
+    ------
+    InputError
+        If the table has no such row.
+
+    """
+    if not 1 <= row <= len(poses):
+        raise InputError(f'{option} {row} is not a row of the table, which has {len(poses)}',
+                         'rows count from 1')
+    return poses.take(slice(row - 1, row))
+
+
+def in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
+    """Call a function for each item, in this process or in several, and keep the order."""
+    if jobs <= 1 or len(items) <= 1:
+        return [function(item) for item in items]
+    from concurrent.futures import ProcessPoolExecutor
+
+    with ProcessPoolExecutor(min(jobs, len(items))) as pool:
+        return list(pool.map(function, items))

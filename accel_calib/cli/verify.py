@@ -1,0 +1,96 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib verify``: how well a calibration does on poses it has not seen."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..errors import AccelCalibError
+from . import options
+
+_SUMMARY = 'say how well a calibration does on poses it has not seen'
+_EXAMPLE = 'accel-calib verify other_poses.csv -c calibration.yaml'
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    made = options.command(commands, 'verify', _SUMMARY, _EXAMPLE)
+    made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
+                      help='pose table (CSV), in the unit of the calibration')
+    made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
+                      help='stored calibration')
+    made.add_argument('--rows', metavar='A:B', help='use these rows alone, from 1, both ends held')
+    made.add_argument('--jobs', type=int, default=1, metavar='N', help='N tables at a time')
+    options.add_json(made)
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Verify and say what came out."""
+    if len(args.poses) == 1:
+        result = _verify(args, args.poses[0])
+        options.write_json(args.json, result)
+        results = [result]
+    else:
+        results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
+        options.write_json(args.json, results)
+    _show(args, results)
+    return 2 if any('error' in result for result in results) else 0
+
+
+def _verify(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    from ..calibrate import check_units, verify
+    from ..files import read_calibration, read_poses
+
+    calibration = read_calibration(args.calibration)
+    poses = options.rows_between(read_poses(path), args.rows)
+    check_units(poses, calibration.units)
+    return {'file': path, 'poses': len(poses), **asdict(verify(calibration, poses))}
+
+
+def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    """Verify on one of several tables; what is wrong with it becomes its result."""
+    try:
+        return _verify(args, path)
+    except AccelCalibError as err:
+        return {'file': path, 'error': err.message, 'advice': err.advice}
+    except OSError as err:
+        return {'file': path, 'error': f'{err.filename}: {err.strerror}',
+                'advice': 'check its name'}
+
+
+def _show(args: argparse.Namespace, results: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table(title='Error of |force| on these poses')
+    for name in ('poses', 'gap before, mg', 'after, mg', 'largest after, mg',
+                 'noise floor, mg'):
+        table.add_column(name, justify='right')
+    console = options.say(args)
+    for result in results:
+        if 'error' in result:
+            console.print(f'{result["file"]}: {result["error"]}; {result["advice"]}',
+                          markup=False)
+            continue
+        floor = result['noise_floor_mg']
+        table.add_row(str(result['file']), f'{result["rms_before_mg"]:.3g}',
+                      f'{result["rms_after_mg"]:.3g}', f'{result["max_after_percent"] * 10:.3g}',
+                      'not known' if floor is None else f'{floor:.3g}')
+    console.print(table)

@@ -1,0 +1,270 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command line: results, JSON, and one line for bad input."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from accel_calib.cli.main import main, parser
+from accel_calib.cli.options import plain
+from accel_calib.files import read_calibration, read_poses, write_table
+from accel_calib.simulate import parse_effect
+
+EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
+           '--effect', 'cross_axis=0.004,0.002,-0.003']
+FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_sd', 'covariance',
+            'poses_used', 'poses_rejected', 'rms_before_mg', 'rms_after_mg', 'max_after_percent',
+            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings'}
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def run_json(capsys, *arguments):
+    status = run(*arguments, '--json', '-')
+    return status, json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture
+def poses(tmp_path):
+    path = tmp_path / 'poses.csv'
+    assert run('simulate', '-o', path, *EFFECTS, '--poses', 24) == 0
+    return path
+
+
+@pytest.fixture
+def calibration(poses, tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    assert run('fit', poses, '-o', path, '--sensor', 'imu_link') == 0
+    return path
+
+
+def test_fit_finds_the_effects_that_were_simulated(poses, capsys):
+    status, result = run_json(capsys, 'fit', poses)
+    assert status == 0
+    assert set(result) >= FIT_KEYS
+    offset = parse_effect(EFFECTS[1])[1] * 9.80665
+    np.testing.assert_allclose(result['offset'], offset, atol=4 * max(result['offset_sd']))
+    assert result['rms_after_mg'] < 0.5 < result['rms_before_mg']
+    assert np.array(result['covariance']).shape == (9, 9)
+    assert len(result['parameters']) == 9
+
+
+@pytest.mark.parametrize(('model', 'keys'), [('9', {'shifts', 'scales', 'angles'}),
+                                             ('12', {'matrix', 'shift'})])
+def test_fit_adds_the_reports_own_names(model, keys, tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    run('simulate', '-o', path, *EFFECTS, '--reference')
+    capsys.readouterr()
+    status, result = run_json(capsys, 'fit', path, '--model', model)
+    assert status == 0
+    assert keys <= set(result)
+    if model == '12':
+        np.testing.assert_allclose(result['matrix'], result['gain'])
+    else:
+        assert set(result['angles']) == {'phi', 'psi', 'theta'}
+
+
+@pytest.mark.parametrize('units', ['m/s2', 'g', 'native'])
+def test_simulation_fit_and_verify_agree_in_every_unit(units, tmp_path, capsys):
+    poses, stored = tmp_path / 'poses.csv', tmp_path / 'c.yaml'
+    run('simulate', '-o', poses, *EFFECTS, '--units', units, '--seed', 1)
+    assert run('fit', poses, '-o', stored, '--units', units) == 0
+    run('simulate', '-o', poses, *EFFECTS, '--units', units, '--seed', 2)
+    capsys.readouterr()
+    status, result = run_json(capsys, 'verify', poses, '-c', stored)
+    assert status == 0
+    assert result['rms_after_mg'] < 1.5 * result['noise_floor_mg']
+    assert set(result) >= {'rms_before_mg', 'rms_after_mg', 'max_after_percent',
+                           'noise_floor_mg'}
+
+
+def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    run('simulate', '-o', path, *EFFECTS, '--mounting', 20, -30, 0, '--poses', 30)
+    capsys.readouterr()
+    status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
+    assert status == 0
+    assert result['poses_used'] == 29
+    from accel_calib.simulate import rotation_from_rpy
+    expected = rotation_from_rpy(*np.radians((20, -30, 0)))[:, 2]
+    np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
+
+
+def test_a_recording_is_captured_fitted_and_corrected(tmp_path, capsys):
+    recording, poses, stored, out = (tmp_path / name for name in ('r.csv', 'p.csv', 'c.yaml',
+                                                                  'o.csv'))
+    run('simulate', '-o', recording, '--recording', *EFFECTS, '--poses', 14, '--temperature', 20,
+        30)
+    capsys.readouterr()
+    status, result = run_json(capsys, 'capture', recording, '-o', poses)
+    assert status == 0
+    assert result['poses'] == 14
+    assert set(result) >= {'poses', 'samples', 'threshold', 'seconds'}
+    assert 'temperature' in read_poses(poses)
+    assert run('fit', poses, '-o', stored) == 0
+    assert run('apply', recording, '-c', stored, '-o', out) == 0
+    assert run('capture', out, '-o', poses) == 0
+    lengths = np.linalg.norm(read_poses(poses).reading, axis=1)
+    np.testing.assert_allclose(lengths, 9.80665, atol=0.01)
+
+
+def test_several_tables_give_a_list_in_their_order(tmp_path, capsys):
+    tables = []
+    for seed in range(3):
+        tables.append(tmp_path / f'{seed}.csv')
+        run('simulate', '-o', tables[-1], *EFFECTS, '--seed', seed)
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('ax,ay\n1,2\n')
+    tables.insert(1, bad)
+    folder = tmp_path / 'out'
+    folder.mkdir()
+    capsys.readouterr()
+    status, results = run_json(capsys, 'fit', *tables, '--jobs', 2, '-o', folder)
+    assert status == 2
+    assert [result['file'] for result in results] == [str(table) for table in tables]
+    assert 'lacks ay' in results[1]['error'] or 'lacks az' in results[1]['error']
+    assert sorted(path.name for path in folder.iterdir()) == ['0.yaml', '1.yaml', '2.yaml']
+    status, results = run_json(capsys, 'verify', *tables[2:], '-c', folder / '0.yaml')
+    assert status == 0
+    assert all(result['rms_after_mg'] < 1 for result in results)
+
+
+def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
+    status, result = None, None
+    status = run('fit', poses, '--rows', '1:5', '--model', '10', '--json', '-')
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert status == 2
+    assert set(result) == {'error', 'advice'}
+    assert 'turn the sensor so that' in result['advice']
+    assert printed.err.startswith('accel-calib fit: 5 poses, model 10 needs')
+    assert printed.err.count('\n') == 1
+
+
+def bad_table(folder, text):
+    path = folder / 'bad.csv'
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(('text', 'says'), [
+    ('', 'is empty'), ('ax,ay,az\n1,2,x\n', "'x', expected a finite number"),
+    ('ax,ay,az\n' + '9000,100,16000\n' * 12, 'units of the readings: native'),
+    ('ax,ay,az\n' + '0,0,9.8\n' * 12, 'all have the same orientation'),
+])
+def test_a_bad_table_leaves_what_was_stored(text, says, calibration, tmp_path, capsys):
+    stored = calibration.read_text()
+    capsys.readouterr()
+    assert run('fit', bad_table(tmp_path, text), '-o', calibration) == 2
+    printed = capsys.readouterr()
+    assert says in printed.err
+    assert printed.err.count('\n') == 1
+    assert printed.out == ''
+    assert calibration.read_text() == stored
+
+
+@pytest.mark.parametrize('arguments', [
+    ('fit', 'missing.csv'), ('capture', 'missing.csv', '-o', 'x.csv'),
+    ('capture', 'missing.mcap', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'missing.yaml'),
+    ('apply', 'missing.csv', '-c', 'calibration.yaml', '-o', 'x.csv'),
+    ('fit', 'poses.csv', '-o', 'no_folder/c.yaml'), ('fit', 'poses.csv', '--rows', '3:2'),
+    ('fit', 'poses.csv', '--rows', '0:5'), ('fit', 'poses.csv', '--rows', 'a:b'),
+    ('fit', 'poses.csv', '--rows', '1:99'), ('fit', 'poses.csv', '--flat', '99'),
+    ('fit', 'poses.csv', 'poses.csv', '-o', 'calibration.yaml'),
+    ('fit', 'poses.csv', '--units', 'g'), ('simulate', '-o', 'x.csv', '--effect', 'wobble=1'),
+    ('simulate', '-o', 'x.csv', '--poses', '0'), ('simulate', '-o', 'no_folder/x.csv'),
+    ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
+    ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
+])
+def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, capsys,
+                                            monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    there = sorted(tmp_path.iterdir())
+    capsys.readouterr()
+    assert run(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f'accel-calib {arguments[0]}: ')
+    assert printed.err.count('\n') == 1
+    assert 'Traceback' not in printed.err
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_a_recording_that_never_rests_is_refused(tmp_path, capsys):
+    path = tmp_path / 'r.csv'
+    run('simulate', '-o', path, '--recording', '--dwell', 0.05, '--turn', 2, '--poses', 10)
+    capsys.readouterr()
+    assert run('capture', path, '-o', tmp_path / 'p.csv') == 2
+    assert 'no still stretch' in capsys.readouterr().err
+
+
+def test_a_newer_calibration_is_refused(calibration, poses, capsys):
+    calibration.write_text(calibration.read_text().replace('version: 1\n', 'version: 7\n'))
+    capsys.readouterr()
+    assert run('verify', poses, '-c', calibration) == 2
+    assert 'has version 7, this package reads up to 1' in capsys.readouterr().err
+
+
+def test_stored_calibration_says_whose_it_is(calibration):
+    found = read_calibration(calibration)
+    assert found.sensor == 'imu_link'
+    assert found.date[:2] == '20'
+
+
+def commands():
+    return list(parser()._subparsers._group_actions[0].choices)
+
+
+@pytest.mark.parametrize('command', commands())
+def test_every_command_has_help_with_an_example(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, '--help'])
+    assert stop.value.code == 0
+    assert f'example:\n  accel-calib {command}' in capsys.readouterr().out
+
+
+def test_wrong_arguments_exit_with_2(capsys):
+    for arguments in ([], ['fly'], ['fit'], ['fit', 'x', '--gravity', '-1']):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+    capsys.readouterr()
+
+
+def test_module_runs_as_a_process(poses):
+    done = subprocess.run([sys.executable, '-m', 'accel_calib.cli.main', 'fit', str(poses)],
+                          capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    assert 'gap (RMS)' in done.stdout
+
+
+def test_json_holds_no_nan():
+    assert plain({'a': np.array([1.0, np.nan]), 'b': (np.inf, None)}) == {
+        'a': [1.0, None], 'b': [None, None]}
+
+
+def test_disturbed_row_is_named(poses, capsys):
+    table = read_poses(poses)
+    reading = table.reading.copy()
+    reading[6] *= 1.05
+    write_table(poses, table.with_columns(reading=reading))
+    _, result = run_json(capsys, 'fit', poses)
+    assert [rejected['row'] for rejected in result['poses_rejected']] == [7]
+    assert 'disturbed' in result['poses_rejected'][0]['reason']
