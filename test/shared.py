@@ -16,11 +16,10 @@
 
 from pathlib import Path
 
-import numpy as np
-import pytest
-
 from accel_calib.model import Model
 from accel_calib.simulate import model_with
+import numpy as np
+import pytest
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 

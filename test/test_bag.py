@@ -14,20 +14,19 @@
 
 """Bags of every kind, written by `rosbags`, read and corrected without ROS."""
 
-import numpy as np
-import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
-from rosbags.typesys import get_typestore, Stores
-
-from accel_calib.capture import capture
 from accel_calib.calibrate import fit_poses
+from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.files import correct_bag, read_recording
 from accel_calib.simulate import simulate_recording, spread_directions
 from accel_calib.units import units_of
-
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import get_typestore, Stores
 from shared import sensor
 
 KINDS = ['mcap', 'sqlite3', 'bag']

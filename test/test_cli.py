@@ -18,13 +18,12 @@ import json
 import subprocess
 import sys
 
-import numpy as np
-import pytest
-
 from accel_calib.cli.main import main, parser
 from accel_calib.cli.options import plain
 from accel_calib.files import read_calibration, read_poses, write_table
 from accel_calib.simulate import parse_effect
+import numpy as np
+import pytest
 
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']

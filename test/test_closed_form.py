@@ -14,14 +14,12 @@
 
 """Closed forms recover a sensor exactly, in any unit."""
 
-import numpy as np
-import pytest
-
 from accel_calib.calibrate import closed_form
 from accel_calib.errors import RefusedFitError
 from accel_calib.model import predict
 from accel_calib.simulate import random_directions, spread_directions
-
+import numpy as np
+import pytest
 from shared import sensor
 
 FITS = {'4': (closed_form.fit_4, ('offset', 'gain')),

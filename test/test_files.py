@@ -16,19 +16,24 @@
 
 import os
 
-import numpy as np
-import pytest
-
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import (check_sensor, format_calibration, parse_calibration,
-                               read_calibration, read_poses, read_samples, write_calibration,
-                               write_table)
+from accel_calib.files import (
+    check_sensor,
+    format_calibration,
+    parse_calibration,
+    read_calibration,
+    read_poses,
+    read_samples,
+    write_calibration,
+    write_table,
+)
 from accel_calib.files.atomic import before
 from accel_calib.simulate import simulate_poses, spread_directions
 from accel_calib.table import COLUMNS, numbered, Poses
 from accel_calib.units import units_of
-
+import numpy as np
+import pytest
 from shared import sensor
 
 GOOD = '# a comment\nax,ay,az\n1,2,3\n4,5,6\n'

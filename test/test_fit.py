@@ -14,18 +14,20 @@
 
 """Poses to calibration: known sensors recovered inside the stated uncertainty, or refused."""
 
-import numpy as np
-import pytest
-
 from accel_calib.calibrate import fit_poses, in_g, level, sensing_axes, verify
 from accel_calib.calibrate.sensing_axes import gain_of, lower_triangular
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.model import predict
-from accel_calib.simulate import (random_directions, rotation_from_rpy, simulate_poses,
-                                  spread_directions)
-from accel_calib.table import Poses, numbered
+from accel_calib.simulate import (
+    random_directions,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
+from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
-
+import numpy as np
+import pytest
 from shared import sensor
 
 G = units_of('g')
@@ -161,7 +163,7 @@ def without(poses, *keys):
 
 
 def test_unknown_noise_is_taken_from_the_residuals():
-    model, poses = simulated(9, 60)
+    poses = simulated(9, 60)[1]
     known, unknown = fit_poses(poses, G, model='10'), fit_poses(without(poses, 'std'), G,
                                                                model='10')
     assert unknown.quality.noise_floor_mg is None

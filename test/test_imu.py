@@ -14,16 +14,18 @@
 
 """Imu messages: one frame, and the conventions of their covariances."""
 
-import numpy as np
-import pytest
-
 from accel_calib import imu
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.model import predict
-from accel_calib.simulate import (random_directions, rotation_from_rpy, simulate_poses,
-                                  spread_directions)
+from accel_calib.simulate import (
+    random_directions,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
 from accel_calib.units import units_of
-
+import numpy as np
+import pytest
 from shared import sensor
 
 UNITS = units_of('m/s2')

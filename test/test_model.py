@@ -14,14 +14,23 @@
 
 """The measurement equation: predict and correct undo each other."""
 
-import numpy as np
-import pytest
-
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
-from accel_calib.model import (correct, force_slope, Model, MODELS, parameter_basis,
-                               parameter_names, predict, reading_of, with_linear_part, with_vector)
+from accel_calib.model import (
+    correct,
+    force_slope,
+    Model,
+    MODELS,
+    parameter_basis,
+    parameter_names,
+    predict,
+    reading_of,
+    with_linear_part,
+    with_vector,
+)
 from accel_calib.simulate import parse_effect, random_directions, rotation_from_rpy
+import numpy as np
+import pytest
 
 
 @pytest.fixture

@@ -14,13 +14,11 @@
 
 """Mounting from a flat pose: every frame, every attitude, the singular ones too."""
 
-import numpy as np
-import pytest
-
-from accel_calib.calibrate.mounting import (flat_direction, FRAMES, mounting,
-                                            mounting_with_heading)
+from accel_calib.calibrate.mounting import flat_direction, FRAMES, mounting, mounting_with_heading
 from accel_calib.errors import InputError
 from accel_calib.simulate import random_directions, rotation_from_rpy
+import numpy as np
+import pytest
 
 ATTITUDES = [(0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0),
              (0, 180, 0), (0, 0, 90), (20, -30, 40), (90, 90, 90), (179.9, 0.1, 0)]

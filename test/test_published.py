@@ -16,15 +16,13 @@
 
 import json
 
-import numpy as np
-import pytest
-
 from accel_calib.calibrate import fit_poses, sensing_axes, verify
 from accel_calib.calibrate.closed_form import fit_six_faces, two_position
 from accel_calib.cli.main import main
 from accel_calib.files import read_poses
 from accel_calib.units import units_of
-
+import numpy as np
+import pytest
 from shared import data
 
 HUAWEI, SECOND, THIRD = (f'esgi95_dataset{name}.csv' for name in ('1_huawei', '2', '3_gt'))

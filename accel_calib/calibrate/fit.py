@@ -38,7 +38,7 @@ from .selection import choose
 from .sensing_axes import lower_triangular, TIES
 from ..errors import InputError, RefusedFitError
 from ..model import Model, MODELS, with_linear_part
-from ..table import Floats, Poses
+from ..table import Floats, Poses, Table
 from ..units import MG, Units
 
 Method = Literal['ml', 'algebraic']
@@ -91,7 +91,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     return _fit_unknown(poses, units, model, method, sensor, date)
 
 
-def check_units(poses: Poses, units: Units) -> None:
+def check_units(poses: Table, units: Units) -> None:
     """
     Make sure that still readings are about 1 g long.
 

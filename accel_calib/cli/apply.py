@@ -20,8 +20,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
 from . import options
+from ..calibrate import Calibration, check_units
+from ..errors import InputError
+from ..files import correct_bag, is_bag, read_calibration, read_samples, write_table
 
 _SUMMARY = 'correct a recording with a calibration'
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
@@ -42,8 +44,6 @@ def add_to(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Correct and say how many samples there were."""
-    from ..files import correct_bag, is_bag, read_calibration
-
     calibration = read_calibration(args.calibration)
     if is_bag(args.recording):
         count = correct_bag(args.recording, calibration, args.output, args.topic)
@@ -53,10 +53,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _correct_table(path: Path, calibration: Any, out: Path) -> int:
-    from ..calibrate import check_units
-    from ..files import read_samples, write_table
-
+def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
     if out.exists() and out.samefile(path):
         raise InputError(f'{out} is the recording itself', 'give another name')
     recording = read_samples(path)

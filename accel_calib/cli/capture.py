@@ -20,12 +20,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
 from . import options
+from ..calibrate import check_units
+from ..capture import capture, CaptureSettings
+from ..capture.settings import REPEATED
+from ..errors import InputError
+from ..files import read_recording, write_table
+from ..units import Units, units_of
 
 _SUMMARY = 'find the still stretches of a recording and write the pose table'
 _EXAMPLE = 'accel-calib capture recording.mcap -o poses.csv'
-_REPEATED = ('keep', 'merge', 'refuse')
 
 
 def add_to(commands: Any) -> None:
@@ -51,7 +55,7 @@ def add_to(commands: Any) -> None:
                       help='cut a longer stretch into poses that share their orientation')
     made.add_argument('--min-pose-angle', type=options.positive, metavar='RAD',
                       help='poses within this angle count as repeated')
-    made.add_argument('--repeated', choices=_REPEATED,
+    made.add_argument('--repeated', choices=REPEATED,
                       help='what becomes of a repeated pose (default: keep)')
     options.add_units(made)
     options.add_json(made)
@@ -60,13 +64,8 @@ def add_to(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Capture, write the poses, and say how many there are."""
-    from ..calibrate import check_units
-    from ..capture import capture
-    from ..files import read_recording, write_table
-    from ..units import Units, units_of
-
     source = read_recording(args.recording, args.topic)
-    units: Units = units_of(source.units or args.units, args.gravity)
+    units = units_of(source.units or args.units, args.gravity)
     check_units(source.recording, units)
     captured = capture(source.recording, units, _settings(args, units))
     if len(captured.poses) == 0:
@@ -88,10 +87,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(args: argparse.Namespace, units: Any) -> Any:
+def _settings(args: argparse.Namespace, units: Units) -> CaptureSettings:
     """Give the settings that were asked for, the others as they are by default."""
-    from ..capture import CaptureSettings
-
     names = ('still_window', 'still_std_max', 'still_gyro_max', 'still_norm_tolerance',
              'min_dwell', 'max_dwell', 'min_pose_angle', 'repeated')
     asked = {name: getattr(args, name) for name in names if getattr(args, name) is not None}

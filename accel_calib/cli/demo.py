@@ -17,9 +17,14 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from dataclasses import asdict
+from typing import Any, TYPE_CHECKING
 
 from . import options
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 _SUMMARY = 'the main job without hardware: simulated Imu, calibrator node, before and after'
 _EXAMPLE = 'accel-calib demo'
@@ -34,6 +39,30 @@ def add_to(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run simulator and calibrator in processes of their own and show what comes of it."""
-    from ..ros.demo import main
+    try:
+        from ..ros.demo import demonstrate
+    except ImportError as err:
+        raise InputError(f'ROS 2 is not here ({err}), the demonstration needs it',
+                         "source /opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'"
+                         ) from err
+    console = options.say(args)
+    outcome = asdict(demonstrate(lambda line: console.print(line, markup=False)))
+    options.write_json(args.json, outcome)
+    console.print(_table(outcome))
+    return 0
 
-    return main(args)
+
+def _table(outcome: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table(title=f'Turned again, at rest in {outcome["rests"]} orientations, '
+                  f'after {outcome["seconds"]:.0f} s')
+    table.add_column('')
+    for name in ('imu/data_raw', 'imu/data_calibrated'):
+        table.add_column(name, justify='right')
+    for words, name, unit in (('error of |a|, RMS', 'rms', 'mg'),
+                              ('error of |a|, largest', 'max', 'mg'),
+                              ('error of up, RMS', 'tilt', 'deg')):
+        table.add_row(f'{words} [{unit}]'.replace('[', '\\['),
+                      *(f'{outcome[f"{name}_{when}_{unit}"]:.3g}' for when in ('before', 'after')))
+    return table

@@ -21,17 +21,14 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from ..errors import AccelCalibError, InputError
 from . import options
+from .results import fit_result, parameter_table, quality_table
+from ..calibrate import Calibration, fit_poses, FRAMES, level, METHODS, MODEL_NAMES
+from ..errors import AccelCalibError, InputError
+from ..files import read_poses, write_calibration
 
-if TYPE_CHECKING:
-    from ..calibrate import Calibration
-
-_MODELS = ('auto', '4', '7', '9', '10', '12')
-_METHODS = ('ml', 'algebraic')
-_FRAMES = ('ros', 'ned', 'android', 'win8')
 _SUMMARY = 'fit a calibration to still poses'
 _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
 
@@ -42,17 +39,17 @@ def add_to(commands: Any) -> None:
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
                       help='where to store the calibration (YAML); a folder for several POSES')
-    made.add_argument('--model', choices=_MODELS, default='auto',
+    made.add_argument('--model', choices=MODEL_NAMES, default='auto',
                       help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
                       'cross-axis; 12: known orientation; auto (default): the smallest that the '
                       'data call for')
-    made.add_argument('--method', choices=_METHODS, default='ml',
+    made.add_argument('--method', choices=METHODS, default='ml',
                       help='ml (default) weighs poses by their noise and leaves out disturbed '
                       "ones; algebraic is the documents' own costs, every row kept")
     made.add_argument('--rows', metavar='A:B', help='use these rows alone, from 1, both ends held')
     made.add_argument('--flat', type=int, metavar='ROW', help='the pose in which the robot was '
                       'level: the mounting is taken out')
-    made.add_argument('--frame', choices=_FRAMES, default='ros',
+    made.add_argument('--frame', choices=FRAMES, default='ros',
                       help='levelled frame (default: ros, z up)')
     made.add_argument('--sensor', default='', help='which sensor this is (frame_id of its Imu)')
     made.add_argument('--jobs', type=int, default=1, metavar='N', help='fit N tables at a time')
@@ -83,8 +80,6 @@ def _run_one(args: argparse.Namespace) -> int:
         options.write_json(args.json, {'error': err.message, 'advice': err.advice})
         raise
     _store(calibration, args.output)
-    from .results import fit_result
-
     options.write_json(args.json, {'file': args.poses[0], **fit_result(calibration)})
     _show(args, calibration)
     return 0
@@ -92,9 +87,6 @@ def _run_one(args: argparse.Namespace) -> int:
 
 def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
     """Fit one pose table as the options say."""
-    from ..calibrate import fit_poses, level
-    from ..files import read_poses
-
     table = read_poses(path)
     units = options.units_from(args)
     date = datetime.now(timezone.utc).isoformat(timespec='seconds')
@@ -108,8 +100,6 @@ def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     """Fit one of several pose tables; what is wrong with it becomes its result."""
-    from .results import fit_result
-
     try:
         calibration = fit_file(args, path)
         _store(calibration, args.output and args.output / f'{path.stem}.yaml')
@@ -123,8 +113,6 @@ def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
 
 def _store(calibration: Calibration, output: Path | None) -> None:
     if output is not None:
-        from ..files import write_calibration
-
         write_calibration(output, calibration)
 
 
@@ -137,8 +125,6 @@ def _in_a_line(result: dict[str, Any]) -> str:
 
 def _show(args: argparse.Namespace, calibration: Calibration) -> None:
     """Tell a person what came out."""
-    from .results import parameter_table, quality_table
-
     console = options.say(args)
     console.print(quality_table(calibration))
     console.print(parameter_table(calibration))

@@ -20,9 +20,9 @@ import argparse
 from collections.abc import Sequence
 import sys
 
+from . import apply, capture, demo, fit, nodes, simulate, verify
 from .. import __version__
 from ..errors import AccelCalibError
-from . import apply, capture, demo, fit, nodes, simulate, verify
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -51,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0, or 2 after bad input, with one line on standard error.
 
     """
-    args = parser().parse_args(arguments)
+    own, for_ros = nodes.split(sys.argv[1:] if arguments is None else arguments)
+    args = parser().parse_args(own)
+    args.for_ros = for_ros
     try:
         status: int = args.run(args)
     except AccelCalibError as err:

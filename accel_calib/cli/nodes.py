@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 from . import options
@@ -30,15 +32,18 @@ def add_to(commands: Any) -> None:
             ('simulator', 'simulator', 'run the simulated Imu node',
              'accel-calib simulator --ros-args -p poses:=12')):
         made = options.command(commands, name, summary, example)
-        made.add_argument('arguments', nargs=argparse.REMAINDER, metavar='--ros-args ...',
-                          help='passed on to ROS')
+        made.epilog = f'{made.epilog}\n\nall from --ros-args on is passed on to ROS'
         made.set_defaults(run=run, module=module)
+
+
+def split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """Part the arguments of this program from those of ROS, which argparse would not let by."""
+    at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    return arguments[:at], arguments[at:]
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the node until it is told to stop."""
-    from importlib import import_module
-
     module = import_module(f'accel_calib.ros.{args.module}')
-    status: int = module.main([args.command, *args.arguments])
+    status: int = module.main([args.command, *args.for_ros])
     return status

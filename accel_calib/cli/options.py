@@ -20,7 +20,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 import json
 from pathlib import Path
-import sys
 from typing import Any
 
 import numpy as np

@@ -20,7 +20,22 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from . import options
+from ..errors import InputError
+from ..files import write_table
+from ..model import Model
+from ..simulate import (
+    model_with,
+    parse_effect,
+    rotation_from_rpy,
+    simulate_poses,
+    simulate_recording,
+    spread_directions,
+)
+from ..table import Floats, Poses, Recording
+from ..units import Units
 
 _SUMMARY = 'simulate poses or a recording of a sensor with known effects'
 _EXAMPLE = ('accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
@@ -63,25 +78,17 @@ def add_to(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and write."""
-    from ..files import write_table
-
     if args.poses < 1 or args.samples < 1 or args.noise < 0.0:
-        from ..errors import InputError
-
         raise InputError(f'--poses {args.poses}, --samples {args.samples}, --noise {args.noise}',
                          'give at least one pose of one sample, and noise of 0 or more')
-    table = _recording(args) if args.recording else _poses(args)
+    table: Poses | Recording = _recording(args) if args.recording else _poses(args)
     write_table(args.output, _in_units(table, options.units_from(args)))
     options.say(args).print(f'{len(table)} rows, stored in {args.output}', markup=False)
     return 0
 
 
-def _setting(args: argparse.Namespace) -> tuple[Any, Any, Any]:
+def _setting(args: argparse.Namespace) -> tuple[Model, Floats, np.random.Generator]:
     """Give the sensor, the directions of its poses, and the source of noise."""
-    import numpy as np
-
-    from ..simulate import model_with, parse_effect, rotation_from_rpy, spread_directions
-
     effects = dict(parse_effect(text) for text in args.effect)
     model = model_with(effects, rotation_from_rpy(*np.radians(args.mounting)))
     flat = np.array([[0.0, 0.0, 1.0]])
@@ -89,22 +96,16 @@ def _setting(args: argparse.Namespace) -> tuple[Any, Any, Any]:
     return model, directions, np.random.default_rng(args.seed)
 
 
-def _poses(args: argparse.Namespace) -> Any:
-    import numpy as np
-
-    from ..simulate import simulate_poses
-
+def _poses(args: argparse.Namespace) -> Poses:
     model, directions, rng = _setting(args)
     context = {'reference': directions} if args.reference else {}
     if args.temperature:
-        context['temperature'] = np.linspace(*args.temperature, args.poses)
+        context['temperature'] = np.linspace(args.temperature[0], args.temperature[1], args.poses)
     return simulate_poses(model, directions, rng, noise_g=args.noise, samples=args.samples,
                           context=context)
 
 
-def _recording(args: argparse.Namespace) -> Any:
-    from ..simulate import simulate_recording
-
+def _recording(args: argparse.Namespace) -> Recording:
     model, directions, rng = _setting(args)
     recording = simulate_recording(
         model, directions, rng, noise_g=args.noise, rate_hz=args.rate, dwell=args.dwell,
@@ -115,7 +116,7 @@ def _recording(args: argparse.Namespace) -> Any:
     return type(recording)(columns, recording.row)
 
 
-def _in_units(table: Any, units: Any) -> Any:
+def _in_units(table: Poses | Recording, units: Units) -> Poses | Recording:
     """Give a table in g in the unit that was asked for."""
     scaled = {key: units.from_g(table[key]) for key in ('reading', 'std', 'reference')
               if key in table}

@@ -22,8 +22,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..errors import AccelCalibError
 from . import options
+from ..calibrate import check_units, verify
+from ..errors import AccelCalibError
+from ..files import read_calibration, read_poses
 
 _SUMMARY = 'say how well a calibration does on poses it has not seen'
 _EXAMPLE = 'accel-calib verify other_poses.csv -c calibration.yaml'
@@ -56,9 +58,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    from ..calibrate import check_units, verify
-    from ..files import read_calibration, read_poses
-
     calibration = read_calibration(args.calibration)
     poses = options.rows_between(read_poses(path), args.rows)
     check_units(poses, calibration.units)

@@ -29,12 +29,12 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from .bag import imu_connections, open_bag, stamp_of, tail_of, temperature_at
+from .calibration_yaml import check_sensor
 from ..calibrate import Calibration
 from ..errors import InputError
 from ..imu import corrected, FIELDS
 from ..table import Floats
-from .bag import imu_connections, open_bag, stamp_of, tail_of, temperature_at
-from .calibration_yaml import check_sensor
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -105,7 +105,8 @@ def _writer(reader: AnyReader, path: Path, out: Path) -> Writer1 | Writer2:
         from rosbags.rosbag1 import Writer as Rosbag1Writer
 
         return Rosbag1Writer(out)
-    from rosbags.rosbag2 import StoragePlugin, Writer as Rosbag2Writer
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Rosbag2Writer
 
     mcap = path.suffix == '.mcap' or any(path.glob('*.mcap'))
     return Rosbag2Writer(out, version=9, storage_plugin=StoragePlugin.MCAP if mcap

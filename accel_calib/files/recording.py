@@ -19,10 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..table import Recording
-from ..units import UnitName
 from .bag import is_bag, read_bag
 from .table_csv import read_samples
+from ..table import Recording
+from ..units import UnitName
 
 
 @dataclass(frozen=True)

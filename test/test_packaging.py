@@ -1,0 +1,148 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the package says of itself agrees, and what it ships is there."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import importlib
+import os
+from pathlib import Path
+import re
+import runpy
+from typing import Any
+from xml.etree import ElementTree
+
+import accel_calib
+import pytest
+import yaml
+
+ROOT = Path(__file__).parent.parent
+
+ROSDEP_KEYS = {
+    'PyYAML': 'python3-yaml',
+    'numpy': 'python3-numpy',
+    'pytest': 'python3-pytest',
+    'rich': 'python3-rich',
+    'rosbags': 'python3-rosbags-pip',
+    'scipy': 'python3-scipy',
+}
+
+
+@contextmanager
+def working_folder(path: Path) -> Iterator[None]:
+    before = Path.cwd()
+    os.chdir(path)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture
+def setup_py(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Give what setup.py hands to setuptools."""
+    setuptools = pytest.importorskip('setuptools')
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **keywords: given.update(keywords))
+    with working_folder(ROOT):
+        runpy.run_path('setup.py')
+    return given
+
+
+@pytest.fixture
+def package_xml() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / 'package.xml').getroot()
+
+
+def texts(element: ElementTree.Element, tag: str) -> list[str]:
+    return [' '.join((child.text or '').split()) for child in element.findall(tag)]
+
+
+def distributions(requirements: list[str]) -> set[str]:
+    return {re.split(r'[^\w.-]', requirement)[0] for requirement in requirements}
+
+
+@pytest.mark.parametrize('tag', ['name', 'version', 'description', 'license', 'maintainer'])
+def test_package_xml_and_setup_py_agree(
+        tag: str, setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
+    assert texts(package_xml, tag) == [setup_py[tag]]
+
+
+def test_version_is_that_of_the_package(setup_py: dict[str, Any]) -> None:
+    assert setup_py['version'] == accel_calib.__version__
+
+
+def test_email_of_the_maintainer_agrees(
+        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
+    assert package_xml.find('maintainer').get('email') == setup_py['maintainer_email']
+
+
+def test_each_requirement_has_its_rosdep_key(
+        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
+    wanted = {ROSDEP_KEYS[name] for name in distributions(setup_py['install_requires'])}
+    listed = {key for key in texts(package_xml, 'exec_depend') if key.startswith('python3-')}
+    assert wanted == listed
+
+
+def test_what_the_nodes_import_is_in_package_xml(package_xml: ElementTree.Element) -> None:
+    sources = [path.read_text(encoding='utf-8')
+               for path in (ROOT / 'accel_calib' / 'ros').rglob('*.py')]
+    pattern = re.compile(r'^\s*(?:from|import) (rclpy|\w+_(?:msgs|srvs|interfaces))\b', re.M)
+    imported = {name for source in sources for name in pattern.findall(source)}
+    assert imported <= set(texts(package_xml, 'exec_depend'))
+
+
+def test_all_that_is_shipped_is_there(setup_py: dict[str, Any]) -> None:
+    shipped = {path for _, paths in setup_py['data_files'] for path in paths}
+    assert {'resource/accel_calib', 'package.xml', 'config/calibrator.yaml',
+            'launch/calibrator.launch.py', 'scripts/calibrator', 'scripts/simulator'} <= shipped
+    assert not [path for path in shipped if not (ROOT / path).is_file()]
+
+
+def test_every_folder_with_code_is_a_package(setup_py: dict[str, Any]) -> None:
+    folders = {path.parent for path in (ROOT / 'accel_calib').rglob('*.py')}
+    assert {'.'.join(path.relative_to(ROOT).parts) for path in folders} == set(
+        setup_py['packages'])
+
+
+@pytest.mark.parametrize('name', ['calibrator', 'simulator'])
+def test_scripts_can_be_executed(name: str) -> None:
+    assert os.access(ROOT / 'scripts' / name, os.X_OK)
+
+
+@pytest.mark.parametrize('name', ['accel-calib', 'calibrator', 'simulator'])
+def test_entry_points_are_importable(name: str, setup_py: dict[str, Any]) -> None:
+    scripts = setup_py['entry_points']['console_scripts']
+    entry_points = dict(re.split(r'\s*=\s*', script) for script in scripts)
+    module, function = entry_points[name].split(':')
+    if '.ros.' in module:
+        pytest.importorskip('rclpy')
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_parameter_file_addresses_the_node_in_any_namespace() -> None:
+    text = (ROOT / 'config' / 'calibrator.yaml').read_text(encoding='utf-8')
+    nodes = yaml.safe_load(text)
+    assert set(nodes) <= {'/**', '/**/calibrator', '/**/simulator'}
+    assert all('ros__parameters' in node for node in nodes.values())
+
+
+def test_launch_file_declares_its_arguments() -> None:
+    path = ROOT / 'launch' / 'calibrator.launch.py'
+    compile(path.read_text(encoding='utf-8'), path, 'exec')
+    pytest.importorskip('launch_ros', reason='not on PyPI')
+    description = runpy.run_path(str(path))['generate_launch_description']()
+    names = {argument.name for argument in description.get_launch_arguments()}
+    assert names == {'namespace', 'imu', 'output', 'params_file', 'calibration_file', 'sensor'}
