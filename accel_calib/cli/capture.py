@@ -75,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
                          '--still-std-max and --min-dwell')
     write_table(args.output, captured.poses)
     options.write_json(args.json, {
-        'poses': len(captured.poses), 'samples': captured.samples,
+        'poses': len(captured.poses), 'samples': len(source.recording),
+        'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
         'interruptions': [item._asdict() for item in captured.interruptions]})
     console = options.say(args)

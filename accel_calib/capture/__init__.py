@@ -1,0 +1,32 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Samples to still poses: streaming for the node, the same rule over arrays for recordings.
+
+The way of the data: `chunks` sums the samples over short stretches of header time, `rule` says
+of each whether the sensor is still, `tracker` joins still chunks to dwells, `run` sums a dwell,
+`dwell` judges it, `poses` makes the pose table. `detector` is the way in; both paths go through
+it. `sums`, `window` and `noise` are the arithmetic below.
+
+"""
+
+from .chunks import Interruption
+from .detector import StillDetector
+from .dwell import Dwell
+from .poses import capture, Captured, is_new, merged, poses_from, select
+from .settings import CaptureSettings, Repeated
+
+__all__ = ['capture', 'Captured', 'CaptureSettings', 'Dwell', 'Interruption', 'is_new', 'merged',
+           'poses_from', 'Repeated', 'select', 'StillDetector']

@@ -1,0 +1,220 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Samples to chunks: sums over short stretches of header time.
+
+Everything that follows works on chunks, a fifth of the still window each, so that the work per
+sample is a few additions whatever the window, and a recording of any length becomes a short
+table. A chunk is one row of sums, and the sum of two rows is the row of both chunks: windows
+and dwells are sums of rows. Samples are taken relative to the first sample of the stream before
+they are squared, which keeps the digits of a small noise on a large offset.
+
+The sample period is learned from the first samples of a segment, never from later ones, so that
+a stream and a recording are cut in the same places. A segment is a stretch without a gap and
+without a jump back in its stamps; after either the period is learned anew.
+
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from .settings import CaptureSettings
+from .sums import CHUNKS_PER_WINDOW, Indices, smallest_steps, sums_of, WIDTH
+from ..table import Floats
+
+_LEARN = 16          # intervals from which the period is learned
+_SAMPLES = 2         # samples of a chunk, at least
+_GAP_SECONDS = 0.5   # a gap is longer than this and than _GAP_PERIODS
+_GAP_PERIODS = 5.0
+_BACK_SECONDS = 0.01  # stamps out of order by no more than this, or _BACK_PERIODS, are jitter
+_BACK_PERIODS = 2.0
+_INTERRUPTIONS_MAX = 10_000
+_PENDING_MAX = 200_000  # samples of one chunk: more mean that the clock stands still
+
+
+class Interruption(NamedTuple):
+    """
+    A break in the stamps, which ends a dwell.
+
+    Parameters
+    ----------
+    time : float
+        Last stamp before it [s].
+    kind : {'gap', 'jump_back', 'stopped'}
+        Samples are missing; time went back (a bag played again, simulated time reset); stamps
+        did not move while samples came.
+    seconds : float
+        How far the next stamp is from the last [s], negative for a jump back.
+
+    """
+
+    time: float
+    kind: Literal['gap', 'jump_back', 'stopped']
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """
+    Consecutive chunks of one segment.
+
+    Parameters
+    ----------
+    sums : (m, ROW) array
+        Sums over the samples of each chunk; time relative to `epoch`, readings and rates
+        relative to `origin`.
+    begin, end : (m,) array
+        First and last stamp [s].
+    step : (m, 2) array
+        Smallest step between successive readings, and rates, that is not 0; infinite where
+        there is none.
+    epoch : float
+        Start of the segment [s].
+    origin : (6,) array
+        First reading and rate of the stream.
+    length : float
+        Length of a chunk [s].
+    period : float
+        Sample period [s].
+    fresh : bool
+        True for the first chunks of a segment.
+
+    """
+
+    sums: Floats
+    begin: Floats
+    end: Floats
+    step: Floats
+    epoch: float
+    origin: Floats
+    length: float
+    period: float
+    fresh: bool
+
+
+class Chunker:
+    """Turn samples into chunks, block after block; the same chunks whatever the blocks."""
+
+    def __init__(self, settings: CaptureSettings) -> None:
+        self._shortest = settings.still_window / CHUNKS_PER_WINDOW
+        self._pending: Floats = np.empty((0, WIDTH))
+        self._origin: Floats | None = None
+        self._period = -1.0
+        self._length = 0.0
+        self._epoch = 0.0
+        self._latest = 0.0
+        self._fresh = True
+        self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
+
+    @property
+    def boundary(self) -> float:
+        """Give the stamp that completes the chunk that is being filled [s]."""
+        if self._period < 0.0 or not len(self._pending):
+            return -np.inf
+        latest = max(self._latest, float(self._pending[:, 0].max()))
+        index = np.floor((latest - self._epoch) / self._length)
+        return float(self._epoch + (index + 1.0) * self._length)
+
+    def feed(self, samples: Floats, last: bool = False) -> list[Chunks]:
+        """
+        Give the chunks that these samples complete.
+
+        Parameters
+        ----------
+        samples : (n, WIDTH) array
+            Time [s], reading, rate, context.
+        last : bool
+            True if no more samples follow: a period is then learned from what is there.
+
+        """
+        pending = np.concatenate([self._pending, samples])
+        if self._origin is None and len(pending):
+            self._origin = np.nan_to_num(pending[0, 1:7])
+        done: list[Chunks] = []
+        while self._learned(pending, last):
+            cut = self._first_break(pending[:, 0])
+            chunks, rest = self._split(pending[:cut])
+            if len(chunks.begin):
+                done.append(chunks)
+                self._fresh = False
+            if cut == len(pending):
+                pending = rest
+                break
+            pending = pending[cut:]
+            self._period = -1.0
+            self._fresh = True
+        self._pending = self._bounded(pending)
+        return done
+
+    def restart(self) -> None:
+        """Begin a new segment with the next sample."""
+        self._pending = np.empty((0, WIDTH))
+        self._period = -1.0
+        self._fresh = True
+
+    def _learned(self, pending: Floats, last: bool) -> bool:
+        if self._period >= 0.0:
+            return True
+        if len(pending) <= (1 if last else _LEARN):
+            return False
+        steps = np.diff(pending[:_LEARN + 1, 0])
+        median = float(np.median(steps))
+        self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
+        self._length = max(self._shortest, _SAMPLES * self._period)
+        self._epoch = self._latest = float(pending[0, 0])
+        return True
+
+    def _first_break(self, time: Floats) -> int:
+        before = np.maximum.accumulate(np.concatenate([[self._latest], time]))[:-1]
+        step = time - before
+        gap = max(_GAP_SECONDS, _GAP_PERIODS * self._period)
+        back = max(_BACK_SECONDS, _BACK_PERIODS * self._period)
+        breaks = np.flatnonzero((step > gap) | (step < -back))
+        if not len(breaks):
+            return len(time)
+        cut = int(breaks[0])
+        kind: Literal['gap', 'jump_back'] = 'gap' if step[cut] > 0.0 else 'jump_back'
+        self.interruptions.append(Interruption(float(before[cut]), kind, float(step[cut])))
+        return cut
+
+    def _split(self, samples: Floats) -> tuple[Chunks, Floats]:
+        latest = np.maximum.accumulate(np.concatenate([[self._latest], samples[:, 0]]))[1:]
+        index = np.floor((latest - self._epoch) / self._length)
+        edges = np.flatnonzero(np.diff(index)) + 1
+        whole = int(edges[-1]) if len(edges) else 0
+        starts = np.concatenate([[0], edges[:-1]]) if whole else np.empty(0, dtype=np.int64)
+        if whole:
+            self._latest = float(latest[whole - 1])
+        return self._chunks(samples[:whole], starts.astype(np.intp)), samples[whole:]
+
+    def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
+        assert self._origin is not None
+        ends = np.append(starts[1:], len(samples)) - 1 if len(starts) else starts
+        return Chunks(sums_of(samples, starts, self._epoch, self._origin),
+                      samples[starts, 0], samples[ends, 0], smallest_steps(samples, starts),
+                      self._epoch, self._origin, self._length, self._period, self._fresh)
+
+    def _bounded(self, pending: Floats) -> Floats:
+        if len(pending) <= _PENDING_MAX or self._period < 0.0:
+            return pending
+        self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
+        self._period = -1.0
+        self._fresh = True
+        return np.empty((0, WIDTH))

@@ -1,0 +1,194 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The stillness detector: samples in, dwells out, one sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import math
+
+import numpy as np
+
+from .chunks import Chunker, Interruption
+from .dwell import Candidate, Dwell, finished
+from .rule import Rule
+from .settings import CaptureSettings
+from .sums import CONTEXT, WIDTH
+from .tracker import Tracker
+from ..table import Floats
+from ..units import Units
+
+_NO_RATE = (math.nan, math.nan, math.nan)
+_NO_CONTEXT: Mapping[str, float] = {}
+_BESIDE = 100    # dwells beside which a new one is judged
+_BUFFER = 4096   # samples that wait for a chunk to end, at most
+
+
+class StillDetector:
+    """
+    Find the dwells of one sensor, sample by sample or block by block.
+
+    Parameters
+    ----------
+    settings : CaptureSettings
+        What is still, and for how long.
+    units : Units
+        Unit of the readings.
+
+    """
+
+    def __init__(self, settings: CaptureSettings, units: Units) -> None:
+        self._settings = settings
+        self._chunker = Chunker(settings)
+        self._rule = Rule(settings, units)
+        self._tracker: Tracker | None = None
+        self._candidates: list[Candidate] = []
+        self._still = False
+        self._mean = np.full(6, np.nan)
+        self._number = 0
+        self._buffer: list[tuple[float, ...]] = []
+        self._latest = -math.inf
+        self._boundary = -math.inf
+
+    def push(self, time: float, reading: Sequence[float], rate: Sequence[float] | None = None,
+             context: Mapping[str, float] = _NO_CONTEXT) -> list[Dwell]:
+        """
+        Take one sample; the numbers must be finite.
+
+        Parameters
+        ----------
+        time : float
+            Header stamp [s].
+        reading : sequence of 3 floats
+            In the unit of the readings.
+        rate : sequence of 3 floats, optional
+            Angular rate [rad/s], or whatever the gyro gives.
+        context : mapping of str to float
+            ``temperature`` [°C] and ``supply_voltage`` [V] where known.
+
+        Returns
+        -------
+        list of Dwell
+            The dwells that ended, as far as they are still by what is known now.
+
+        """
+        if context:
+            extra = [context.get(name, math.nan) for name in CONTEXT]
+        else:
+            extra = [math.nan, math.nan]
+        buffer = self._buffer
+        buffer.append((time, *reading, *(rate or _NO_RATE), *extra))
+        if self._latest <= time < self._boundary and len(buffer) < _BUFFER:
+            self._latest = time
+            return []
+        self._latest = time
+        self._buffer = []
+        return self.push_block(np.array(buffer))
+
+    def push_block(self, samples: Floats) -> list[Dwell]:
+        """
+        Take many samples at once.
+
+        Parameters
+        ----------
+        samples : (n, 9) array
+            Columns time, reading (3), rate (3, NaN: none), temperature and supply voltage
+            (NaN: none).
+
+        Returns
+        -------
+        list of Dwell
+            As `push`.
+
+        """
+        found = self._feed(samples, last=False)
+        self._boundary = self._chunker.boundary
+        return self._told(found)
+
+    def close(self) -> list[Dwell]:
+        """End the running dwell, for no sample follows; give it if it is one."""
+        buffer, self._buffer = self._buffer, []
+        found = self._feed(np.array(buffer).reshape(-1, WIDTH), last=True) + self._leave()
+        self._chunker.restart()
+        self._boundary = -math.inf
+        return self._told(found)
+
+    @property
+    def still(self) -> bool:
+        """Tell whether the sensor is still now."""
+        return self._still
+
+    def current(self) -> Dwell | None:
+        """Give the running dwell so far, if it makes a pose already."""
+        found = None if self._tracker is None else self._tracker.current()
+        told = [] if found is None else self._told([found])
+        return told[0] if told else None
+
+    def dwells(self) -> list[Dwell]:
+        """Give the dwells that ended so far and are still by the noise that is known now."""
+        return finished(self._candidates, self._rule)
+
+    @property
+    def threshold(self) -> float:
+        """
+        Give the standard deviation below which a window is still now.
+
+        In the unit of the readings, of the axis where it is largest; infinite before anything
+        is known of a sensor in native units.
+
+        """
+        limit = self._rule.limit_of(self._rule.noise_of(np.nan_to_num(self._mean)))
+        return float(np.sqrt(np.max(limit[:3])))
+
+    @property
+    def interruptions(self) -> tuple[Interruption, ...]:
+        """Give the breaks in the stamps so far, the last thousands of them."""
+        return tuple(self._chunker.interruptions)
+
+    def _feed(self, samples: Floats, last: bool) -> list[Candidate]:
+        found: list[Candidate] = []
+        for chunks in self._chunker.feed(samples, last):
+            if chunks.fresh:
+                found += self._leave()
+            judged = self._rule.feed(chunks)
+            if self._tracker is None:
+                self._tracker = Tracker(self._settings, self._rule, judged, self._number)
+            found += self._keep(self._tracker.feed(judged))
+            self._still = bool(judged.still[-1])
+            self._mean = chunks.origin
+        return found
+
+    def _leave(self) -> list[Candidate]:
+        if self._tracker is None:
+            return []
+        found = self._keep(self._tracker.close())
+        self._number = self._tracker.number
+        self._tracker = None
+        self._still = False
+        return found
+
+    def _told(self, found: list[Candidate]) -> list[Dwell]:
+        """Give the dwells of these, judged beside the earlier ones."""
+        if not found:
+            return []
+        known = {id(each) for each in found}
+        earlier = [each for each in self._candidates[-_BESIDE:] if id(each) not in known]
+        told = finished([*earlier, *found], self._rule)
+        good = sum(each.accepted(self._rule) for each in found)
+        return told[len(told) - good:]
+
+    def _keep(self, found: list[Candidate]) -> list[Candidate]:
+        self._candidates += found
+        return found

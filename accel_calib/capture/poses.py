@@ -1,0 +1,220 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Dwells to poses, and recordings to poses.
+
+**Repeated poses.** Two poses whose readings lie within a chord c of each other differ in
+direction by 2 asin(c/2r), r the reading of 1 g; offsets cancel in the difference. In native
+units r is half the range of the poses' readings on the axis where it is widest: too small, and
+the angle too large, until the sensor has been turned over, so that too few poses count as
+repeated rather than too many.
+
+**Merging.** The mean of two readings on a sphere lies inside it: with weights w and 1 - w, by
+w (1 - w) c²/2r², which for 0.1 rad is 1.25 mg. Where 1 g is known the mean is moved out by as
+much. Weights are inverse variances of the means, and the merged std and count give the noise of
+the weighted mean.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .chunks import Interruption
+from .detector import StillDetector
+from .dwell import Dwell
+from .settings import CaptureSettings
+from .sums import CONTEXT, WIDTH
+from ..errors import InputError
+from ..table import Floats, numbered, Poses, Recording
+from ..units import Units
+
+_BLOCK = 1 << 16   # samples
+
+
+@dataclass(frozen=True)
+class Captured:
+    """
+    What was found in a recording.
+
+    Parameters
+    ----------
+    poses : Poses
+        The poses.
+    samples : int
+        Samples of the recording that the poses are averages of.
+    threshold : float
+        Standard deviation below which a window was still in the end [unit of the readings].
+    seconds : float
+        Time from the first to the last stamp of the recording, breaks left out [s].
+    interruptions : tuple of Interruption
+        Breaks in the stamps.
+
+    """
+
+    poses: Poses
+    samples: int
+    threshold: float
+    seconds: float
+    interruptions: tuple[Interruption, ...]
+
+
+def capture(recording: Recording, units: Units, settings: CaptureSettings = CaptureSettings()
+            ) -> Captured:
+    """
+    Find the still poses of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        The samples; ``rate``, ``temperature`` and ``supply_voltage`` are used where present.
+    units : Units
+        Unit of the readings.
+    settings : CaptureSettings
+        What is still, and which poses to keep.
+
+    Returns
+    -------
+    Captured
+        The poses, in order of time.
+
+    Raises
+    ------
+    InputError
+        If a time, a reading or a rate is not finite.
+
+    """
+    detector = StillDetector(settings, units)
+    for start in range(0, len(recording), _BLOCK):
+        detector.push_block(_block(recording, start, start + _BLOCK))
+    detector.close()
+    dwells = select(detector.dwells(), settings, units)
+    interruptions = detector.interruptions
+    time = recording['time']
+    seconds = float(time[-1] - time[0]) if len(time) else 0.0
+    return Captured(poses_from(dwells, settings), sum(each.samples for each in dwells),
+                    detector.threshold, seconds - sum(each.seconds for each in interruptions),
+                    interruptions)
+
+
+def _block(recording: Recording, start: int, stop: int) -> Floats:
+    which = slice(start, stop)
+    samples = np.full((len(recording.row[which]), WIDTH), np.nan)
+    samples[:, 0] = recording['time'][which]
+    samples[:, 1:4] = recording.reading[which]
+    given = 4
+    if 'rate' in recording:
+        samples[:, 4:7] = recording['rate'][which]
+        given = 7
+    for column, name in enumerate(CONTEXT, start=7):
+        if name in recording:
+            samples[:, column] = recording[name][which]
+    bad = np.flatnonzero(~np.isfinite(samples[:, :given]).all(axis=1))
+    if len(bad):
+        row = recording.row[start + bad[0]]
+        message = f'row {row} holds a time, reading or rate that is not a finite number'
+        raise InputError(message, 'remove that row, or repair the recording')
+    return samples
+
+
+def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
+    """
+    Give the pose table of these dwells.
+
+    ``orientation`` is among its columns if ``max_dwell`` cuts dwells.
+
+    """
+    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
+        'time': np.array([each.time for each in dwells], dtype=float),
+        'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
+        'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
+        'count': np.array([each.count for each in dwells], dtype=float)}
+    for name in (*CONTEXT, 'rate'):
+        if dwells and all(name in each.context for each in dwells):
+            columns[name] = np.array([each.context[name] for each in dwells])
+    if np.isfinite(settings.max_dwell):
+        columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
+    return Poses(columns, numbered(columns))
+
+
+def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> list[Dwell]:
+    """Keep, merge or refuse repeated dwells, as the settings ask."""
+    if settings.repeated == 'keep':
+        return list(dwells)
+    radius = _radius([each.mean for each in dwells], units)
+    kept: list[Dwell] = []
+    for dwell in dwells:
+        near = _nearest(dwell, kept, radius, settings)
+        if near is None:
+            kept.append(dwell)
+        elif settings.repeated == 'merge':
+            kept[near] = merged(kept[near], dwell, units)
+    return kept
+
+
+def is_new(dwell: Dwell, dwells: Sequence[Dwell], settings: CaptureSettings, units: Units
+           ) -> bool:
+    """Tell whether no earlier dwell lies within ``min_pose_angle`` of this one."""
+    radius = _radius([each.mean for each in (*dwells, dwell)], units)
+    return _nearest(dwell, dwells, radius, settings) is None
+
+
+def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
+    """
+    Give the weighted mean of two dwells in nearly the same direction.
+
+    Time and context go by the samples; the orientation is that of the first.
+
+    """
+    weight = _weight(first, second)
+    mean = weight * first.mean + (1.0 - weight) * second.mean
+    if units.name != 'native':
+        chord = float(np.linalg.norm(first.mean - second.mean)) / units.per_g
+        mean = mean * (1.0 + 0.5 * weight * (1.0 - weight) * chord**2)
+    noise = np.sqrt(weight**2 * first.std**2 / first.count
+                    + (1.0 - weight)**2 * second.std**2 / second.count)
+    count = first.count + second.count
+    samples = first.samples + second.samples
+    share = first.samples / samples
+    context = {name: share * first.context[name] + (1.0 - share) * second.context[name]
+               for name in first.context if name in second.context}
+    return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
+                   time=share * first.time + (1.0 - share) * second.time,
+                   samples=samples, context=context)
+
+
+def _weight(first: Dwell, second: Dwell) -> float:
+    one = float(np.sum(first.std**2)) / first.count
+    two = float(np.sum(second.std**2)) / second.count
+    return two / (one + two) if one + two > 0.0 else first.samples / (
+        first.samples + second.samples)
+
+
+def _radius(means: Sequence[Floats], units: Units) -> float:
+    if units.name != 'native':
+        return units.per_g
+    return 0.5 * float(np.ptp(np.array(means), axis=0).max()) if means else 0.0
+
+
+def _nearest(dwell: Dwell, others: Sequence[Dwell], radius: float, settings: CaptureSettings
+             ) -> int | None:
+    """Give the index of the nearest other dwell, if it is within ``min_pose_angle``."""
+    far = [float(np.linalg.norm(dwell.mean - each.mean))
+           if each.orientation != dwell.orientation else np.inf for each in others]
+    reach = 2.0 * radius * np.sin(0.5 * settings.min_pose_angle)
+    return int(np.argmin(far)) if far and min(far) < reach else None

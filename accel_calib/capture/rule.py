@@ -1,0 +1,246 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The rule for still, over chunks.
+
+A window is the last `CHUNKS_PER_WINDOW` chunks. It is still when
+
+1. the variance of each axis within it is below `VARIANCE_RATIO` times the sensor's own noise;
+2. where a rate is given, so is the variance of the rate. Its mean tells nothing, for gyros have
+   biases, unless the user set a limit;
+3. |mean reading| is near 1 g, where the unit of the readings is known;
+4. over the last `SLOPE_CHUNKS` there is no slope: none that stands out of its noise and that is
+   more than a tolerance which leaves room for the drift of a sensor that warms up. Turning at
+   0.5 °/s moves a reading by up to 8.7 mg/s and shows in no variance.
+
+**The sensor's own noise** is the lower envelope of what was seen so far. The mean variance v of
+the windows in `LONG` chunks is known to about v √(2/dof), with dof = 2 n / (1 + excess) for n
+samples whose mean is `excess` times as noisy as that of independent samples (exact for white,
+and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), has been an upper
+bound of the noise wherever the sensor was still, and lies far above it where it moved; so its
+minimum so far is taken. It is never less than the resolution allows: a quantised reading that
+flips between two steps q has a variance of up to q²/4; the smallest step seen is q. Nor less
+than a millionth of the reading, for the sake of data without noise.
+
+Before there is any reference, and for very noisy starts, the unit of the readings gives one: no
+sensor with a standard deviation above `STD_CAP_G` is called still.
+
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .chunks import Chunks
+from .noise import Trend
+from .settings import CaptureSettings
+from .sums import ROW
+from .window import at_least, clipped, granted, rounding, Stretch, stretch, windows
+from ..table import Floats
+from ..units import Units
+
+LONG = 12
+"""Chunks over which the noise is judged."""
+
+SLOPE_CHUNKS = (LONG, 3 * LONG)
+"""Chunks over which slopes are sought: the longer, the smaller ones show in a noisy sensor."""
+
+HORIZON = max(SLOPE_CHUNKS)
+"""Chunks after which nothing that follows changes the verdict on one."""
+
+VARIANCE_RATIO = 12.0
+"""Variance of a window over the noise: windows are short, and cutting a dwell in two is bad."""
+
+RATE_RATIO = 900.0
+"""The same for the rate: a gyro feels shaking that an average over a dwell does not."""
+
+STD_CAP_G = 0.15
+"""Largest standard deviation that the adaptive threshold takes [g]."""
+
+SLOPE_G = 4e-3
+"""Slope within a dwell that is let pass [g/s]: a sensor that settles on a soft base."""
+
+DWELL_SLOPE_G = 2e-3
+"""Slope through a dwell that is let pass [g/s]: 0.11 °/s; warming up gives some 1e-5 g/s."""
+
+SLOPE_NOISE = 0.1
+"""The same in standard deviations of the samples per second, for a sensor not turned yet."""
+
+STRENGTH = 40.0
+"""A slope stands out if the sum of its squared scores over 3 axes is above: p about 1e-6."""
+
+WEAK_STRENGTH = 8.0
+"""The same for a stretch next to a slope, which was not found there: p about 0.05."""
+
+
+class Judged(NamedTuple):
+    """
+    Chunks with what the rule says of the window that ends with each.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        The chunks.
+    level : (m, 6) array
+        Variance within the window, of reading and rate; NaN where not known.
+    limit : (m, 6) array
+        What the variance had to be below.
+    still : (m,) array of bool
+        The rule.
+    trending : (m,) array of int
+        Where a slope was the reason, the number of chunks it was seen over; otherwise 0.
+
+    """
+
+    chunks: Chunks
+    level: Floats
+    limit: Floats
+    still: NDArray[np.bool_]
+    trending: NDArray[np.intp]
+
+
+class Rule:
+    """The rule and its memory: the last chunks, the noise and the resolution seen so far."""
+
+    def __init__(self, settings: CaptureSettings, units: Units) -> None:
+        self._settings = settings
+        self._known = units.name != 'native'
+        self._per_g = units.per_g
+        self._lowest = np.full(3, np.inf)
+        self._highest = np.full(3, -np.inf)
+        self._before = np.full((HORIZON - 1, ROW), np.nan)
+        self._floor = np.full(6, np.inf)
+        self._step = np.full(2, np.inf)
+
+    @property
+    def scale(self) -> float:
+        """Give the reading of 1 g; for native units half the range of the readings at rest."""
+        if self._known:
+            return self._per_g
+        return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
+
+    def noise_of(self, mean: Floats) -> Floats:
+        """
+        Give the variance of the sensor's own noise, as known now, for a mean reading and rate.
+
+        Infinite before anything is known.
+
+        """
+        noise = at_least(self._floor, self._step, mean)
+        return granted(noise, np.asarray(self.scale))
+
+    def rounding(self, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
+        """
+        Give what rounding does to samples and to their mean.
+
+        Returns
+        -------
+        std : (3,) array
+            Standard deviation of the rounding of a sample; more than 0 in any case.
+        variance : (3,) array
+            Of the error of the mean that averaging does not remove.
+
+        """
+        return rounding(float(self._step[0]), self._floor, mean, std)
+
+    def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
+                 rate_ratio: float = RATE_RATIO) -> Floats:
+        """Give the (..., 6) largest variances of a still window at this noise."""
+        limit = noise * np.repeat([ratio, rate_ratio], 3)
+        if self._known:
+            cap = (STD_CAP_G * self._per_g)**2
+            limit[..., :3] = np.minimum(limit[..., :3], cap)
+        if self._settings.still_std_max > 0.0:
+            limit[..., :3] = (self._settings.still_std_max * self._per_g)**2
+        return np.asarray(limit)
+
+    def feed(self, chunks: Chunks) -> Judged:
+        """Judge consecutive chunks."""
+        if chunks.fresh:
+            self._before = np.full((HORIZON - 1, ROW), np.nan)
+        rows = np.concatenate([self._before, chunks.sums])
+        self._before = rows[len(rows) - HORIZON + 1:]
+        mean, level = windows(rows, chunks.origin)
+        size = len(chunks.sums)
+        mean, recent = mean[-size:], level[-size:]
+        seen = {length: stretch(rows, level, length, size, chunks.length)
+                for length in SLOPE_CHUNKS}
+        noise = self._learn(seen[LONG], mean, chunks.step)
+        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=1))
+        limit = self.limit_of(granted(noise, scale))
+        trending = np.zeros(size, dtype=np.intp)
+        for length, each in seen.items():
+            reading = Trend(*(part[:, 0] for part in each.trend))
+            calm = np.all(each.highest[:, :3] <= limit[:, :3], axis=1)
+            trending[calm & self.moved(reading, scale, each.variance[:, :3])] = length
+        still = self._quiet(mean, recent, limit) & (trending == 0)
+        return Judged(chunks, recent, limit, still, trending)
+
+    def moved(self, found: Trend, scale: Floats, variance: Floats, strength: float = STRENGTH,
+              drift_g: float = SLOPE_G) -> NDArray[np.bool_]:
+        """
+        Tell whether a slope stands out of its noise and is more than a drift.
+
+        Parameters
+        ----------
+        found : Trend
+            The slope.
+        scale : (...) array
+            Reading of 1 g.
+        variance : (..., 3) array
+            Of the samples.
+        strength : float
+            What stands out.
+        drift_g : float
+            What passes as a drift [g/s].
+
+        """
+        drift = drift_g * scale
+        if not self._known:
+            drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=-1)))
+        large = np.sqrt(np.sum(found.slope**2, axis=-1)) > drift
+        return np.asarray(large & (found.strength > strength))
+
+    def _quiet(self, mean: Floats, level: Floats, limit: Floats) -> NDArray[np.bool_]:
+        quiet = (np.all(level[:, :3] <= limit[:, :3], axis=1)
+                 & ~np.any(level[:, 3:] > limit[:, 3:], axis=1))
+        if self._known:
+            norm = np.linalg.norm(mean[:, :3], axis=1) / self._per_g
+            quiet &= np.abs(norm - 1.0) <= self._settings.still_norm_tolerance
+        if self._settings.still_gyro_max > 0.0:
+            quiet &= ~(np.linalg.norm(mean[:, 3:], axis=1) > self._settings.still_gyro_max)
+        return np.asarray(quiet)
+
+    def _scales(self, mean: Floats, quiet: NDArray[np.bool_]) -> Floats:
+        if self._known:
+            return np.full(len(mean), self._per_g)
+        at_rest = np.where(quiet[:, np.newaxis], mean[:, :3], np.nan)
+        low = np.fmin.accumulate(np.concatenate([self._lowest[np.newaxis], at_rest]))[1:]
+        high = np.fmax.accumulate(np.concatenate([self._highest[np.newaxis], at_rest]))[1:]
+        if len(mean):
+            self._lowest, self._highest = low[-1], high[-1]
+        return np.asarray(np.maximum(0.5 * np.max(high - low, axis=1), 0.0))
+
+    def _learn(self, seen: Stretch, mean: Floats, step: Floats) -> Floats:
+        dof = np.maximum(2.0 * seen.samples[:, np.newaxis] / (1.0 + seen.trend.excess), 1.0)
+        average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=1)
+        steps = np.minimum.accumulate(np.concatenate([self._step[np.newaxis], step]))[1:]
+        average[clipped(average, steps, mean)] = np.nan
+        floor = np.fmin.accumulate(np.concatenate([self._floor[np.newaxis], average]))[1:]
+        self._floor, self._step = floor[-1], steps[-1]
+        return at_least(floor, steps, mean)

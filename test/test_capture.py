@@ -1,0 +1,175 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings to poses: real files, repeated poses, long dwells, bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from accel_calib.capture import capture, CaptureSettings, is_new, merged, StillDetector
+from accel_calib.errors import InputError
+from accel_calib.table import Recording
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+
+DATA = Path(__file__).parents[2] / 'shared' / 'data'
+G = units_of('g')
+
+
+def recording(**columns) -> Recording:
+    return Recording(columns, np.arange(1, len(columns['time']) + 1))
+
+
+def real(name: str) -> Recording:
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f'{path} is not there')
+    with path.open() as lines:
+        rows = [line for line in lines if not line.startswith('#')]
+    table = np.genfromtxt(rows, delimiter=',', names=True)
+    columns = {'time': table['time'],
+               'reading': np.column_stack([table[axis] for axis in ('ax', 'ay', 'az')])}
+    if 'gx' in table.dtype.names:
+        columns['rate'] = np.column_stack([table[axis] for axis in ('gx', 'gy', 'gz')])
+    if 'temperature' in table.dtype.names:
+        columns['temperature'] = table['temperature']
+    return recording(**columns)
+
+
+def visited(directions, seed=0, seconds=3.0, noise=2e-3) -> Recording:
+    """Give a recording at 100 Hz that rests in these directions, with a shake in between."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for direction in directions:
+        rest = np.asarray(direction) + noise * rng.normal(size=(int(seconds * 100), 3))
+        parts += [rest, np.asarray(direction) + 0.5 * rng.normal(size=(80, 3))]
+    reading = np.concatenate(parts)
+    return recording(time=np.arange(len(reading)) / 100.0, reading=reading)
+
+
+@pytest.mark.parametrize(('name', 'unit', 'poses'), [
+    ('mpu9150_imu0.csv', 'm/s2', 21), ('mpu9150_imu1.csv', 'm/s2', 21),
+    ('xsens_mti_counts.csv', 'native', 38)])
+def test_poses_of_real_recordings_are_found(name, unit, poses):
+    samples = real(name)
+    result = capture(samples, units_of(unit))
+    assert len(result.poses) == poses
+    assert 0.6 * len(samples) < result.samples < len(samples)
+    assert result.interruptions == ()
+    assert result.seconds == pytest.approx(samples['time'][-1] - samples['time'][0])
+    assert result.poses.noise is not None
+    assert 'rate' in result.poses
+
+
+def test_poses_of_real_recordings_are_found_without_the_gyro():
+    samples = real('mpu9150_imu0.csv')
+    result = capture(recording(time=samples['time'], reading=samples.reading), units_of('m/s2'))
+    assert 20 <= len(result.poses) <= 22
+
+
+def test_streaming_a_real_recording_gives_the_same_poses():
+    samples = real('mpu9150_imu1.csv')
+    detector = StillDetector(CaptureSettings(), units_of('m/s2'))
+    for time, reading, rate in zip(samples['time'].tolist(), samples.reading.tolist(),
+                                   samples['rate'].tolist()):
+        detector.push(time, reading, rate)
+    detector.close()
+    poses = capture(samples, units_of('m/s2')).poses
+    dwells = detector.dwells()
+    np.testing.assert_allclose([each.mean for each in dwells], poses.reading, rtol=1e-9)
+    np.testing.assert_allclose([each.count for each in dwells], poses['count'], rtol=1e-6)
+
+
+def test_a_sensor_that_lay_still_for_days_gives_a_pose_an_orientation():
+    result = capture(real('sensehat_lsm9ds1_temperature.csv'), G)
+    assert 3 <= len(result.poses) <= 5
+    assert result.samples > 24000
+    assert [each.kind for each in result.interruptions] == ['gap']
+    assert 'orientation' not in result.poses
+
+
+def test_max_dwell_cuts_a_dwell_that_temperature_moves():
+    result = capture(real('sensehat_lsm9ds1_temperature.csv'), G, CaptureSettings(max_dwell=3600))
+    poses = result.poses
+    assert 60 < len(poses) < 80
+    long = np.bincount(poses['orientation']).max()
+    assert long == pytest.approx(58, abs=1)
+    assert np.ptp(poses['temperature']) > 1.0
+    assert np.all(np.diff(poses['time']) > 0.0)
+
+
+FACES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0)]
+AGAIN = [*FACES, (0.03, 0.0, 0.9996), (0.0, 0.9996, 0.02)]
+
+
+@pytest.mark.parametrize(('repeated', 'poses'), [('keep', 8), ('merge', 6), ('refuse', 6)])
+@pytest.mark.parametrize('unit', ['g', 'native'])
+def test_repeated_poses_are_kept_merged_or_refused_as_asked(repeated, poses, unit):
+    samples = visited(AGAIN)
+    samples = samples.with_columns(reading=samples.reading * (4e3 if unit == 'native' else 1.0))
+    settings = CaptureSettings(repeated=repeated)
+    assert len(capture(samples, units_of(unit), settings).poses) == poses
+
+
+def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
+    kept = capture(visited(AGAIN), G).poses
+    poses = capture(visited(AGAIN), G, CaptureSettings(repeated='merge')).poses
+    assert np.linalg.norm(poses.reading[0]) == pytest.approx(1.0, abs=4e-4)
+    assert poses.reading[0, 0] == pytest.approx(0.015, abs=1e-3)
+    assert np.all(poses.noise[:2] < kept.noise[:2])
+
+
+def test_whether_a_dwell_is_new_depends_on_min_pose_angle():
+    detector = StillDetector(CaptureSettings(), G)
+    samples = visited(AGAIN)
+    table = np.column_stack([samples['time'], samples.reading, np.full((len(samples), 5), np.nan)])
+    detector.push_block(table)
+    detector.close()
+    *earlier, last = detector.dwells()
+    assert not is_new(last, earlier, CaptureSettings(), G)
+    assert is_new(last, earlier, CaptureSettings(min_pose_angle=0.01), G)
+    assert merged(earlier[1], last, G).samples == earlier[1].samples + last.samples
+
+
+def test_a_number_that_is_not_finite_is_refused_with_its_row():
+    samples = visited(FACES)
+    reading = samples.reading.copy()
+    reading[70, 1] = np.nan
+    with pytest.raises(InputError, match='row 71 .* remove that row'):
+        capture(samples.with_columns(reading=reading), G)
+
+
+@pytest.mark.parametrize('rows', [0, 1, 2, 12])
+def test_a_recording_of_a_few_samples_has_no_poses(rows):
+    result = capture(visited(FACES).take(slice(0, rows)), G)
+    assert len(result.poses) == 0
+    assert result.samples == 0
+
+
+def test_stamps_that_stand_still_are_reported_and_give_no_pose():
+    samples = recording(time=np.zeros(250_000), reading=np.tile([0.0, 0.0, 1.0], (250_000, 1)))
+    result = capture(samples, G)
+    assert len(result.poses) == 0
+    assert [each.kind for each in result.interruptions] == ['stopped']
+
+
+@pytest.mark.parametrize('settings', [
+    {'still_window': 0.0}, {'min_dwell': -1.0}, {'max_dwell': 0.5}, {'still_std_max': -1.0},
+    {'still_gyro_max': float('nan')}, {'still_norm_tolerance': 0.0}, {'min_pose_angle': 4.0},
+    {'repeated': 'forget'}])
+def test_settings_out_of_range_are_refused_by_name(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        CaptureSettings(**settings)

@@ -1,0 +1,238 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Still or not: sensors of all kinds, hands, slow turning, broken stamps."""
+
+from __future__ import annotations
+
+from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
+from accel_calib.table import Recording
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+G = units_of('g')
+
+
+def still(seed, seconds, rate=100.0, noise=2e-3):
+    """Give times and readings of a sensor at rest."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(int(seconds * rate)) / rate
+    force = Rotation.random(random_state=seed).apply([0.0, 0.0, 1.0])
+    return time, force + noise * rng.normal(size=(len(time), 3))
+
+
+def turned(seed, rate=100.0, noise=2e-3, correlation=0.0, step=0.0, dwell=(1.5, 8.0), poses=8):
+    """Give times, readings and (start, end, force) of a sensor turned by hand between poses."""
+    rng = np.random.default_rng(seed)
+    lengths = np.column_stack([rng.uniform(*dwell, poses), rng.uniform(0.6, 2.0, poses)])
+    keys = np.concatenate([[0.0], np.cumsum(lengths)])[:-1]
+    attitude = Rotation.random(poses, random_state=seed)
+    time = np.arange(int(keys[-1] * rate)) / rate
+    slerp = Slerp(keys, attitude[np.repeat(np.arange(poses), 2)])
+    moving = (np.searchsorted(keys, time, side='right') % 2 == 0)[:, np.newaxis]
+    decay = np.exp(-40.0 / rate)
+    hand = max(0.08, 4.0 * noise) * moving * lfilter(
+        [np.sqrt(1.0 - decay**2)], [1.0, -decay], rng.normal(size=(len(time), 3)), axis=0)
+    own = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation],
+                  rng.normal(size=(len(time) + 500, 3)), axis=0)[500:]
+    reading = slerp(time).apply([0.0, 0.0, 1.0]) + hand + noise * own
+    if step > 0.0:
+        reading = np.round(reading / step) * step
+    truth = [(keys[2 * i], keys[2 * i + 1], attitude[i].apply([0.0, 0.0, 1.0]))
+             for i in range(poses)]
+    return time, reading, truth
+
+
+def captured(time, reading, settings=CaptureSettings(), units=G, **columns) -> Captured:
+    table = {'time': time, 'reading': units.from_g(reading), **columns}
+    return capture(Recording(table, np.arange(1, len(time) + 1)), units, settings)
+
+
+def pushed(time, reading, settings=CaptureSettings(), rate=None) -> StillDetector:
+    detector = StillDetector(settings, G)
+    for i, (stamp, sample) in enumerate(zip(time.tolist(), reading.tolist())):
+        detector.push(stamp, sample, None if rate is None else rate[i].tolist())
+    detector.close()
+    return detector
+
+
+def assert_same(one: Dwell, other: Dwell):
+    assert (one.start, one.end, one.samples) == (other.start, other.end, other.samples)
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-12)
+    np.testing.assert_allclose(one.std, other.std, rtol=1e-9)
+    np.testing.assert_allclose(one.count, other.count, rtol=1e-6)
+
+
+def assert_all_found(result: Captured, truth, missed=0):
+    time = result.poses['time']
+    hits = [int(np.sum((time > start) & (time < end))) for start, end, _ in truth]
+    assert sum(hits) == len(time), 'a pose was found while the sensor moved'
+    assert max(hits) == 1
+    assert hits.count(0) <= missed
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('sensor', [
+    {}, {'noise': 5e-5}, {'noise': 0.05}, {'noise': 0.0}, {'rate': 1000.0}, {'rate': 200.0},
+    {'rate': 25.0, 'dwell': (2.0, 8.0)}, {'rate': 100.0, 'correlation': 0.9},
+    {'noise': 5e-5, 'step': 1e-3}, {'noise': 3e-4, 'step': 4e-3}, {'dwell': (1.5, 1.6)}],
+    ids=lambda sensor: ' '.join(f'{key} {value}' for key, value in sensor.items()) or 'usual')
+def test_every_pose_of_a_sensor_is_found_and_none_in_between(sensor, seed):
+    time, reading, truth = turned(seed, **sensor)
+    assert_all_found(captured(time, reading), truth)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_counts_and_volts_work_like_g(seed):
+    time, reading, truth = turned(seed)
+    for scale, offset in ((4000.0, 33000.0), (0.34, 1.77)):
+        counts = reading * scale + offset
+        assert_all_found(captured(time, counts, units=units_of('native')), truth)
+    assert_all_found(captured(time, reading, units=units_of('m/s2')), truth)
+
+
+def test_a_sensor_sampled_each_ten_seconds_is_captured():
+    time, reading = still(3, 4000.0, rate=0.1, noise=7e-5)
+    reading[200:] += [0.3, -0.2, -0.05]
+    assert len(captured(time, reading).poses) == 2
+
+
+@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize('blocks', [1, 7, 1000])
+def test_streaming_and_blocks_give_the_dwells_of_the_whole(seed, blocks):
+    time, reading, _ = turned(seed, poses=6)
+    rate = np.random.default_rng(seed).normal(0.02, 2e-3, reading.shape)
+    one = pushed(time, reading, rate=rate).dwells()
+    samples = np.column_stack([time, reading, rate, np.full((len(time), 2), np.nan)])
+    detector = StillDetector(CaptureSettings(), G)
+    for start in range(0, len(samples), blocks):
+        detector.push_block(samples[start:start + blocks])
+    detector.close()
+    assert len(one) == len(detector.dwells()) == 6
+    for first, second in zip(one, detector.dwells()):
+        assert_same(first, second)
+
+
+def test_streaming_equals_the_array_path_over_gaps_and_jumps_back():
+    time, reading, _ = turned(5, poses=6)
+    time = time + 1.7e9
+    time[900:] += 4.0
+    time[1700:] -= 9.0
+    detector, result = pushed(time, reading), captured(time, reading)
+    dwells = detector.dwells()
+    assert [each.kind for each in result.interruptions] == ['gap', 'jump_back']
+    assert detector.interruptions == result.interruptions
+    np.testing.assert_array_equal([each.time for each in dwells], result.poses['time'])
+
+
+@pytest.mark.parametrize('speed', [0.5, 1.0, 2.0, 5.0])
+@pytest.mark.parametrize('noise', [5e-5, 2e-3, 1e-2])
+def test_slow_turning_is_not_still(speed, noise):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        time = np.arange(2000) / 100.0
+        angle = np.radians(speed) * np.maximum(time - 6.0, 0.0)
+        force = np.column_stack([np.sin(angle), np.zeros(2000), np.cos(angle)])
+        result = captured(time, force + noise * rng.normal(size=force.shape))
+        assert len(result.poses) == 1
+        assert result.poses['time'][0] < 4.0
+        assert np.abs(result.poses.reading[0] - [0.0, 0.0, 1.0]).max() < 5e-3 + noise
+
+
+def test_turning_about_the_vertical_is_still_for_it_changes_nothing():
+    time, reading = still(1, 5.0)
+    assert len(captured(time, reading, rate=np.full(reading.shape, 0.1)).poses) == 1
+
+
+@pytest.mark.parametrize('amplitude', [0.01, 0.03])
+def test_a_hand_held_tremor_is_withdrawn_once_the_sensor_was_put_down(amplitude):
+    time, reading, _ = turned(2, noise=2e-3, poses=4)
+    first, held = still(8, 5.0)
+    held = held + amplitude * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
+    result = captured(np.arange(len(time) + 500) / 100.0, np.concatenate([held, reading]))
+    assert len(result.poses) == 4
+    assert result.poses['time'].min() > 5.0
+
+
+def test_a_knock_does_not_cut_a_dwell_in_two():
+    time, reading = still(4, 8.0)
+    reading[400:406] += 0.4
+    result = captured(time, reading)
+    assert len(result.poses) == 1
+    assert result.samples > 700
+
+
+def test_a_dwell_shorter_than_min_dwell_is_none():
+    time, reading, _ = turned(1, dwell=(1.5, 1.6))
+    assert len(captured(time, reading, CaptureSettings(min_dwell=2.0)).poses) == 0
+
+
+def test_readings_far_from_one_g_are_not_still():
+    time, reading = still(1, 5.0)
+    assert len(captured(time, 1.25 * reading).poses) == 1
+    assert len(captured(time, 1.4 * reading).poses) == 0
+    assert len(captured(time, 1.4 * reading, CaptureSettings(still_norm_tolerance=0.5)).poses) == 1
+
+
+def test_limits_of_the_user_override_the_adaptive_ones():
+    time, reading = still(1, 5.0, noise=0.01)
+    assert len(captured(time, reading, CaptureSettings(still_std_max=0.005)).poses) == 0
+    assert captured(time, reading, CaptureSettings(still_std_max=0.02)).threshold == 0.02
+    rate = np.full(reading.shape, 0.02)
+    assert len(captured(time, reading, CaptureSettings(still_gyro_max=0.03), rate=rate).poses) == 0
+    assert len(captured(time, reading, CaptureSettings(still_gyro_max=0.04), rate=rate).poses) == 1
+
+
+def test_the_running_dwell_is_there_before_it_ends():
+    time, reading = still(6, 4.0)
+    detector = StillDetector(CaptureSettings(), G)
+    for stamp, sample in zip(time.tolist()[:80], reading.tolist()):
+        detector.push(stamp, sample)
+    assert detector.still
+    assert detector.current() is None
+    for stamp, sample in zip(time.tolist()[80:], reading.tolist()[80:]):
+        detector.push(stamp, sample, None, {'temperature': 21.0})
+    dwell = detector.current()
+    assert dwell is not None
+    assert dwell.samples > 300
+    assert dwell.context['temperature'] == pytest.approx(21.0)
+    assert detector.dwells() == []
+    for stamp in np.arange(4.0, 5.5, 0.01).tolist():
+        detector.push(stamp, [stamp % 0.3, 1.0, stamp % 0.7])
+    assert not detector.still
+    assert detector.current() is None
+    assert len(detector.dwells()) == 1
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.6, 0.9])
+def test_the_stated_noise_of_a_mean_is_its_real_one(correlation):
+    scores = []
+    for seed in range(40):
+        time, reading, truth = turned(seed, correlation=correlation, poses=6)
+        poses = captured(time, reading).poses
+        for stamp, mean, noise in zip(poses['time'], poses.reading, poses.noise):
+            force = next(force for start, end, force in truth if start < stamp < end)
+            scores.append((mean - force) / noise)
+    assert 0.85 < np.std(scores) < 1.15
+
+
+def test_a_long_dwell_takes_bounded_memory_and_keeps_its_mean():
+    time, reading = still(1, 300.0, rate=50.0)
+    result = captured(time, reading)
+    assert len(result.poses) == 1
+    np.testing.assert_allclose(result.poses.reading[0], reading[5:-10].mean(axis=0), atol=1e-5)
+    assert result.poses['count'][0] > 0.6 * len(time)
