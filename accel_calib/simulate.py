@@ -31,37 +31,6 @@ from .errors import InputError
 from .model import Model, predict
 from .table import Floats, numbered, Poses, Recording
 
-_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-
-
-def spread_directions(count: int) -> Floats:
-    """
-    Spread directions evenly over the sphere (Fibonacci lattice).
-
-    Returns
-    -------
-    (count, 3) array
-        Unit vectors.
-
-    """
-    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    radius, angle = np.sqrt(1.0 - z ** 2), _GOLDEN_ANGLE * np.arange(count)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
-
-
-def random_directions(count: int, rng: np.random.Generator) -> Floats:
-    """
-    Draw directions evenly over the sphere.
-
-    Returns
-    -------
-    (count, 3) array
-        Unit vectors.
-
-    """
-    drawn = rng.normal(size=(count, 3))
-    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-
 
 def parse_effect(text: str) -> tuple[str, Floats]:
     """
@@ -98,22 +67,6 @@ def parse_effect(text: str) -> tuple[str, Floats]:
                          f'{EFFECTS[name].unit}',
                          f'write {name}={",".join(["0.001"] * len(parameters))}, for instance')
     return name, np.broadcast_to(values, len(parameters)).copy()
-
-
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
-    """
-    Give the rotation of fixed-axis roll, pitch and yaw [rad], as in URDF.
-
-    Returns
-    -------
-    (3, 3) array
-        From the axes of the turned body to those it is turned in.
-
-    """
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                     [-sp, cp * sr, cp * cr]])
 
 
 def model_with(effects: Mapping[str, Floats], rotation: Floats | None = None) -> Model:

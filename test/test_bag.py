@@ -18,7 +18,8 @@ from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.files import correct_bag, read_recording
-from accel_calib.simulate import simulate_recording, spread_directions
+from accel_calib.simulate import simulate_recording
+from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
 import numpy as np
 import pytest
@@ -46,8 +47,8 @@ def imu_message(store, k, recording, frame_id='imu_link'):
     stamp = types['builtin_interfaces/msg/Time'](
         sec=int(nanoseconds // 10 ** 9) + 100, nanosec=int(nanoseconds % 10 ** 9))
     ros1 = 'seq' in types['std_msgs/msg/Header'].__annotations__
-    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id,
-                                            **({'seq': k} if ros1 else {}))
+    extra = {'seq': k} if ros1 else {}
+    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id, **extra)
     vector = types['geometry_msgs/msg/Vector3']
     covariance = np.zeros(9)
     quaternion = types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0)
@@ -117,8 +118,8 @@ def test_a_corrected_bag_differs_in_the_acceleration_alone(kind, recording, tmp_
     assert correct_bag(path, calibration, out) == len(recording)
     with AnyReader([path]) as before, AnyReader([out]) as after:
         assert [c.topic for c in before.connections] == [c.topic for c in after.connections]
-        for (c0, t0, raw0), (c1, t1, raw1) in zip(before.messages(), after.messages(),
-                                                 strict=True):
+        pairs = zip(before.messages(), after.messages(), strict=True)
+        for (c0, t0, raw0), (c1, t1, raw1) in pairs:
             assert (c0.topic, c0.msgtype, t0) == (c1.topic, c1.msgtype, t1)
             if c0.topic != '/imu/data_raw':
                 assert bytes(raw0) == bytes(raw1)

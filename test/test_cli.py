@@ -22,6 +22,7 @@ from accel_calib.cli.main import main, parser
 from accel_calib.cli.options import plain
 from accel_calib.files import read_calibration, read_poses, write_table
 from accel_calib.simulate import parse_effect
+from accel_calib.sphere import rotation_from_rpy
 import numpy as np
 import pytest
 
@@ -102,7 +103,6 @@ def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
     assert status == 0
     assert result['poses_used'] == 29
-    from accel_calib.simulate import rotation_from_rpy
     expected = rotation_from_rpy(*np.radians((20, -30, 0)))[:, 2]
     np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
 

@@ -17,7 +17,7 @@
 from accel_calib.calibrate import closed_form
 from accel_calib.errors import RefusedFitError
 from accel_calib.model import predict
-from accel_calib.simulate import random_directions, spread_directions
+from accel_calib.sphere import random_directions, spread_directions
 import numpy as np
 import pytest
 from shared import sensor

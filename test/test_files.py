@@ -29,7 +29,8 @@ from accel_calib.files import (
     write_table,
 )
 from accel_calib.files.atomic import before
-from accel_calib.simulate import simulate_poses, spread_directions
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import spread_directions
 from accel_calib.table import COLUMNS, numbered, Poses
 from accel_calib.units import units_of
 import numpy as np

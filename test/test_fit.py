@@ -18,12 +18,8 @@ from accel_calib.calibrate import fit_poses, in_g, level, sensing_axes, verify
 from accel_calib.calibrate.sensing_axes import gain_of, lower_triangular
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.model import predict
-from accel_calib.simulate import (
-    random_directions,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-)
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
 import numpy as np
@@ -164,8 +160,8 @@ def without(poses, *keys):
 
 def test_unknown_noise_is_taken_from_the_residuals():
     poses = simulated(9, 60)[1]
-    known, unknown = fit_poses(poses, G, model='10'), fit_poses(without(poses, 'std'), G,
-                                                               model='10')
+    known = fit_poses(poses, G, model='10')
+    unknown = fit_poses(without(poses, 'std'), G, model='10')
     assert unknown.quality.noise_floor_mg is None
     np.testing.assert_allclose(unknown.offset_sd, known.offset_sd, rtol=0.4)
     assert any('uncertainty comes from the residuals' in text for text in unknown.warnings)
@@ -218,8 +214,8 @@ FACES = np.vstack([np.eye(3), -np.eye(3)])
     (FIVE, 'point in 5 directions'), (np.repeat(FACES, 2, axis=0), 'point in 6 directions'),
     (FACES, '6 poses, model 10 needs at least 9'), (SAME[:1], '1 pose, model 10')])
 @pytest.mark.parametrize('units', ['g', 'm/s2'])
-def test_poses_that_cannot_carry_the_model_are_refused_with_the_way_to_turn(directions, says,
-                                                                           units):
+def test_poses_that_cannot_carry_the_model_are_refused_with_the_way_to_turn(
+        directions, says, units):
     rng = np.random.default_rng(12)
     poses = in_units(simulate_poses(sensor(rng), directions, rng), units_of(units))
     with pytest.raises(RefusedFitError, match=says) as refusal:

@@ -17,12 +17,8 @@
 from accel_calib import imu
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.model import predict
-from accel_calib.simulate import (
-    random_directions,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-)
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
 from accel_calib.units import units_of
 import numpy as np
 import pytest

@@ -28,7 +28,8 @@ from accel_calib.model import (
     with_linear_part,
     with_vector,
 )
-from accel_calib.simulate import parse_effect, random_directions, rotation_from_rpy
+from accel_calib.simulate import parse_effect
+from accel_calib.sphere import random_directions, rotation_from_rpy
 import numpy as np
 import pytest
 

@@ -16,7 +16,7 @@
 
 from accel_calib.calibrate.mounting import flat_direction, FRAMES, mounting, mounting_with_heading
 from accel_calib.errors import InputError
-from accel_calib.simulate import random_directions, rotation_from_rpy
+from accel_calib.sphere import random_directions, rotation_from_rpy
 import numpy as np
 import pytest
 

@@ -138,7 +138,7 @@ class Calibration:
 
     @property
     def force_per_g(self) -> float:
-        """The unit of corrected force in one g: as the readings, and g for native readings."""
+        """Give how many units of corrected force are 1 g: g for native readings."""
         return 1.0 if self.units.name == 'native' else self.units.per_g
 
     @property
@@ -153,13 +153,13 @@ class Calibration:
 
     @property
     def offset_sd(self) -> Floats:
-        """Standard deviation of V, (3,), in the unit of the readings."""
+        """Give the standard deviation of V, (3,), in the unit of the readings."""
         rows = _linear_rows(self.model, np.zeros((1, 3)))[0]
         return self.units.from_g(_deviation(rows, self.covariance))
 
     @property
     def gain_sd(self) -> Floats:
-        """Standard deviation of W, (3, 3)."""
+        """Give the standard deviation of W, (3, 3)."""
         rows = _linear_rows(self.model, np.vstack([np.zeros(3), np.eye(3)]))
         columns = [_deviation(row - rows[0], self.covariance) for row in rows[1:]]
         return np.column_stack(columns) * (self.units.per_g / self.force_per_g)

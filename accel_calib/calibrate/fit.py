@@ -251,5 +251,3 @@ def _warnings(fit: Fit, stretched: float) -> tuple[str, ...]:
                         'the pose means: poses repeat worse than their samples say, or the model '
                         'lacks an effect')
     return tuple(warnings)
-
-

@@ -36,7 +36,7 @@ import numpy as np
 
 from ..errors import RefusedFitError
 from ..model import MODELS, parameter_basis
-from ..simulate import spread_directions
+from ..sphere import spread_directions
 from ..table import Floats
 
 LARGEST_DILUTION = 40.0

@@ -297,4 +297,3 @@ def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool) -> Floa
         scale = chi2 / dof if dof > 0 else np.nan
     factor = np.linalg.pinv(jacobian)
     return factor @ factor.T * scale
-

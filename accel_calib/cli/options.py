@@ -142,6 +142,8 @@ def in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
     if jobs <= 1 or len(items) <= 1:
         return [function(item) for item in items]
     from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
 
-    with ProcessPoolExecutor(min(jobs, len(items))) as pool:
+    # A fork of a process with threads, which numpy has, may hang.
+    with ProcessPoolExecutor(min(jobs, len(items)), get_context('spawn')) as pool:
         return list(pool.map(function, items))

@@ -26,14 +26,8 @@ from . import options
 from ..errors import InputError
 from ..files import write_table
 from ..model import Model
-from ..simulate import (
-    model_with,
-    parse_effect,
-    rotation_from_rpy,
-    simulate_poses,
-    simulate_recording,
-    spread_directions,
-)
+from ..simulate import model_with, parse_effect, simulate_poses, simulate_recording
+from ..sphere import rotation_from_rpy, spread_directions
 from ..table import Floats, Poses, Recording
 from ..units import Units
 

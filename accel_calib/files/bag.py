@@ -214,4 +214,3 @@ def temperature_at(reader: AnyReader, time: Floats) -> Floats | None:
         return None
     order = np.argsort(stamps, kind='stable')
     return np.interp(time, np.array(stamps)[order], np.array(values)[order])
-

@@ -1,0 +1,77 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+# Everything the targets need is put into .venv, from nothing but Python and make.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+
+# Folders too: they change when a file goes.
+SOURCES := package.xml setup.cfg $(shell find accel_calib config launch resource scripts \
+	-name __pycache__ -prune -o -print)
+
+PYTHON_SOURCES := setup.py $(wildcard .ci/*.py accel_calib benchmarks examples launch test)
+
+# A sourced ROS, or a shell that a Python with ROS wheels started, would mix its libraries
+# with those of .venv.
+ifneq ($(ROS_DISTRO)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
+unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+endif
+
+.PHONY: help demo test lint clean
+.NOTPARALLEL:
+
+help:
+	@echo 'make demo   the main job, without hardware'
+	@echo 'make test   the tests; PYTEST_ARGS="-k name" for some of them'
+	@echo 'make lint   linter and type check'
+	@echo 'make clean  removes .venv and what was built'
+
+demo: $(VENV)/package
+	@$(BIN)/accel-calib demo
+
+test: $(VENV)/extra-test $(VENV)/package
+	@PATH="$(CURDIR)/$(BIN):$$PATH" ROS_LOG_DIR="$${ROS_LOG_DIR:-$(CURDIR)/$(VENV)/log}" \
+		$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(VENV)/extra-dev
+	@$(BIN)/ruff check --quiet $(PYTHON_SOURCES)
+	@$(BIN)/flake8 $(PYTHON_SOURCES)
+	@$(BIN)/pydocstyle --property-decorators= $(PYTHON_SOURCES)
+	@$(BIN)/mypy
+
+clean:
+	@rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+
+$(VENV)/made:
+	@echo 'Making $(VENV); once, a minute or two'
+	@$(PYTHON) -m venv $(VENV)
+	@touch $(VENV)/COLCON_IGNORE
+	@$(PIP) install 'setuptools>=70.1'
+	@touch $@
+
+$(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
+	@$(PIP) install --no-build-isolation '.[ros,$*]'
+	@touch $@
+
+# build/lib keeps modules that the sources no longer have.
+$(VENV)/package: $(SOURCES) $(VENV)/extra-ros
+	@rm -rf build/lib build/bdist.*
+	@$(PIP) install --no-build-isolation --no-deps --force-reinstall .
+	@touch $@

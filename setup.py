@@ -1,0 +1,71 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'accel_calib'
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Calibrates an accelerometer in place: offset, gain, cross-axis and mounting '
+                'from still poses, and the named effects behind what is left.',
+    author='The accel_calib authors',
+    maintainer='The accel_calib authors',
+    maintainer_email='accel_calib@example.com',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
+        # Where ros2 run and launch look. Under colcon the entry points below land there too,
+        # see setup.cfg; pip puts those into bin/ alone.
+        (f'lib/{NAME}', ['scripts/calibrator', 'scripts/simulator']),
+    ],
+    zip_safe=True,
+    python_requires='>=3.10',
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'rosbags', 'rich'],
+    extras_require={
+        # ROS itself, where there is no ROS installation.
+        'ros': [
+            'ros-jazzy-rclpy[fastrtps]==7.1.6',
+            'ros-jazzy-common-interfaces==5.3.6',
+            'ros-jazzy-ament-index-python',
+        ],
+        'test': ['pytest', 'setuptools'],
+        'dev': [
+            'flake8',
+            'flake8-builtins',
+            'flake8-comprehensions',
+            'flake8-import-order',
+            'flake8-quotes',
+            'mypy~=2.4',
+            'pydocstyle',
+            'ruff~=0.17.5',
+            'scipy-stubs',
+            'types-PyYAML',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'accel-calib = accel_calib.cli.main:main',
+            'calibrator = accel_calib.ros.calibrator:main',
+            'simulator = accel_calib.ros.simulator:main',
+        ],
+    },
+)
