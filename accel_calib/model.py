@@ -77,9 +77,9 @@ class Model:
         for name, values in self.values.items():
             if name not in EFFECTS:
                 raise ValueError(f'effect {name!r} is none of {", ".join(EFFECTS)}')
-            if np.shape(values) != (len(EFFECTS[name].parameters),):
+            if np.shape(values) != (len(EFFECTS[name].values),):
                 raise ValueError(f'effect {name} has values of shape {np.shape(values)}, expected '
-                                 f'{len(EFFECTS[name].parameters)}')
+                                 f'{len(EFFECTS[name].values)}')
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -112,18 +112,27 @@ class Model:
         total = np.zeros_like(u)
         for name, values in self.values.items():
             if EFFECTS[name].linear is linear:
-                total = total + EFFECTS[name].basis(u, context) @ values
+                parameters, shape = EFFECTS[name].split(values)
+                total = total + EFFECTS[name].basis(u, context, shape) @ parameters
         return total
+
+    def _leaves(self, reading: Floats) -> Floats:
+        """Give the (n, 3) reading that the output makes of this one."""
+        for name, values in self.values.items():
+            output = EFFECTS[name].output
+            if output is not None:
+                reading = output(reading, values)
+        return reading
 
 
 def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
     """Name every parameter of these effects as ``effect.axis``, in the order of all vectors."""
-    return tuple(f'{name}.{part}' for name in effects for part in EFFECTS[name].parameters)
+    return tuple(f'{name}.{part}' for name in effects for part in EFFECTS[name].values)
 
 
 def with_vector(effects: tuple[str, ...], vector: Floats, rotation: Floats | None = None) -> Model:
     """Make a model of these effects from the (p,) vector of all values."""
-    sizes = [len(EFFECTS[name].parameters) for name in effects]
+    sizes = [len(EFFECTS[name].values) for name in effects]
     parts = np.split(vector, np.cumsum(sizes)[:-1]) if sizes else []
     return Model(dict(zip(effects, parts, strict=True)),
                  np.eye(3) if rotation is None else rotation)
@@ -193,7 +202,7 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
 def reading_of(model: Model, u: Floats, context: Context) -> Floats:
     """Say what the sensor reads under the (n, 3) force u, given in its own axes [g]."""
     mat_w, vec_v = model.linear_part
-    return vec_v + u @ mat_w.T + model._added(u, context, linear=False)
+    return model._leaves(vec_v + u @ mat_w.T + model._added(u, context, linear=False))
 
 
 def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
@@ -263,10 +272,37 @@ def correct(model: Model, reading: Floats, context: Context) -> Floats:
     return sensor_force(model, reading, context) @ model.rotation
 
 
-def parameter_basis(effects: tuple[str, ...], u: Floats, context: Context) -> Floats:
-    """Give the (n, 3, p) reading that a value of 1 of each parameter adds at force u."""
-    parts = [EFFECTS[name].basis(u, context) for name in effects]
-    return np.concatenate([np.zeros((len(u), 3, 0)), *parts], axis=2)
+def parameter_basis(model: Model, u: Floats, context: Context) -> Floats:
+    """
+    Say what each value of a model does to the reading.
+
+    Parameters
+    ----------
+    model : Model
+        The sensor.
+    u : (n, 3) array
+        Force in the axes of the sensor [g].
+    context : mapping of str to array
+        What the effects need, n rows each.
+
+    Returns
+    -------
+    (n, 3, p) array
+        Derivative of the reading by each value, in the order of ``model.vector``.
+
+    """
+    parts: list[Floats] = [np.zeros((len(u), 3, 0))]
+    for name, values in model.values.items():
+        effect = EFFECTS[name]
+        parameters, shape = effect.split(values)
+        parts.append(effect.basis(u, context, shape))
+        for k in range(len(shape)):  # the one derivative that is taken by difference
+            step = np.zeros(len(shape))
+            step[k] = 1e-4 * max(abs(shape[k]), 1.0) if effect.shape[k] == 'tau' else 0.0
+            change = (effect.basis(u, context, shape + step)
+                      - effect.basis(u, context, shape - step)) @ parameters
+            parts.append((change / (2.0 * step[k] or 1.0))[:, :, np.newaxis])
+    return np.concatenate(parts, axis=2)
 
 
 def force_slope(model: Model, u: Floats, context: Context) -> Floats:
@@ -274,5 +310,6 @@ def force_slope(model: Model, u: Floats, context: Context) -> Floats:
     slope = np.broadcast_to(model.linear_part[0], (len(u), 3, 3))
     for name, values in model.values.items():
         if not EFFECTS[name].linear:
-            slope = slope + EFFECTS[name].slope(u, context, values)
+            parameters, shape = EFFECTS[name].split(values)
+            slope = slope + EFFECTS[name].slope(u, context, shape, parameters)
     return slope

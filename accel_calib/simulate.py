@@ -56,7 +56,7 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     if name not in EFFECTS or not equals:
         raise InputError(f'effect {text!r} is not NAME=VALUE,… with a NAME of the catalogue',
                          f'use one of {", ".join(EFFECTS)}')
-    parameters = EFFECTS[name].parameters
+    parameters = EFFECTS[name].values
     try:
         values = np.array([float(part) for part in values_text.split(',')])
     except ValueError:

@@ -41,13 +41,26 @@ def rng():
 
 @pytest.fixture
 def context(rng):
-    return {'temperature': rng.uniform(0, 50, 40), 'std': rng.uniform(0, 0.2, (40, 3))}
+    return {'temperature': rng.uniform(0, 50, 40), 'std': rng.uniform(0, 0.2, (40, 3)),
+            'time': 1000.0 + np.sort(rng.uniform(0, 7200, 40)),
+            'supply_voltage': rng.uniform(3, 3.6, 40), 'rate': rng.normal(size=(40, 3)),
+            'approach': random_directions(40, rng)}
+
+
+OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
+ADDED = [name for name in EFFECTS if name not in OUTPUT]
+SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0}
+
+
+def values_of(name, rng):
+    """Draw values of a common size for an effect."""
+    effect = EFFECTS[name]
+    return np.array([*rng.normal(size=len(effect.parameters)) * effect.typical * 0.3,
+                     *(SHAPES[part] for part in effect.shape)])
 
 
 def everything(rng):
-    values = {name: rng.normal(size=len(effect.parameters)) * effect.typical
-              for name, effect in EFFECTS.items()}
-    return Model(values, rotation_from_rpy(0.3, -0.4, 2.0))
+    return Model({name: values_of(name, rng) for name in ADDED}, rotation_from_rpy(0.3, -0.4, 2.0))
 
 
 def test_predict_and_correct_undo_each_other_with_every_effect(rng, context):
@@ -56,30 +69,45 @@ def test_predict_and_correct_undo_each_other_with_every_effect(rng, context):
                                atol=1e-12)
 
 
-@pytest.mark.parametrize('name', EFFECTS)
-def test_effect_adds_its_basis_times_its_values(name, rng, context):
-    force = random_directions(40, rng)
-    values = rng.normal(size=len(EFFECTS[name].parameters)) * 0.01
-    model = Model({name: values})
-    added = predict(model, force, context) - force
-    np.testing.assert_allclose(added, parameter_basis((name,), force, context) @ values,
-                               atol=1e-15)
-    assert np.any(np.abs(added) > 0)
+@pytest.mark.parametrize('name', ADDED)
+def test_values_move_the_reading_as_their_basis_says(name, rng, context):
+    force, values = random_directions(40, rng), values_of(name, rng)
+    basis = parameter_basis(Model({name: values}), force, context)
+    for k, part in enumerate(EFFECTS[name].values):
+        if part in ('start', 'instant'):  # given by the data, not fitted
+            continue
+        step = np.zeros(len(values))
+        step[k] = 1e-4 * max(abs(values[k]), 1.0)
+        change = (predict(Model({name: values + step}), force, context)
+                  - predict(Model({name: values - step}), force, context)) / (2 * step[k])
+        np.testing.assert_allclose(basis[:, :, k], change, atol=1e-9)
+        assert np.any(np.abs(change) > 0)
 
 
-@pytest.mark.parametrize('name', EFFECTS)
+@pytest.mark.parametrize('name', ADDED)
 def test_slope_is_the_derivative_of_the_reading(name, rng, context):
     force, step = random_directions(40, rng), 1e-6
-    model = Model({name: rng.normal(size=len(EFFECTS[name].parameters))})
+    model = Model({name: values_of(name, rng)})
     numeric = np.stack([(reading_of(model, force + step * axis, context)
                          - reading_of(model, force - step * axis, context)) / (2 * step)
                         for axis in np.eye(3)], axis=2)
     np.testing.assert_allclose(force_slope(model, force, context), numeric, atol=1e-7)
 
 
+def test_effects_of_the_output_act_on_the_whole_reading():
+    force = np.array([[0.5, -0.96, 0.123]])
+    offset = parse_effect('offset=0.01,-0.01,0.002')
+    clipped = Model(dict([offset, parse_effect('saturation=0.95')]))
+    np.testing.assert_allclose(predict(clipped, force, {}), [[0.51, -0.95, 0.125]])
+    grid = Model(dict([offset, parse_effect('quantisation=0.02')]))
+    np.testing.assert_allclose(predict(grid, force, {}), [[0.52, -0.96, 0.12]])
+
+
 def test_effects_by_hand():
-    force, context = np.array([[0.5, -2.0, 3.0]]), {'temperature': np.array([35.0]),
-                                                    'std': np.array([[0.1, 0.2, 0.3]])}
+    force = np.array([[0.5, -2.0, 3.0]])
+    context = {'temperature': np.array([35.0]), 'std': np.array([[0.1, 0.2, 0.3]]),
+               'time': np.array([7300.0]), 'supply_voltage': np.array([3.63]),
+               'rate': np.array([[0.0, 0.0, 2.0]]), 'approach': np.array([[0.6, 0.0, -0.8]])}
     cases = {
         'offset=1,2,3': (1, 2, 3), 'gain=0.1': (0.05, -0.2, 0.3),
         'axis_gain=0.1,0.2,0.3': (0.05, -0.4, 0.9), 'cross_axis=1,0,0': (-2.0, 0.5, 0),
@@ -87,9 +115,12 @@ def test_effects_by_hand():
         'cubic=1': (0.125, -8, 27), 'odd_quadratic=1': (0.25, -4, 9),
         'gain_asymmetry=1': (0.5, 2, 3), 'cross_coupling=1,0,0,0,0,10': (-1, 0, -60),
         'offset_temperature=1': (10, 10, 10), 'gain_temperature=1': (5, -20, 30),
-        'vibration_rectification=1': (0.01, 0.04, 0.09),
+        'supply_ratio=1,0,0,2': (0.05, -0.2, 0.5), 'offset_drift=1,2,3,100': (2, 4, 6),
+        'warm_up=1,2,3,100,7200': (np.exp(-1), 2 * np.exp(-1), 3 * np.exp(-1)),
+        'offset_step=1,2,3,7300': (1, 2, 3), 'vibration_rectification=1': (0.01, 0.04, 0.09),
+        'hysteresis=1': (0.6, 0.0, -0.8), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
     }
-    assert {case.partition('=')[0] for case in cases} == set(EFFECTS)
+    assert {case.partition('=')[0] for case in cases} == set(ADDED)
     for text, added in cases.items():
         model = Model(dict([parse_effect(text)]))
         np.testing.assert_allclose(predict(model, force, context)[0] - force[0], added,

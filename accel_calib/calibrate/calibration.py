@@ -206,7 +206,7 @@ class Calibration:
         """
         model, known = self.model, context or {}
         u = force / self.force_per_g @ model.rotation.T
-        basis = parameter_basis(model.effects, u, known)
+        basis = parameter_basis(model, u, known)
         moved = model.rotation.T @ np.linalg.solve(force_slope(model, u, known), basis)
         covariance: Floats = moved @ self.covariance @ np.swapaxes(moved, 1, 2)
         return covariance * self.force_per_g ** 2
@@ -214,8 +214,8 @@ class Calibration:
 
 def _linear_rows(model: Model, u: Floats) -> Floats:
     """Give the (n, 3, p) part that each value has in V + W u; none where it is not linear."""
-    parts = [EFFECTS[name].basis(u, {}) if EFFECTS[name].linear
-             else np.zeros((len(u), 3, len(EFFECTS[name].parameters))) for name in model.effects]
+    parts = [EFFECTS[name].basis(u, {}, np.zeros(0)) if EFFECTS[name].linear
+             else np.zeros((len(u), 3, len(EFFECTS[name].values))) for name in model.effects]
     return np.concatenate([np.zeros((len(u), 3, 0)), *parts], axis=2)
 
 

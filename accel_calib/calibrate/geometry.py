@@ -34,8 +34,9 @@ from itertools import product
 
 import numpy as np
 
+from ..effects import EFFECTS
 from ..errors import RefusedFitError
-from ..model import MODELS, parameter_basis
+from ..model import MODELS
 from ..sphere import spread_directions
 from ..table import Floats
 
@@ -76,7 +77,8 @@ class NextPose:
 def _rows(name: str, directions: Floats) -> Floats:
     """Give φ for each direction, (n, p), in the effects of a model that the norm can carry."""
     effects = MODELS['10' if name == '9' else name]
-    return np.einsum('ni,nip->np', directions, parameter_basis(effects, directions, {}))
+    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0)) for effect in effects]
+    return np.einsum('ni,nip->np', directions, np.concatenate(parts, axis=2))
 
 
 def free_parameters(name: str) -> int:

@@ -38,7 +38,15 @@ import numpy as np
 
 from ..effects import Context
 from ..errors import InputError, RefusedFitError
-from ..model import force_slope, Model, parameter_basis, reading_of, sensor_force, with_vector
+from ..model import (
+    force_slope,
+    Model,
+    parameter_basis,
+    parameter_names,
+    reading_of,
+    sensor_force,
+    with_vector,
+)
 from ..table import Floats
 
 _CHI2_SURPRISE = 0.01
@@ -130,7 +138,7 @@ def norm_rows(model: Model, u: Floats, context: Context) -> Floats:
 
 def norm_jacobian(model: Model, u: Floats, context: Context) -> Floats:
     """Give the (n, p) derivative of |u| by the values of the model."""
-    basis = parameter_basis(model.effects, u, context)
+    basis = parameter_basis(model, u, context)
     return -np.einsum('ni,nip->np', norm_rows(model, u, context), basis)
 
 
@@ -256,7 +264,8 @@ def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, 
     """
     noise = None if noise is None else believable(noise)
     sigma = np.ones(reading.size) if noise is None else noise.ravel()
-    basis = parameter_basis(effects, reference, context)
+    zero = with_vector(effects, np.zeros(len(parameter_names(effects))))
+    basis = parameter_basis(zero, reference, context)
     design = basis.reshape(reading.size, -1) / sigma[:, np.newaxis]
     values, _, rank, _ = np.linalg.lstsq(design, (reading - reference).ravel() / sigma, rcond=1e-9)
     if rank < design.shape[1]:

@@ -53,7 +53,7 @@ def format_calibration(calibration: Calibration) -> str:
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
         'effects': {name: {'what': EFFECTS[name].words, 'unit': EFFECTS[name].unit,
-                           **dict(zip(EFFECTS[name].parameters, values.tolist(), strict=True))}
+                           **dict(zip(EFFECTS[name].values, values.tolist(), strict=True))}
                     for name, values in model.values.items()},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
         'covariance': calibration.covariance.tolist(),
@@ -125,7 +125,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Make the record from the content of a file."""
     if content['frame'] not in FRAMES:
         raise ValueError(f'frame {content["frame"]!r} is none of {", ".join(FRAMES)}')
-    values = {name: np.array([float(effect[part]) for part in EFFECTS[name].parameters])
+    values = {name: np.array([float(effect[part]) for part in EFFECTS[name].values])
               for name, effect in content['effects'].items()}
     rotation = _finite(content['rotation'])
     if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
