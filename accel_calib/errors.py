@@ -29,9 +29,12 @@ class AccelCalibError(Exception):
     """
 
     def __init__(self, message: str, advice: str) -> None:
-        super().__init__(f'{message}; {advice}')
+        super().__init__(message, advice)
         self.message = message
         self.advice = advice
+
+    def __str__(self) -> str:
+        return f'{self.message}; {self.advice}'
 
 
 class InputError(AccelCalibError):

@@ -58,6 +58,8 @@ COLUMNS: dict[str, Column] = {
     'rate': Column(('gx', 'gy', 'gz'), 'rad/s', 'angular rate'),
     'reference': Column(('ref_x', 'ref_y', 'ref_z'), 'unit of the reading',
                         'true specific force (known orientation); in g for native units'),
+    'approach': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the pose before; '
+                       'made from the order of the poses'),
     'orientation': Column(('orientation',), '', 'rows that share it had the same orientation'),
     'label': Column(('label',), '', 'a word of the user'),
 }

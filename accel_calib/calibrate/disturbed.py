@@ -16,10 +16,11 @@
 Disturbed poses: knocked, or not still. A fault of the data, found and left out.
 
 The pose whose residual is the largest against what the other poses say (externally studentised,
-with the moderated variance of `accel_calib.calibrate.likelihood.Fit`) is left out and the rest
-fitted again, several times over; as many are then called disturbed as the generalised extreme
-studentised deviate test (Rosner 1983) finds at the level `_LEVEL`, which is not masked when
-several poses are disturbed.
+with the moderated variance of `accel_calib.calibrate.likelihood.Fit`) is taken out, and so on,
+several times over; as many are then called disturbed as the generalised extreme studentised
+deviate test (Rosner 1983) finds at the level `_LEVEL`, which is not masked when several poses are
+disturbed. Between the poses taken out the fit is followed to first order; it is then made anew
+without them, and the search goes on until it finds no more.
 
 """
 
@@ -35,10 +36,10 @@ from ..table import Floats
 
 _LEVEL = 0.01
 _LARGEST_SHARE = 0.25
+_ROUNDS = 4
 
 
-def disturbed(fit_rows: Callable[[NDArray[np.int64]], Fit], count: int,
-              free: int) -> NDArray[np.int64]:
+def disturbed(fit_rows: Callable[[NDArray[np.int64]], Fit], count: int) -> NDArray[np.int64]:
     """
     Find disturbed poses.
 
@@ -48,8 +49,6 @@ def disturbed(fit_rows: Callable[[NDArray[np.int64]], Fit], count: int,
         Fits the poses at these indices.
     count : int
         Number of poses.
-    free : int
-        Free parameters of the fit.
 
     Returns
     -------
@@ -58,36 +57,62 @@ def disturbed(fit_rows: Callable[[NDArray[np.int64]], Fit], count: int,
 
     """
     kept = np.arange(count)
-    out: list[int] = []
-    found = 0
-    for _ in range(min(int(_LARGEST_SHARE * count), count - free - 1)):
+    for _ in range(_ROUNDS):
         fit = fit_rows(kept)
-        worst, size = _largest(fit)
-        if size > _critical(fit, len(kept)):
+        most = int(_LARGEST_SHARE * count) - (count - len(kept))
+        found = _extreme(fit, min(most, fit.dof - 1))
+        if not found:
+            break
+        kept = np.delete(kept, found)
+    return np.setdiff1d(np.arange(count), kept)
+
+
+def _extreme(fit: Fit, most: int) -> list[int]:
+    """Give the residuals that the test calls extreme, among at most so many."""
+    rows, found = np.arange(len(fit.residual)), 0
+    out: list[int] = []
+    belief = fit.variance_dof - fit.dof
+    for _ in range(most):
+        sizes, dof = studentised(fit.weighted[rows], fit.jacobian[rows], belief)
+        worst = int(np.argmax(sizes))
+        if sizes[worst] > _critical(dof, len(rows)):
             found = len(out) + 1
-        out.append(int(kept[worst]))
-        kept = np.delete(kept, worst)
-    return np.array(sorted(out[:found]), int)
+        out.append(int(rows[worst]))
+        rows = np.delete(rows, worst)
+    return out[:found]
 
 
-def studentised(fit: Fit) -> Floats:
-    """Give each residual over its deviation as the others tell it, (n,); 0 where they can't."""
-    free_share = 1.0 - fit.leverage
-    tells = free_share > 1e-6
-    squared = np.where(tells, fit.weighted ** 2 / np.where(tells, free_share, 1.0), 0.0)
-    others = (fit.variance * fit.variance_dof - squared) / (fit.variance_dof - 1.0)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        ratio = np.sqrt(squared / np.maximum(others, 0.0))
-    return np.nan_to_num(ratio, nan=0.0, posinf=np.inf)
+def studentised(weighted: Floats, jacobian: Floats, belief: float) -> tuple[Floats, float]:
+    """
+    Give each residual over its deviation as the others tell it.
+
+    Parameters
+    ----------
+    weighted : (m,) array
+        Residuals over their noise, of a fit that need not be these rows' own.
+    jacobian : (m, q) array
+        Their derivative by the free values.
+    belief : float
+        Degrees of freedom that the measured noise counts as.
+
+    Returns
+    -------
+    (m,) array, float
+        Student's t of each, and its degrees of freedom; 0 where the others cannot tell.
+
+    """
+    onto = np.linalg.qr(jacobian)[0]
+    residual = weighted - onto @ (onto.T @ weighted)
+    own = 1.0 - np.sum(onto ** 2, axis=1)
+    tells = own > 1e-6
+    squared = np.where(tells, residual ** 2 / np.where(tells, own, 1.0), 0.0)
+    dof = belief + len(weighted) - jacobian.shape[1] - 1.0
+    others = np.maximum(belief + residual @ residual - squared, 1e-300) / max(dof, 1e-9)
+    return np.sqrt(squared / others), dof
 
 
-def _largest(fit: Fit) -> tuple[int, float]:
-    sizes = studentised(fit)
-    return int(np.argmax(sizes)), float(np.max(sizes))
-
-
-def _critical(fit: Fit, count: int) -> float:
+def _critical(dof: float, count: int) -> float:
     """Give Student's t that one of `count` clean poses exceeds with probability `_LEVEL`."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(fit.variance_dof - 1.0, 1.0 - _LEVEL / (2.0 * count)))
+    return float(stdtrit(max(dof, 1.0), 1.0 - _LEVEL / (2.0 * count)))

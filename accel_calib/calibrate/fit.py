@@ -149,8 +149,7 @@ def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor:
     largest = _carried(directions)[-1] if model == 'auto' else model
     out = np.zeros(0, int)
     if method == 'ml':
-        out = disturbed(lambda rows: _fit_rows(poses_g.take(rows), largest, 'ml'), len(poses),
-                        free_parameters(largest))
+        out = disturbed(lambda rows: _fit_rows(poses_g.take(rows), largest, 'ml'), len(poses))
         kept = np.delete(kept, out)
         refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions[kept])
     if model == 'auto':

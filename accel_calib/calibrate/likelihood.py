@@ -52,6 +52,9 @@ from ..table import Floats
 _CHI2_SURPRISE = 0.01
 """Below this probability of the chi², the residuals and not the samples set the noise."""
 
+_NO_NOISE_G = 1e-9
+"""Samples that scatter less do not scatter at all."""
+
 _LEAST_NOISE = 0.1
 """A pose that claims less than this part of the median noise is not believed."""
 
@@ -145,7 +148,7 @@ def norm_jacobian(model: Model, u: Floats, context: Context) -> Floats:
 def believable(noise: Floats) -> Floats | None:
     """Raise noise that is far below the others'; None where most claim to have none at all."""
     median = np.median(noise)
-    return np.maximum(noise, _LEAST_NOISE * median) if median > 0.0 else None
+    return np.maximum(noise, _LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
 def fit_norm(start: Model, reading: Floats, context: Context, noise: Floats | None,
@@ -278,7 +281,8 @@ def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, 
     return Fit(model, covariance, residual, sigma, -design, noise is not None)
 
 
-def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool) -> Floats:
+def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool,
+                  dof: int | None = None) -> Floats:
     """
     Give the covariance of the free parameters.
 
@@ -290,6 +294,8 @@ def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool) -> Floa
         Residuals over their noise.
     noise_known : bool
         If not, or if the chi² is too large to believe the noise, the residuals scale it.
+    dof : int, optional
+        Degrees of freedom, where they are not m - q.
 
     Returns
     -------
@@ -299,7 +305,7 @@ def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool) -> Floa
     """
     from scipy.special import chdtrc
 
-    dof = len(weighted) - jacobian.shape[1]
+    dof = len(weighted) - jacobian.shape[1] if dof is None else dof
     chi2 = float(weighted @ weighted)
     scale = 1.0
     if not noise_known or (dof > 0 and chdtrc(dof, chi2) < _CHI2_SURPRISE):

@@ -171,7 +171,8 @@ def _held_out(fit: Fit, count: int) -> Floats:
     1974); NaN where the pose alone determines a parameter.
 
     """
-    orthonormal = np.linalg.qr(fit.jacobian)[0].reshape(count, -1, fit.jacobian.shape[1])
+    each = len(fit.residual) // count
+    orthonormal = np.linalg.qr(fit.jacobian)[0].reshape(count, each, fit.jacobian.shape[1])
     own = np.eye(orthonormal.shape[1]) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
     if np.any(np.linalg.svd(own, compute_uv=False) < 1e-9):
         return np.full((count, own.shape[1]), np.nan)

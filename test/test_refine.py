@@ -1,0 +1,223 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Hidden effects are found by name, and nothing is made up; sets of an independent generator."""
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.capture import capture, CaptureSettings
+from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.files import format_calibration, parse_calibration, read_poses, read_samples
+from accel_calib.refine import refine
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+import generator
+import numpy as np
+import pytest
+from shared import data, sensor
+
+MPS2, G = units_of('m/s2'), units_of('g')
+LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
+
+
+@pytest.fixture
+def taken(tmp_path):
+    """Give poses of a simulated sensor, through a file as a user's are."""
+    def take(seed, hidden=None, **setup):
+        made = generator.simulate(np.random.default_rng(seed), hidden or {},
+                                  generator.Setup(**setup))
+        generator.write_csv(tmp_path / 'poses.csv', made.columns)
+        return read_poses(tmp_path / 'poses.csv'), made
+    return take
+
+
+def names(found):
+    return [step.effect for step in found.steps if step.effect not in LADDER]
+
+
+@pytest.mark.parametrize('effect', [name for name in generator.EFFECTS
+                                    if name not in generator.OUTSIDE])
+def test_each_hidden_effect_is_named_or_named_as_a_rival(effect, taken):
+    poses, _ = taken(11, {effect: 5.0}, poses=60)
+    found = refine(poses, MPS2, base='10')
+    assert len(names(found)) == 1
+    step = next(step for step in found.steps if step.effect == names(found)[0])
+    assert effect in (step.effect, *step.rivals)
+    assert found.verdict == 'explained'
+    if effect != 'quantisation':  # a grid cannot be taken out
+        assert step.gap_after_mg < 0.6 * step.gap_before_mg
+        assert step.held_out_after_mg < 0.7 * step.held_out_before_mg
+        assert found.remaining_gap_mg < 1.5 * found.noise_floor_mg
+    assert step.p_value < 0.005
+    assert any(letter.isdigit() for letter in step.where)
+
+
+@pytest.mark.parametrize('effect', ['quadratic', 'offset_temperature', 'warm_up'])
+def test_values_are_those_that_were_hidden(effect, taken):
+    poses, made = taken(12, {effect: 6.0}, poses=100)
+    calibration = refine(poses, MPS2, base='10').calibration
+    truth = made.truth[effect]
+    for k, name in enumerate(calibration.parameters):
+        owner, _, part = name.partition('.')
+        if owner == effect and part in truth and part not in ('start', 'instant'):
+            value = calibration.model.vector[k]
+            deviation = np.sqrt(calibration.covariance[k, k])
+            assert abs(value - truth[part]) < 4.0 * deviation, name
+
+
+@pytest.mark.parametrize('poses', [24, 60, 200])
+def test_nothing_is_named_where_nothing_is_hidden(poses, taken):
+    for seed in range(10):
+        found = refine(taken(seed, poses=poses)[0], MPS2)
+        assert (found.verdict, names(found)) == ('no_gap', [])
+
+
+def test_two_hidden_effects_are_both_named(taken):
+    for seed, pair in enumerate([('quadratic', 'offset_temperature'), ('cubic', 'offset_step'),
+                                 ('hysteresis', 'supply_ratio')]):
+        found = refine(taken(seed, dict.fromkeys(pair, 6.0), poses=60)[0], MPS2, base='10')
+        assert sorted(names(found)) == sorted(pair)
+
+
+@pytest.mark.parametrize('effect', generator.OUTSIDE)
+def test_what_no_effect_explains_is_said_to_be_unexplained(effect, taken):
+    found = refine(taken(3, {effect: 6.0}, poses=60)[0], MPS2, base='10')
+    assert names(found) in ([], ['offset_wander'])
+    if not names(found):
+        assert found.verdict == 'unexplained'
+        assert any('gap remains' in line for line in found.advice)
+
+
+@pytest.mark.parametrize(('effect', 'columns'), [
+    ('offset_temperature', ('temperature',)), ('supply_ratio', ('supply_voltage',)),
+    ('lever_arm', ('gx', 'gy', 'gz'))])
+def test_an_effect_whose_column_is_missing_gets_no_other_name(effect, columns, taken):
+    found = refine(taken(4, {effect: 6.0}, poses=60, dropped=columns)[0], MPS2, base='10')
+    assert names(found) in ([], ['offset_wander'])
+    assert found.verdict != 'no_gap'
+    assert (effect, ', '.join(columns)) in found.not_testable
+
+
+def test_knocked_poses_are_found_and_nothing_is_named(taken):
+    for seed in range(5):
+        poses, made = taken(seed, poses=60, knocked=3)
+        found = refine(poses, MPS2, base='10')
+        shows = {row for row, size in made.knocked.items() if abs(size) > 5e-3}
+        assert shows <= set(found.disturbed_poses) <= set(made.knocked)
+        assert names(found) == []
+
+
+def test_a_refined_calibration_is_an_ordinary_one(taken):
+    poses, made = taken(5, {'offset_temperature': 6.0, 'quadratic': 6.0}, poses=60)
+    calibration = refine(poses, MPS2, base='10', sensor='imu').calibration
+    stored = parse_calibration(format_calibration(calibration), 'x.yaml')
+    fresh = generator.again(np.random.default_rng(1), made)
+    columns = {'reading': np.column_stack([fresh.columns[name] for name in ('ax', 'ay', 'az')])}
+    force = stored.correct(columns['reading'], {'temperature': np.array(
+        fresh.columns['temperature'])})
+    assert np.std(np.linalg.norm(force, axis=1)) / 9.80665 < 1e-3
+    with pytest.raises(InputError, match='need temperature'):
+        stored.correct(columns['reading'])
+
+
+def test_the_ladder_is_climbed_from_an_ideal_sensor(taken):
+    found = refine(taken(6, poses=60)[0], MPS2, base='ideal')
+    steps = [step.effect for step in found.steps]
+    assert sorted(steps) == sorted(LADDER)
+    assert steps.index('gain') < steps.index('axis_gain')
+    gaps = [found.gap_mg, *(step.gap_after_mg for step in found.steps)]
+    assert gaps == sorted(gaps, reverse=True)
+    assert found.verdict == 'explained'
+
+
+def test_known_orientation_shows_what_the_norm_does_not():
+    rng, directions = np.random.default_rng(7), spread_directions(30)
+    model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
+    poses = simulate_poses(model, directions, rng, context={'reference': directions})
+    found = refine(poses, G, base='10')
+    assert [step.effect for step in found.steps] == ['misalignment']
+    assert refine(poses, G).verdict == 'no_gap'
+
+
+def test_shared_orientation_shows_temperature_across_gravity():
+    rng = np.random.default_rng(8)
+    directions = np.repeat(random_directions(3, rng), 20, axis=0)
+    temperature = 25.0 + 8.0 * np.sin(np.arange(60.0))
+    model = model_with({'offset_temperature': np.array([5e-4, 4e-4, -4e-4])})
+    poses = simulate_poses(model, directions, rng, context={
+        'temperature': temperature, 'time': np.arange(60.0) * 3600.0,
+        'orientation': np.repeat(np.arange(3.0), 20)})
+    found = refine(poses, G)
+    assert names(found) == ['offset_temperature']
+    values = found.calibration.model.values['offset_temperature']
+    np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4], atol=3e-5)
+
+
+def test_too_few_poses_are_refused():
+    poses = simulate_poses(model_with({}), spread_directions(3), np.random.default_rng(1))
+    with pytest.raises(RefusedFitError, match='3 poses are too few'):
+        refine(poses, G)
+
+
+def test_base_may_be_a_stored_calibration(taken):
+    poses, _ = taken(9, {'cubic': 6.0}, poses=60)
+    base = fit_poses(poses, MPS2, model='10', sensor='imu')
+    found = refine(poses, MPS2, base=base)
+    assert names(found) == ['cubic']
+    assert found.calibration.sensor == 'imu'
+
+
+@pytest.mark.parametrize('name', ['mpu9150_imu0', 'mpu9150_imu1'])
+def test_mpu9150_hides_nothing(name):
+    poses = capture(read_samples(data(f'{name}.csv')), MPS2).poses
+    assert names(refine(poses, MPS2, base='10')) == []
+    climbed = refine(poses, MPS2, base='ideal')
+    assert sorted(step.effect for step in climbed.steps) == sorted(LADDER)
+
+
+def test_xsens_lacks_cross_axis_most():
+    poses = capture(read_samples(data('xsens_mti_counts.csv')), units_of('native')).poses
+    found = refine(poses, units_of('native'), base='7')
+    assert found.steps[0].effect == 'cross_axis'
+    assert found.steps[0].gap_before_mg > 2.5
+    assert found.steps[0].gap_after_mg < 0.12
+
+
+def test_report_data_show_a_quadratic_part_in_the_first_phone_alone():
+    units = units_of('m/s2', 9.8061)
+    found = refine(read_poses(data('esgi95_dataset1_huawei.csv')), units, base='10')
+    assert names(found) == ['quadratic']
+    assert found.steps[-1].held_out_before_mg == pytest.approx(1.5, abs=0.1)
+    assert found.steps[-1].held_out_after_mg == pytest.approx(0.8, abs=0.1)
+    for name in ('esgi95_dataset2.csv', 'esgi95_dataset3_gt.csv'):
+        assert names(refine(read_poses(data(name)), units)) == []
+
+
+def test_sensehat_moves_with_temperature():
+    recording = read_samples(data('sensehat_lsm9ds1_temperature.csv'))
+    poses = capture(recording, G, CaptureSettings(max_dwell=3600.0)).poses
+    found = refine(poses, G)
+    step = next(step for step in found.steps if step.effect == 'offset_temperature')
+    moved = [step.parameters[axis] * 1e3 for axis in 'xyz']
+    np.testing.assert_allclose(moved, [0.57, 0.41, -0.41], atol=0.08)
+    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
+
+
+def test_poses_are_left_as_they_were(taken):
+    poses = taken(10, {'cubic': 6.0}, poses=40)[0]
+    before = Poses({key: values.copy() for key, values in poses.columns.items()}, poses.row)
+    refine(poses, MPS2)
+    for key in poses.columns:
+        np.testing.assert_array_equal(poses[key], before[key])
