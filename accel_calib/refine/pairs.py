@@ -49,7 +49,7 @@ def best_pair(found: dict[str, Candidate], state: State) -> tuple[Candidate, Can
 
 
 def pair_is_better(pair: tuple[Candidate, Candidate], single: Candidate, state: State,
-                    among: int) -> bool:
+                   among: int) -> bool:
     """Tell whether both of a pair are called for, and the best single one is in neither's way."""
     if single.effect in (pair[0].effect, pair[1].effect):
         return False

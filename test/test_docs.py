@@ -1,0 +1,57 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The documentation says what the code does."""
+
+import importlib.util
+from pathlib import Path
+import re
+
+from accel_calib.cli.main import parser
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def tables():
+    spec = importlib.util.spec_from_file_location('tables', ROOT / 'docs' / 'tables.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize('page', sorted((ROOT / 'docs').glob('*.md')), ids=lambda path: path.name)
+def test_tables_are_those_of_the_code(page):
+    text = page.read_text(encoding='utf-8')
+    assert tables().with_tables(text) == text, 'run: python docs/tables.py'
+
+
+def test_every_table_is_in_a_page():
+    pages = ''.join(path.read_text(encoding='utf-8') for path in (ROOT / 'docs').glob('*.md'))
+    for name in tables().TABLES:
+        assert f'<!-- {name} -->' in pages
+
+
+def test_commands_of_the_readme_exist():
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    known = set(parser()._subparsers._group_actions[0].choices)
+    assert set(re.findall(r'^ +accel-calib (\w+)', text, re.MULTILINE)) <= known
+
+
+@pytest.mark.parametrize('page', ['README.md', 'CONTRIBUTING.md', *(
+    f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))])
+def test_links_lead_somewhere(page):
+    path = ROOT / page
+    for link in re.findall(r'\]\(([^)#]+)\)', path.read_text(encoding='utf-8')):
+        assert link.startswith('http') or (path.parent / link).exists(), link
