@@ -47,13 +47,16 @@ setup(
             'ros-jazzy-common-interfaces==5.3.6',
             'ros-jazzy-ament-index-python',
         ],
-        'test': ['pytest', 'setuptools'],
+        # Figures: accel-calib report, and refine --report.
+        'report': ['matplotlib>=3.6'],
+        'test': ['matplotlib>=3.6', 'pytest', 'setuptools'],
         'dev': [
             'flake8',
             'flake8-builtins',
             'flake8-comprehensions',
             'flake8-import-order',
             'flake8-quotes',
+            'matplotlib>=3.6',
             'mypy~=2.4',
             'pydocstyle',
             'ruff~=0.17.5',

@@ -20,7 +20,7 @@ import argparse
 from collections.abc import Sequence
 import sys
 
-from . import apply, capture, demo, fit, nodes, simulate, verify
+from . import apply, capture, demo, fit, nodes, refine, report, simulate, verify
 from .. import __version__
 from ..errors import AccelCalibError
 
@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument('--version', action='version', version=__version__)
     commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND',
                                   required=True)
-    for command in (demo, capture, fit, verify, apply, simulate, nodes):
+    for command in (demo, capture, fit, verify, refine, apply, simulate, report, nodes):
         command.add_to(commands)
     return top
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from .candidates import Candidate, LADDER
 from .equations import kinds
 from .knocked import knocked
-from .least_squares import Fitted
+from .least_squares import Fitted, fitted
 from .noise import is_down_to_noise, is_noise
 from .output import Clipped, off_grid, unclipped
 from .pairs import best_pair, pair_is_better
@@ -166,10 +166,23 @@ def _climb(state: State) -> tuple[State, tuple[str, ...]]:
     while True:
         found = state.candidates_among(_rungs(state))
         best = _best(found, state.fitted, state.dof)
-        if best is None or probability(best, state.fitted, state.dof, len(found)) > LEVEL:
+        if best is None or not _called_for(best, found, state):
             return state, added
+        if best.effect == 'axis_gain' and 'gain' in found and probability(
+                found['gain'], state.fitted, state.dof, len(found)) < LEVEL:
+            best = found['gain']  # one rung at a time
         state = plus(state, best)
         added = (*added, best.effect)
+
+
+def _called_for(best: Candidate, found: dict[str, Candidate], state: State) -> bool:
+    """Tell whether a rung is called for, alone or with all the others: one may hide another."""
+    columns = fitted(np.zeros(len(state.near.residual)), np.zeros((len(state.near.residual), 0)))
+    for candidate in found.values():
+        columns = columns.with_columns(candidate.columns)
+    together = replace(best, columns=columns.onto)
+    return any(probability(candidate, state.fitted, state.dof, len(found)) < LEVEL
+               for candidate in (best, together))
 
 
 def _rungs(state: State) -> tuple[str, ...]:
@@ -177,7 +190,7 @@ def _rungs(state: State) -> tuple[str, ...]:
     present = state.model.values
     rungs = ['offset', 'cross_axis']
     if 'axis_gain' not in present:
-        rungs.append('axis_gain' if 'gain' in present else 'gain')
+        rungs += ['gain', 'axis_gain']
     if len(kinds(state.poses_g)[0]):
         rungs.append('misalignment')
     return tuple(name for name in LADDER if name in rungs and name not in present)
@@ -209,10 +222,10 @@ def _settle(state: State, rows: NDArray[np.intp], patience: float
 def _settled_again(poses_g: Poses, start: State, state: State, names: tuple[str, ...]
                    ) -> tuple[State, NDArray[np.intp], State]:
     """Judge all poses anew in the model that was found."""
-    everyone = replace(state, poses_g=beginning(poses_g, start.model).poses_g)
-    whole = everyone.with_effects(dict(state.model.values))
+    # Near the model of the good poses: one that the knocked ones shaped bends the equations.
+    whole = State(state.model, beginning(poses_g, start.model).poses_g)
     standing = knocked(whole.near, whole.fitted)
-    again = whole.without(standing.poses) if standing.poses.size else whole
+    again = whole.without(standing.poses)
     before = State(start.model, again.poses_g).with_effects(dict(start.model.values))
     return again, standing.poses, before
 
