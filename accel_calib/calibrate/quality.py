@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .approach import with_approach
 from .calibration import Calibration, Quality
 from .geometry import coverage
 from .likelihood import believable, Fit, norm_rows
@@ -82,7 +83,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
         Gaps before and after.
 
     """
-    poses_g = in_g(poses, calibration.units)
+    poses_g = with_approach(in_g(poses, calibration.units), calibration.model)
     vectors = calibration.name == '12' and 'reference' in poses
     before = _before(poses_g, calibration.units, vectors=vectors)
     model = calibration.model

@@ -72,27 +72,6 @@ class Candidate:
         return self.columns.shape[1] + self.searched
 
 
-def with_approach(poses_g: Poses, force: Floats) -> Poses:
-    """
-    Add from where each pose was reached, in the order of time or of the rows.
-
-    Parameters
-    ----------
-    poses_g : Poses
-        In g.
-    force : (n, 3) array
-        Their unit forces.
-
-    """
-    order = np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g else np.arange(
-        len(poses_g))
-    steps = np.diff(force[order], axis=0, prepend=force[order][:1])
-    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-    approach = np.zeros_like(force)
-    approach[order] = -steps / np.where(lengths > 1e-3, lengths, np.inf)
-    return Poses({**poses_g.columns, 'approach': approach}, poses_g.row)
-
-
 def candidates(equations: Equations, fitted: Fitted, context: Context, names: tuple[str, ...],
                whitening: Floats | None = None) -> dict[str, Candidate]:
     """
@@ -161,7 +140,19 @@ def _shapes(name: str, context: Context) -> Iterator[Floats]:
 
 def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tuple[str, ...]
                  ) -> list[tuple[str, str]]:
-    """Name the effects that these poses cannot show, with what to record."""
+    """
+    Name the effects that these poses cannot show, with what to record.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        In g.
+    testable : mapping of str to Candidate
+        Effects that they can show.
+    present : tuple of str
+        Effects of the model, and their rivals.
+
+    """
     missing = []
     known = kinds(poses_g)[0]
     for name, effect in EFFECTS.items():
@@ -184,7 +175,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
 
 def _more(name: str) -> str:
     """Say what would make an effect visible whose columns are there."""
-    needs = [COLUMNS[key].names[0] for key in EFFECTS[name].needs if key in COLUMNS]
+    needs = [COLUMNS[key].meaning for key in EFFECTS[name].needs if key in COLUMNS]
     if needs:
-        return f'a {needs[0]} that changes more between the poses'
+        return f'poses between which this changes more: {needs[0]}'
     return 'more poses in more directions'

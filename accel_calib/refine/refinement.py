@@ -95,8 +95,9 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     remaining, noise = _remaining(found)
     verdict: Verdict = ('unexplained' if not noise else 'explained' if steps else 'no_gap')
     left_out = tuple(int(row) for row in poses.row[found.knocked])
+    alike = tuple(rival for step in steps for rival in step.rivals)
     untestable = tuple(not_testable(found.final.poses_g, found.final.found,
-                                    found.final.model.effects))
+                                    (*found.final.model.effects, *alike)))
     kept = found.final.poses_g
     return Refinement(
         verdict, found.final.floor_mg, found.base.gap_mg(found.base.fitted.residual), remaining,

@@ -22,11 +22,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .candidates import Candidate, candidates, LADDER, with_approach
+from .candidates import Candidate, candidates, LADDER
 from .equations import Equations, equations, noise_of
 from .exact import columns_of, fit_exactly
 from .least_squares import Fitted, fitted
 from .wander import Wander, wander
+from ..calibrate.approach import with_approach
 from ..effects import EFFECTS
 from ..model import Model
 from ..table import Floats, Poses
@@ -153,7 +154,5 @@ def _started(state: State, values: dict[str, Floats], candidate: Candidate) -> d
 
 def beginning(poses_g: Poses, model: Model) -> State:
     """Give the state of a model before anything is added, fitted to all poses."""
-    noise = noise_of(poses_g)
-    force = equations(model, poses_g, noise).force
-    return State(fit_exactly(model, with_approach(poses_g, force), noise),
-                 with_approach(poses_g, force))
+    known = with_approach(poses_g, model)
+    return State(fit_exactly(model, known, noise_of(known)), known)

@@ -84,9 +84,10 @@ def _directions(force: Floats, share: Floats) -> str:
     near = units @ force.T >= _NEAR
     counts = np.sum(near, axis=1)
     means = np.where(counts > 0, near @ share / np.maximum(counts, 1), 0.0)
-    largest = np.argsort(-np.abs(means))[:_LARGEST]
+    largest = [k for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]]
     return 'with ' + ', '.join(
-        f'{_name(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} poses)' for k in largest)
+        f'{_name(signs[k])} up ({means[k]:+.2g} mg, {counts[k]} pose{"" if counts[k] == 1 else "s"})'
+        for k in largest)
 
 
 def _name(signs: Floats) -> str:

@@ -1,0 +1,54 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib report``: the figures of a refinement, and the page that holds them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from . import options
+from .refine import add_inputs, refine_file
+from ..report import check_matplotlib, write_figures, write_page
+
+_SUMMARY = 'show what a calibration still lacks: figures, and one self-contained page'
+_EXAMPLE = 'accel-calib report poses.csv -o report.html --figures figures'
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    made = options.command(commands, 'report', _SUMMARY, _EXAMPLE)
+    made.add_argument('poses', type=Path, metavar='POSES',
+                      help='pose table (CSV), or a recording: bags, and tables of samples')
+    made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
+                      help='page to write (HTML)')
+    made.add_argument('--figures', type=Path, metavar='FOLDER',
+                      help='write each figure as SVG and PNG too')
+    add_inputs(made)
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Refine and draw."""
+    check_matplotlib()
+    result = refine_file(args, args.poses)
+    write_page(args.output, result, str(args.poses))
+    console = options.say(args)
+    console.print(f'{result.verdict}, stored in {args.output}', markup=False)
+    if args.figures is not None:
+        count = len(write_figures(args.figures, result))
+        console.print(f'{count} figures, stored in {args.figures}', markup=False)
+    return 0

@@ -1,0 +1,135 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Residuals against the variable of an effect: force by axis, temperature, time and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .style import ACCENT, new_figure, residual_label, styled
+from .words import WANDER
+from ..effects import AXES, EFFECTS
+from ..table import Floats, Poses
+from ..units import MG
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
+
+
+@dataclass(frozen=True)
+class Variable:
+    """
+    What residuals are drawn against.
+
+    Parameters
+    ----------
+    label : str
+        With its unit.
+    values : (n,) array
+        Of each pose.
+    unit_range : bool
+        Whether it goes from -1 to 1 by its nature.
+
+    """
+
+    label: str
+    values: Floats
+    unit_range: bool = False
+
+
+def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
+    """Give what an effect depends on: one variable, or three by axis."""
+    needs = ('time',) if effect == WANDER else EFFECTS[effect].needs
+    key = next((name for name in needs if name in poses_g), None)
+    if key == 'approach':
+        return [Variable(f'from the pose before, {axis}', poses_g[key][:, k], True)
+                for k, axis in enumerate(AXES)]
+    if key is None:
+        return [Variable(f'force along {axis} [g]', force[:, k], True)
+                for k, axis in enumerate(AXES)]
+    return [_variable(key, poses_g)]
+
+
+def recorded(poses_g: Poses) -> list[Variable]:
+    """Give all that was recorded beside the readings and changes."""
+    found = [_variable(key, poses_g) for key in _CONTEXT if key in poses_g]
+    return [variable for variable in found if np.ptp(variable.values) > 0.0]
+
+
+def _variable(key: str, poses_g: Poses) -> Variable:
+    values = poses_g[key]
+    if key == 'time':
+        return _time(values)
+    if key == 'std':
+        return Variable('standard deviation of the samples [mg]',
+                        np.sqrt(np.mean(values ** 2, axis=1)) * MG)
+    if key == 'rate':
+        return Variable('angular rate [rad/s]', np.linalg.norm(values, axis=1))
+    label, unit = {'temperature': ('temperature', '°C'), 'supply_voltage': ('supply', 'V')}[key]
+    return Variable(f'{label} [{unit}]', values)
+
+
+def _time(seconds: Floats) -> Variable:
+    since = seconds - np.min(seconds)
+    span = np.max(since)
+    for unit, size in (('h', 3600.0), ('min', 60.0)):
+        if span > 3.0 * size:
+            return Variable(f'time since the first pose [{unit}]', since / size)
+    return Variable('time since the first pose [s]', since)
+
+
+def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
+                 limit_mg: float, *, signed: bool, colour: str) -> Figure:
+    """
+    Draw residuals against variables, one panel each.
+
+    Parameters
+    ----------
+    title : str
+        What is drawn.
+    variables : sequence of Variable
+        One panel each.
+    residual_mg : (n,) array
+        What is left in each pose [mg].
+    limit_mg : float
+        End of the residual axis [mg].
+    signed : bool
+        Whether residuals have a sign.
+    colour : str
+        Of the poses.
+
+    """
+    with styled():
+        figure = new_figure(1.0 + 1.45 * len(variables) + (0.8 if len(variables) == 1 else 0.0))
+        panels = figure.subplots(len(variables), 1, sharey=True, squeeze=False)[:, 0]
+        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+        size = float(np.clip(5.5 - len(residual_mg) / 80.0, 2.5, 5.5))
+        for panel, variable in zip(panels, variables, strict=True):
+            panel.grid(visible=True)
+            panel.axhline(0.0, color=ACCENT, linewidth=1.0)
+            panel.plot(variable.values, residual_mg, 'o', color=colour, markersize=size,
+                       markeredgecolor='white', markeredgewidth=0.4)
+            panel.set_xlabel(variable.label)
+            if variable.unit_range:
+                panel.set(xlim=(-1.06, 1.06), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
+            panel.set_ylim(-limit_mg if signed else -0.04 * limit_mg, limit_mg)
+        figure.supylabel(residual_label(signed=signed), fontsize=10.0)
+    return figure

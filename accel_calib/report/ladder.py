@@ -1,0 +1,106 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The ladder of gaps: from the base down, step by step, to the noise floor."""
+
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from .style import ACCENT, AFTER, FAINT, new_figure, styled
+from .words import base_words, short
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..refine import Refinement
+
+_WIDTH_INCHES = 4.9
+_RUNG_INCHES = 0.52
+
+
+def draw_ladder(result: Refinement) -> Figure:
+    """Draw the gap of the base and after each step, over all poses and over those held out."""
+    rungs = _rungs(result)
+    with styled():
+        figure = new_figure(1.25 + _RUNG_INCHES * len(rungs), _WIDTH_INCHES)
+        axes = figure.subplots()
+        _draw_rungs(axes, rungs)
+        if result.noise_floor_mg:
+            axes.axvline(result.noise_floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),
+                         label=f'noise floor {short(result.noise_floor_mg)} mg', zorder=1)
+        _scale(axes, *_limits(result, rungs))
+        axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, handletextpad=0.2,
+                    columnspacing=0.9, handlelength=1.6, borderaxespad=0.0)
+    return figure
+
+
+def _scale(axes: Any, least: float, largest: float) -> None:
+    """Make the axis of gaps logarithmic, with marks that a person can read."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    few = largest / least > 300.0
+    axes.set_xscale('log')
+    axes.set_xlim(least, largest)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if few else (1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel('gap: RMS over the poses [mg], logarithmic')
+    axes.grid(visible=True, axis='x')
+
+
+def _rungs(result: Refinement) -> list[tuple[str, float, float | None]]:
+    """Give name, gap and gap of poses held out [mg] of the base and of each step."""
+    held_out = (result.steps[0].held_out_before_mg if result.steps
+                else result.calibration.quality.held_out_rms_mg)
+    rungs = [(base_words(result), result.gap_mg, held_out)]
+    rungs += [(f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg)
+              for step in result.steps]
+    return rungs
+
+
+def _draw_rungs(axes: Any, rungs: list[tuple[str, float, float | None]]) -> None:
+    height = np.arange(len(rungs))
+    gaps = np.array([gap for _, gap, _ in rungs])
+    axes.step(gaps, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
+    axes.plot(gaps, height, 'o', color=AFTER, markersize=9, label='all poses kept', zorder=3)
+    held_out = np.array([np.nan if gap is None else gap for _, _, gap in rungs])
+    if np.any(np.isfinite(held_out)):
+        axes.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
+                  markeredgewidth=1.6, label='each held out', zorder=3)
+    white = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1.0}
+    for at, gap, out in zip(height, gaps, held_out, strict=True):
+        words = short(gap) if np.isnan(out) else f'{short(gap)}, held out {short(out)}'
+        axes.annotate(words, (np.nanmax([gap, out]), at), (9, 0), va='center',
+                      textcoords='offset points', fontsize=9.0,
+                      bbox=white)
+    for at, (name, _, _) in zip(height, rungs, strict=True):
+        axes.text(0.005, at - 0.36, name, transform=axes.get_yaxis_transform(), va='center',
+                  fontweight='bold', fontsize=9.5, bbox=white)
+    axes.set_ylim(len(rungs) - 0.55, -0.65)
+    axes.yaxis.set_visible(False)
+    axes.spines['left'].set_visible(False)
+
+
+def _limits(result: Refinement, rungs: list[tuple[str, float, float | None]]
+            ) -> tuple[float, float]:
+    """Give ends of the axis that leave room for the numbers."""
+    values = [value for rung in rungs for value in rung[1:] if value]
+    values += [result.noise_floor_mg] if result.noise_floor_mg else []
+    least, largest = min(values, default=1.0), max(values, default=1.0)
+    room = max(float(np.log10(largest / least)), 0.5)
+    return least / 10.0 ** (0.08 * room), largest * 10.0 ** (0.5 * room)

@@ -1,0 +1,122 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How figures look, and how they become SVG and PNG.
+
+Figures are drawn at the width of half a page, so that a phone shows one and a desk two beside
+each other with the same text. Colours are from Okabe and Ito's palette and from RdBu, which
+people with colour blindness can tell apart. matplotlib is imported only where a figure is drawn.
+
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import io
+from pathlib import Path
+import re
+from typing import Any, TYPE_CHECKING
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BEFORE = '#8c8c8c'
+AFTER = '#0072b2'
+ACCENT = '#d55e00'
+INK = '#222222'
+FAINT = '#d9d9d9'
+DIVERGING = 'RdBu_r'
+SEQUENTIAL = 'Blues'
+WIDTH_INCHES = 4.8
+
+_PNG_DPI = 160
+_STYLE: Any = {
+    'font.family': ['sans-serif'], 'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Arial'],
+    'font.size': 10.0, 'axes.titlesize': 10.5, 'axes.labelsize': 10.0,
+    'axes.edgecolor': '#666666', 'axes.labelcolor': INK, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.axisbelow': True, 'text.color': INK, 'xtick.color': INK,
+    'ytick.color': INK, 'xtick.labelsize': 9.0, 'ytick.labelsize': 9.0, 'legend.frameon': False,
+    'legend.fontsize': 9.0, 'grid.color': '#e6e6e6', 'svg.fonttype': 'none',
+    'svg.hashsalt': 'accel_calib', 'axes.unicode_minus': True,
+}
+
+
+def check_matplotlib() -> None:
+    """
+    Make sure that figures can be drawn.
+
+    Raises
+    ------
+    InputError
+        If matplotlib is not there.
+
+    """
+    if find_spec('matplotlib') is None:
+        raise InputError('figures need matplotlib, which is not here',
+                         "pip install 'accel_calib[report]'")
+
+
+def styled() -> Any:
+    """Give the context in which figures are drawn and saved."""
+    from matplotlib import rc_context
+
+    return rc_context(_STYLE)
+
+
+def new_figure(height_inches: float, width_inches: float = WIDTH_INCHES) -> Figure:
+    """Make an empty figure."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_inches, height_inches), layout='constrained')
+
+
+def residual_label(*, signed: bool) -> str:
+    """Name the axis of residuals."""
+    return '|force| − 1 g [mg]' if signed else 'size of the error [mg]'
+
+
+def inline_svg(figure: Figure, prefix: str, title: str) -> str:
+    """
+    Give a figure as SVG to stand in a page among others.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    prefix : str
+        Put before its ids, which must differ between the figures of a page.
+    title : str
+        What it shows, for those who cannot see it; escaped already.
+
+    """
+    buffer = io.StringIO()
+    with styled():
+        figure.savefig(buffer, format='svg', transparent=True,
+                       metadata={'Date': None, 'Creator': None})
+    text = buffer.getvalue()
+    text = text[text.index('<svg'):]
+    text = re.sub(r'<metadata>.*?</metadata>', '', text, flags=re.S)
+    text = re.sub(r' (?:xmlns(?::\w+)?|width|height|version)="[^"]*"', '', text[:400]) + text[400:]
+    text = re.sub(r'\bid="', f'id="{prefix}-', text)
+    text = text.replace('url(#', f'url(#{prefix}-').replace('xlink:href="#', f'href="#{prefix}-')
+    return text.replace('<svg', f'<svg role="img" aria-label="{title}"', 1).strip()
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure to a file, of the kind that its name says."""
+    with styled():
+        figure.savefig(path, dpi=_PNG_DPI, facecolor='white')

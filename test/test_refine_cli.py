@@ -1,0 +1,196 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib refine`` and ``report``: the JSON, what is stored, and what is refused."""
+
+import json
+
+from accel_calib.cli import refine as refine_command
+from accel_calib.cli.main import main
+from accel_calib.files import read_calibration, read_poses, write_table
+from accel_calib.table import Poses
+import numpy as np
+import pytest
+
+SENSOR = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
+          '--effect', 'cross_axis=0.004,0.002,-0.003']
+HIDDEN = ['--effect', 'quadratic=0.006,-0.004,0.005']
+KEYS = {'file', 'verdict', 'noise_floor_mg', 'gap_mg', 'steps', 'remaining_gap_mg',
+        'disturbed_poses', 'not_testable', 'advice'}
+STEP_KEYS = {'effect', 'rivals', 'parameters', 'gap_before_mg', 'gap_after_mg',
+             'held_out_before_mg', 'held_out_after_mg', 'p_value', 'where'}
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def run_json(capsys, *arguments):
+    status = run(*arguments, '--json', '-')
+    return status, json.loads(capsys.readouterr().out)
+
+
+def simulated(path, *arguments):
+    assert run('simulate', '-o', path, *SENSOR, *arguments) == 0
+    return path
+
+
+@pytest.fixture
+def hidden(tmp_path, capsys):
+    path = simulated(tmp_path / 'hidden.csv', *HIDDEN, '--poses', 60)
+    capsys.readouterr()
+    return path
+
+
+def test_result_has_the_names_of_the_interface(hidden, capsys):
+    status, result = run_json(capsys, 'refine', hidden)
+    assert status == 0
+    assert set(result) >= KEYS
+    assert result['file'] == str(hidden)
+    assert result['verdict'] == 'explained'
+    step = result['steps'][0]
+    assert set(step) >= STEP_KEYS
+    assert 'quadratic' in {step['effect'], *step['rivals']}
+    assert step['gap_after_mg'] < 0.5 * step['gap_before_mg']
+    assert all(set(item) == {'effect', 'needs'} for item in result['not_testable'])
+    assert 'offset_temperature' in {item['effect'] for item in result['not_testable']}
+
+
+def test_terminal_tells_the_story(hidden, capsys):
+    assert run('refine', hidden) == 0
+    said = capsys.readouterr().out
+    for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'noise floor',
+                  'only noise is left', 'these data cannot show'):
+        assert words in said
+
+
+def test_refined_calibration_is_an_ordinary_one(hidden, tmp_path, capsys):
+    stored, other = tmp_path / 'refined.yaml', tmp_path / 'other.csv'
+    assert run('refine', hidden, '-o', stored, '--sensor', 'imu_link') == 0
+    calibration = read_calibration(stored)
+    assert calibration.sensor == 'imu_link'
+    assert len(calibration.model.effects) == 4
+    simulated(other, *HIDDEN, '--seed', 7, '--poses', 40)
+    capsys.readouterr()
+    _, result = run_json(capsys, 'verify', other, '-c', stored)
+    assert result['rms_after_mg'] < 1.5 * result['noise_floor_mg']
+
+
+def test_stored_calibration_is_the_base(hidden, tmp_path, capsys):
+    fitted, again = tmp_path / 'fitted.yaml', tmp_path / 'again.yaml'
+    assert run('fit', hidden, '-o', fitted, '--model', '10', '--sensor', 'a') == 0
+    assert run('refine', hidden, '-c', fitted, '-o', again) == 0
+    capsys.readouterr()
+    status, result = run_json(capsys, 'refine', hidden, '-c', again)
+    assert status == 0
+    assert (result['verdict'], result['steps']) == ('no_gap', [])
+    assert run('refine', hidden, '-c', fitted, '--sensor', 'b') == 2
+    assert "is of sensor 'a'" in capsys.readouterr().err
+
+
+def test_several_tables_give_a_list_in_their_order(hidden, tmp_path, capsys):
+    clean = simulated(tmp_path / 'clean.csv', '--poses', 30)
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('ax,ay\n1,2\n')
+    folder = tmp_path / 'out'
+    folder.mkdir()
+    capsys.readouterr()
+    status, results = run_json(capsys, 'refine', clean, bad, hidden, '--jobs', 2, '-o', folder)
+    assert status == 2
+    assert [result['file'] for result in results] == [str(clean), str(bad), str(hidden)]
+    assert [result.get('verdict') for result in results] == ['no_gap', None, 'explained']
+    assert set(results[1]) == {'file', 'error', 'advice'}
+    assert sorted(path.name for path in folder.iterdir()) == ['clean.yaml', 'hidden.yaml']
+
+
+def test_disturbed_row_is_named(hidden, capsys):
+    table = read_poses(hidden)
+    reading = table.reading.copy()
+    reading[6] *= 1.05
+    write_table(hidden, table.with_columns(reading=reading))
+    _, result = run_json(capsys, 'refine', hidden)
+    assert result['disturbed_poses'] == [7]
+
+
+def test_table_of_samples_is_captured_first(tmp_path, capsys):
+    path = simulated(tmp_path / 'r.csv', '--recording', '--poses', 24, '--dwell', 2)
+    capsys.readouterr()
+    status, result = run_json(capsys, 'refine', path, '--base', '10')
+    assert status == 0
+    assert result['poses_used'] + len(result['disturbed_poses']) == 24
+
+
+@pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [
+    (0.01, 20, False, True), (20.0, 60, False, False), (0.1, 60, True, False),
+    (10.0, 6000, False, True)])
+def test_samples_are_told_from_poses(step, rows, count, samples):
+    columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3))}
+    if count:
+        columns['count'] = np.ones(rows)
+    table = Poses(columns, np.arange(1, rows + 1))
+    assert refine_command._are_samples(table) == samples
+
+
+@pytest.mark.parametrize('arguments', [
+    ('refine', 'missing.csv'), ('refine', 'hidden.csv', '-c', 'missing.yaml'),
+    ('refine', 'hidden.csv', '-o', 'none/c.yaml'), ('refine', 'hidden.csv', '--rows', '1:3'),
+    ('refine', 'hidden.csv', '--report', 'none/r.html'), ('refine', 'hidden.csv', '--units', 'g'),
+    ('refine', 'hidden.csv', 'hidden.csv', '-o', 'c.yaml'), ('refine', 'missing.mcap'),
+    ('refine', 'hidden.csv', '--base', '12'), ('report', 'missing.csv', '-o', 'r.html'),
+    ('report', 'hidden.csv', '-o', 'none/r.html'),
+])
+def test_bad_input_is_one_line_and_status_2(arguments, hidden, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    there = sorted(tmp_path.iterdir())
+    assert run(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f'accel-calib {arguments[0]}: ')
+    assert printed.err.count('\n') == 1
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_refusal_is_in_the_json_too(hidden, capsys):
+    assert run('refine', hidden, '--rows', '1:3', '--json', '-') == 2
+    result = json.loads(capsys.readouterr().out)
+    assert {'error', 'advice'} <= set(result)
+
+
+def test_page_and_figures_are_written(hidden, tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    page, folder = tmp_path / 'r.html', tmp_path / 'figures'
+    assert run('report', hidden, '-o', page, '--figures', folder) == 0
+    assert page.read_text().startswith('<!DOCTYPE html>')
+    names = {path.name for path in folder.iterdir()}
+    assert {'ladder.svg', 'ladder.png', 'remaining_sphere.png'} <= names
+    again = tmp_path / 'again.html'
+    assert run('refine', hidden, '--report', again) == 0
+    assert again.exists()
+
+
+def test_without_matplotlib_one_line_says_what_to_install(hidden, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr('accel_calib.report.style.find_spec', lambda name: None)
+    page = tmp_path / 'r.html'
+    assert run('refine', hidden, '--report', page) == 2
+    printed = capsys.readouterr()
+    assert "pip install 'accel_calib[report]'" in printed.err
+    assert printed.err.count('\n') == 1
+    assert not page.exists()
+    assert run('refine', hidden) == 0
+
+
+def test_dwell_that_cannot_be_is_refused(tmp_path, capsys):
+    path = simulated(tmp_path / 'r.csv', '--recording', '--poses', 3)
+    capsys.readouterr()
+    assert run('refine', path, '--max-dwell', 0.1) == 2
+    assert 'change --max-dwell' in capsys.readouterr().err

@@ -1,0 +1,156 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The report: what the maps keep, what the page holds, and that it needs nothing else."""
+
+from html.parser import HTMLParser
+import re
+
+from accel_calib.refine import refine
+from accel_calib.report import all_drawings, page
+from accel_calib.report.against import recorded, variables_of
+from accel_calib.report.sphere_map import equal_area
+from accel_calib.report.words import chance, effect_words, values_of
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions
+from accel_calib.units import Units
+import numpy as np
+import pytest
+
+pytest.importorskip('matplotlib')
+
+VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
+
+
+def refined(base='10', poses=60, knocked=(), **hidden):
+    rng = np.random.default_rng(5)
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        'axis_gain': np.array([0.01, -0.02, 0.005]), **hidden})
+    time = np.arange(poses) * 20.0
+    context = {'time': time, 'temperature': 30.0 + 10.0 * np.sin(time / 190.0)}
+    table = simulate_poses(model, random_directions(poses, rng), rng, noise_g=0.002,
+                           context=context)
+    reading = table.reading.copy()
+    for row in knocked:
+        reading[row - 1] *= 1.05
+    return refine(table.with_columns(reading=reading), Units('g', 1.0), base=base)
+
+
+@pytest.fixture(scope='module')
+def warm():
+    return refined(knocked=(9,), offset_temperature=np.array([2e-4, -1e-4, 1.5e-4]))
+
+
+class Balance(HTMLParser):
+    """Follows tags that open and close."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.ids += [value for name, value in attrs if name == 'id']
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.ids += [value for name, value in attrs if name == 'id']
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_map_keeps_areas():
+    directions = random_directions(200_000, np.random.default_rng(0))
+    place = equal_area(directions)
+    radius = np.linalg.norm(place, axis=1)
+    assert np.max(radius) <= 1.0
+    # Evenly on the sphere is evenly on the disc: a share r² lies within radius r.
+    for r in (0.3, 0.6, 0.9):
+        assert np.mean(radius < r) == pytest.approx(r ** 2, abs=0.005)
+    np.testing.assert_allclose(equal_area(np.array([[0, 0, 1.0], [3.0, 0, 0]])), [[0, 0], [1, 0]])
+
+
+def test_page_is_whole_and_needs_nothing_from_outside(warm):
+    text = page(warm, 'poses.csv')
+    balance = Balance()
+    balance.feed(text)
+    assert not balance.open
+    assert len(balance.ids) == len(set(balance.ids))
+    referred = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    assert referred <= set(balance.ids)
+    assert not re.search(r'https?:|<script|<link|<img|@import|src=', text)
+    assert '<html lang="en">' in text
+    assert 'name="viewport"' in text
+
+
+def test_page_tells_each_step(warm):
+    text = page(warm, 'poses.csv')
+    assert [step.effect for step in warm.steps] == ['offset_temperature']
+    for words in ('offset_temperature', 'Offset that moves with temperature', 'mg/°C',
+                  'zero-g offset temperature coefficient TCO', 'rows 9', 'noise floor',
+                  'temperature [°C]', 'What these data cannot show', 'What remains'):
+        assert words in text
+
+
+def test_what_comes_from_outside_is_escaped(warm):
+    text = page(warm, '<b onload="x">&.csv')
+    assert '<b onload' not in text
+    assert '&lt;b onload=&quot;x&quot;&gt;&amp;.csv' in text
+
+
+def test_before_and_after_have_one_scale(warm):
+    figures = {drawing.name: drawing.figure for drawing in all_drawings(warm)}
+    before, after = (figures[f'step1_offset_temperature_variable_{when}'].axes[0]
+                     for when in ('before', 'after'))
+    assert before.get_ylim() == after.get_ylim()
+    assert before.get_ylim()[0] == -before.get_ylim()[1]
+    maps = [figures[f'step1_offset_temperature_sphere_{when}'].axes[0].collections[-1]
+            for when in ('before', 'after')]
+    assert maps[0].get_clim() == maps[1].get_clim()
+
+
+def test_no_gap_has_its_page_too():
+    clean = refined()
+    assert clean.verdict == 'no_gap'
+    assert [drawing.name for drawing in all_drawings(clean)] == [
+        'ladder', 'remaining_sphere', 'remaining_variables']
+    assert 'Nothing beyond the noise' in page(clean, 'poses.csv')
+
+
+def test_ladder_from_an_ideal_sensor_has_a_rung_a_step():
+    result = refined(base='ideal')
+    ladder = next(iter(all_drawings(result)))
+    said = {text.get_text() for text in ladder.figure.axes[0].texts}
+    assert {'ideal sensor', *(f'+ {step.effect}' for step in result.steps)} <= said
+
+
+def test_variables_are_those_of_the_effect(warm):
+    poses, force = warm.poses_g, warm.force
+    assert [v.label for v in variables_of('gain_temperature', poses, force)] == [
+        'temperature [°C]']
+    assert [v.label for v in variables_of('offset_wander', poses, force)] == [
+        'time since the first pose [min]']
+    assert len(variables_of('quadratic', poses, force)) == 3
+    assert len(variables_of('hysteresis', poses, force)) == 3
+    assert [v.label.split()[0] for v in recorded(poses)] == ['temperature', 'time']
+
+
+def test_numbers_are_short(warm):
+    assert chance(0.0) == 'p < 1e-16'
+    assert chance(3.21e-4) == 'p = 0.0003'
+    assert effect_words('offset_wander').startswith('offset that wanders')
+    values = dict(values_of(warm.steps[-1]))
+    assert set(values) == {'x', 'y', 'z'}
+    assert all(value.endswith(' mg/°C') for value in values.values())
