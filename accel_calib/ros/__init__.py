@@ -1,0 +1,37 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The nodes: convert, call, publish.
+
+====================  ============================================================
+`calibrator`          `main` of the calibrator, `calibrator_node` the node itself
+`simulator`           `main` of the simulator, `simulator_node` the node itself
+`demo`                both at work
+`run`                 init, spin, clean shutdown
+`settings`            parameters of both nodes, in one table each; `parameters`, `declare`
+`conversion`, `qos`   messages to plain numbers and back
+`watch`, `pose_book`  samples to rests to poses (no ROS)
+`applied`             the calibration in use, gravity held from the last rest (no ROS)
+`fitting`             poses to calibration, and words about it (no ROS)
+`storage`             where calibration and poses are kept (no ROS)
+`commands`            what services do; `answers` and `worker` how they answer
+`vitals`, `health`    what is counted, and how it is judged
+`markers`             poses on the unit sphere; `pose_view` when they change
+====================  ============================================================
+
+The calibrator's callbacks run in one thread, and only they change its state. What takes longer
+(fits, files) goes to `worker` and comes back as a callback.
+
+"""

@@ -1,0 +1,219 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The calibrator node: Imu in, corrected Imu out, poses on the way.
+
+The stream is here; what services do is in `commands`. Header stamps are the clock of all that is
+measured, so that a bag or a simulation may run at any speed; only the diagnostics go by a steady
+clock, and come without ``/clock`` too.
+
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TYPE_CHECKING
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import Bool
+from visualization_msgs.msg import MarkerArray
+
+from . import conversion, qos
+from .applied import Applied
+from .commands import Commands
+from .declare import declared, follow
+from .fitting import title
+from .health import status_of
+from .settings import CalibratorSettings, capture_settings
+from .storage import load, Loaded, Store, store_of
+from .vitals import Vitals
+from .watch import Change, Watch
+from .worker import Worker
+from ..errors import AccelCalibError
+from ..units import units_of
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from ..calibrate import Calibration
+
+_SAY_AGAIN = 10.0
+"""A line about the stream is logged at most once in this time [s]."""
+
+
+class CalibratorNode(Node):
+    """Calibrate an accelerometer in place and correct what it says."""
+
+    def __init__(self) -> None:
+        super().__init__('calibrator')
+        self.settings = declared(self, CalibratorSettings)
+        follow(self, lambda: self.settings, self._set_settings)
+        self.units = units_of(self.settings.units, self.settings.gravity)
+        self.watch = Watch(capture_settings(self.settings), self.units)
+        self.applied = Applied(self.settings.gravity)
+        self.worker = Worker(self)
+        self.store: Store | None = None
+        self.sensor = self.settings.sensor
+        self.frame_id = ''
+        self.problem = ''
+        self.message_context: dict[str, Any] = {}
+        self._sample_context: dict[str, float] = {}
+        self._known = False
+        self._still = False
+        self.vitals = Vitals(self.units.per_g if self.units.name != 'native' else math.nan)
+        self._publish_all()
+        self.commands = Commands(self)
+        if self.sensor or self.settings.calibration_file:
+            self.store = store_of(self.settings.calibration_file, self.sensor)
+            self._take_up(load(self.store, self.sensor, self.units.name))
+
+    def start(self) -> None:
+        """Begin, once there is an executor."""
+        self.commands.view.show(store=False)
+        self._subscribe_all()
+
+    def _publish_all(self) -> None:
+        self._calibrated = self.create_publisher(Imu, 'imu/data_calibrated', qos.STREAM)
+        self._motion = self.create_publisher(Vector3Stamped, '~/linear_acceleration', qos.STREAM)
+        self._still_state = self.create_publisher(Bool, '~/still', qos.LATCHED)
+        self.poses = self.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._still_state.publish(Bool(data=False))
+
+    def _subscribe_all(self) -> None:
+        self.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR)
+        self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
+        self.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _set_settings(self, settings: CalibratorSettings) -> None:
+        self.settings = settings
+
+    def adopt(self, calibration: Calibration | None) -> None:
+        """Correct with this calibration from now on."""
+        self.applied.adopt(calibration)
+        self.problem = ''
+        if calibration is not None:
+            self.get_logger().info(f'correcting with {title(calibration)}')
+
+    def _on_temperature(self, message: Temperature) -> None:
+        if math.isfinite(message.temperature):
+            self.vitals.temperature = message.temperature
+            self._sample_context = {'temperature': message.temperature}
+            self.message_context = {'temperature': np.array([message.temperature])}
+
+    def _on_imu(self, message: Imu) -> None:
+        reading = conversion.reading_of(message)
+        if not conversion.is_finite(reading):
+            self._drop(reading)
+            return
+        if not self._known:
+            self._identify(message.header.frame_id)
+        self._send(message)
+        stamp = conversion.seconds(message.header)
+        self.vitals.good(stamp, reading)
+        change = self.watch.push(stamp, reading, conversion.rate_of(message),
+                                 self._sample_context, self.settings.auto_capture)
+        if self.watch.detector.still is not self._still:
+            self._still = not self._still
+            self._still_state.publish(Bool(data=self._still))
+        if change is not None:
+            self._note(change)
+
+    def _drop(self, reading: conversion.Triple) -> None:
+        self.vitals.bad()
+        self.get_logger().warning(
+            f'an Imu has the linear_acceleration {reading}, expected three finite numbers; it is '
+            'dropped: look at the driver', throttle_duration_sec=_SAY_AGAIN)
+
+    def _send(self, message: Imu) -> None:
+        """Publish the corrected message, or the raw one where that is asked for."""
+        applied, settings = self.applied, self.settings
+        if not applied.enabled or (applied.calibration is None and settings.passthrough):
+            self._calibrated.publish(message)
+        elif applied.calibration is not None:
+            try:
+                corrected = conversion.corrected_message(
+                    message, applied.calibration, applied.scale, self.message_context,
+                    settings.output_frame_id)
+            except AccelCalibError as error:
+                self.get_logger().error(f'messages are not corrected: {error}',
+                                        throttle_duration_sec=_SAY_AGAIN)
+                return
+            self._calibrated.publish(corrected)
+            self._send_motion(corrected)
+
+    def _send_motion(self, corrected: Imu) -> None:
+        """Publish the acceleration without gravity, as the last rest had it."""
+        gravity = self.applied.gravity
+        if gravity is None or not self._motion.get_subscription_count():
+            return
+        force = np.array(conversion.reading_of(corrected))
+        self._motion.publish(Vector3Stamped(header=corrected.header,
+                                            vector=conversion.vector3(force - gravity)))
+
+    def _note(self, change: Change) -> None:
+        """Act on a rest and on poses."""
+        if change.rest is not None:
+            self.applied.rested(change.rest)
+        for dwell in change.ended:
+            self.applied.ended(dwell)
+        if change.taken_back:
+            self.get_logger().info(f'taken back {change.taken_back} of the poses: the sensor was '
+                                   'not still, as is known now')
+        if change.poses:
+            self.commands.poses_changed(ended=bool(change.ended))
+
+    def _identify(self, frame_id: str) -> None:
+        """Learn from the first message which sensor this is."""
+        self._known = True
+        self.frame_id = frame_id
+        self.sensor = self.settings.sensor or frame_id
+        sensor, units = self.sensor, self.units.name
+        store = self.store = self.store or store_of('', sensor)
+        if not (self.settings.sensor or self.settings.calibration_file):
+            self.worker.run(lambda: load(store, sensor, units), self._take_up_later)
+        else:
+            self.commands.check_sensor()
+
+    def _take_up_later(self, done: Future[Loaded]) -> None:
+        self._take_up(done.result())
+        self.commands.view.show(store=False)
+
+    def _take_up(self, loaded: Loaded) -> None:
+        """Go on with what was stored."""
+        if loaded.poses is not None:
+            self.watch.book.take_up(loaded.poses)
+            self.get_logger().info(f'{len(loaded.poses)} poses were stored before')
+        if loaded.calibration is not None:
+            self.adopt(loaded.calibration)
+        self.problem = loaded.problem
+        for line in filter(None, (loaded.problem, loaded.note)):
+            self.get_logger().error(line)
+
+    def _on_tick(self) -> None:
+        """Publish the diagnostics."""
+        self.vitals.tick()
+        array = DiagnosticArray(status=[status_of(self.vitals.health(self))])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def close(self) -> None:
+        """Finish what is being written."""
+        self.worker.close()

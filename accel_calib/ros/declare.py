@@ -1,0 +1,89 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters, declared in a node."""
+
+from __future__ import annotations
+
+from dataclasses import Field, fields
+from typing import Any, TYPE_CHECKING
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.parameter import Parameter
+
+from .parameters import changed, default_of, expected, Settings
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rclpy.node import Node
+
+
+def declared(node: Node, kind: type[Settings]) -> Settings:
+    """
+    Declare the parameters of these settings and give their values.
+
+    Raises
+    ------
+    InputError
+        If a value is not one that the parameter takes.
+
+    """
+    try:
+        values = {parameter.name: node.declare_parameter(
+            parameter.name, default_of(parameter), _descriptor(parameter)).value
+            for parameter in fields(kind)}
+    except InvalidParameterValueException as error:
+        raise InputError(str(error), 'give such a value') from error
+    return changed(kind(), values)
+
+
+def follow(node: Node, settings: Callable[[], Settings],
+           adopt: Callable[[Settings], None]) -> None:
+    """Have new settings adopted when parameters are set, and bad values refused."""
+    def on_set(parameters: list[Parameter]) -> SetParametersResult:
+        values = {parameter.name: parameter.value for parameter in parameters}
+        try:
+            adopt(changed(settings(), values))
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(on_set)
+
+
+def _descriptor(parameter: Field[Any]) -> ParameterDescriptor:
+    """Describe a parameter to `ros2 param describe` and to rqt."""
+    default, limits = default_of(parameter), parameter.metadata['limits']
+    descriptor = ParameterDescriptor(
+        name=parameter.name, description=parameter.metadata['words'],
+        type=Parameter.Type.from_parameter_value(default).value,
+        additional_constraints=expected(parameter), read_only=not parameter.metadata['live'],
+        dynamic_typing=True)
+    if limits is None:
+        return descriptor
+    if isinstance(default, float):
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=limits[0], to_value=limits[1])]
+    else:
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(limits[0]), to_value=int(limits[1]))]
+    return descriptor

@@ -1,0 +1,301 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The main job without hardware: simulator and calibrator in processes of their own, over DDS.
+
+This process is their user: it waits for the poses, calls ``~/fit`` and ``~/set_level``, and then
+compares raw and corrected messages with the simulator's truth while the sensor is turned again.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+from geometry_msgs.msg import Vector3Stamped
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from . import qos
+from ..errors import AccelCalibError
+from ..table import Floats
+from ..units import MG, STANDARD_GRAVITY
+
+POSES = 12
+_EFFECTS = ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
+            'cross_axis=0.006,-0.004,0.003']
+_MOUNTING = [8.0, -5.0, 0.0]
+_DWELL, _TURN = 1.5, 0.5
+_CHECKED, _LEAST_SAMPLES = 5, 100
+_PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
+
+
+_Spin = Callable[[Callable[[], bool], str], None]
+"""Spins until something is so; what is waited for is named in the error."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    Raw and corrected messages against the truth, over rests in several orientations.
+
+    Parameters
+    ----------
+    rests : int
+        Orientations compared.
+    rms_before_mg, rms_after_mg : float
+        RMS of |a| - 1 g [mg].
+    max_before_mg, max_after_mg : float
+        Largest of them [mg].
+    tilt_before_deg, tilt_after_deg : float
+        RMS angle between the measured and the true direction of up [°].
+    seconds : float
+        Of the whole demonstration.
+
+    """
+
+    rests: int
+    rms_before_mg: float
+    rms_after_mg: float
+    max_before_mg: float
+    max_after_mg: float
+    tilt_before_deg: float
+    tilt_after_deg: float
+    seconds: float
+
+
+class _User(Node):
+    """Listen to both nodes, and call the calibrator."""
+
+    def __init__(self) -> None:
+        super().__init__('demo')
+        self.poses = 0
+        self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
+            'raw': {}, 'corrected': {}, 'truth': {}}
+        self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, qos.LATCHED)
+        for name, topic, kind in (('raw', 'imu/data_raw', Imu),
+                                  ('corrected', 'imu/data_calibrated', Imu),
+                                  ('truth', 'simulator/truth', Vector3Stamped)):
+            self.create_subscription(kind, topic, self._keeper(name), qos.SENSOR)
+
+    def _on_poses(self, markers: MarkerArray) -> None:
+        self.poses = sum(marker.ns == 'poses' for marker in markers.markers)
+
+    def _keeper(self, name: str) -> Callable[[Any], None]:
+        kept = self.messages[name]
+
+        def keep(message: Any) -> None:
+            stamp = message.header.stamp
+            vector = message.vector if name == 'truth' else message.linear_acceleration
+            kept[stamp.sec * 10 ** 9 + stamp.nanosec] = vector.x, vector.y, vector.z
+
+        return keep
+
+    def is_flat(self) -> bool:
+        """Tell whether the robot lies flat at this moment."""
+        truth = self.messages['truth']
+        return bool(truth) and truth[max(truth)] == (0.0, 0.0, STANDARD_GRAVITY)
+
+
+def _has_passed(instant: float) -> bool:
+    return time.monotonic() > instant
+
+
+def _at_least(user: _User, count: int) -> bool:
+    return user.poses >= count
+
+
+class DemoError(AccelCalibError):
+    """The demonstration did not come to its end."""
+
+
+def demonstrate(tell: Callable[[str], None]) -> Outcome:
+    """
+    Run the whole demonstration.
+
+    Parameters
+    ----------
+    tell : callable
+        Is given a line for each step.
+
+    Returns
+    -------
+    Outcome
+        What came of it.
+
+    Raises
+    ------
+    DemoError
+        If a step does not happen in time.
+
+    """
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
+        _set_environment(Path(folder))
+        tell('starting a simulated Imu, turned by hand, and the calibrator node')
+        processes = [
+            stack.enter_context(_process('node', {'sensor': 'demo'})),
+            stack.enter_context(_process('simulator', {
+                'poses': POSES, 'dwell': _DWELL, 'turn': _TURN, 'mounting': _MOUNTING,
+                'effects': _EFFECTS, 'loop': True, 'wait': 10.0}))]
+        user, spin = stack.enter_context(_user(processes))
+        spin(lambda: user.poses > 0, 'the first pose')
+        for count in range(4, POSES + 1, 4):
+            spin(partial(_at_least, user, count), f'{count} poses')
+            tell(f'{count} still poses captured')
+        tell(f'~/fit: {_call(user, spin, "fit")}')
+        spin(user.is_flat, 'the flat pose')
+        tell(f'~/set_level: {_call_patiently(user, spin, "set_level")}')
+        for messages in user.messages.values():
+            messages.clear()
+        spin(lambda: len(_rests(user)) > _CHECKED, f'{_CHECKED} more rests')
+        return _outcome(_rests(user)[1:], time.monotonic() - began)
+
+
+def _set_environment(folder: Path) -> None:
+    """Keep this demonstration to itself: its own domain, this machine, its own files."""
+    os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
+                      ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
+                      ROS_LOG_DIR=str(folder / 'log'))
+
+
+@contextmanager
+def _process(command: str, parameters: dict[str, Any]
+             ) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a node as a user would, and end it."""
+    given = [part for name, value in parameters.items()
+             for part in ('-p', f'{name}:={_in_yaml(value)}')]
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'accel_calib.cli.main', command, '--ros-args',
+         '--log-level', 'error', *given])
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _in_yaml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@contextmanager
+def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User, _Spin]]:
+    """Give the user of the nodes, and a function that spins until something is so."""
+    rclpy.init(args=[])
+    user = _User()
+    executor = SingleThreadedExecutor()
+    executor.add_node(user)
+
+    def spin(until: Callable[[], bool], what: str) -> None:
+        ends = time.monotonic() + _PATIENCE
+        while not until():
+            if any(process.poll() is not None for process in processes):
+                raise DemoError('a node has ended', 'see what it said above')
+            if time.monotonic() > ends:
+                raise DemoError(f'{what} did not come within {_PATIENCE:.0f} s, '
+                                f'{user.poses} poses so far',
+                                'see whether a firewall stops DDS on this machine')
+            look_again = time.monotonic() + _LOOK_EVERY
+            while time.monotonic() < look_again:
+                executor.spin_once(timeout_sec=_LOOK_EVERY)
+
+    try:
+        yield user, spin
+    finally:
+        executor.shutdown()
+        user.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _request(user: _User, spin: _Spin, name: str) -> Trigger.Response:
+    client = user.create_client(Trigger, f'calibrator/{name}')
+    spin(client.service_is_ready, f'the service {name}')
+    future = client.call_async(Trigger.Request())
+    spin(future.done, f'the answer of {name}')
+    user.destroy_client(client)
+    return future.result()
+
+
+def _call(user: _User, spin: _Spin, name: str) -> str:
+    """Call a service of the calibrator that must succeed."""
+    answer = _request(user, spin, name)
+    if not answer.success:
+        raise DemoError(f'~/{name} answered: {answer.message}', 'run the demonstration again')
+    return str(answer.message)
+
+
+def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
+    """Call a service again until the sensor has been still for long enough."""
+    while user.is_flat():
+        answer = _request(user, spin, name)
+        if answer.success:
+            return str(answer.message)
+        spin(partial(_has_passed, time.monotonic() + _AGAIN), 'a moment')
+    return _call(user, spin, name)
+
+
+def _rests(user: _User) -> list[dict[str, Floats]]:
+    """Give the mean of raw, corrected and true acceleration over each whole rest, in g."""
+    common = sorted(set.intersection(*(set(kept) for kept in user.messages.values())))
+    if len(common) < 2:
+        return []
+    arrays = {name: np.array([kept[stamp] for stamp in common]) / STANDARD_GRAVITY
+              for name, kept in user.messages.items()}
+    moving = np.any(np.diff(arrays['truth'], axis=0) != 0.0, axis=1)
+    ends = np.flatnonzero(np.concatenate([[True], moving, [True]]))
+    return [{name: values[a:b].mean(axis=0) for name, values in arrays.items()}
+            for a, b in pairwise(ends) if b - a > _LEAST_SAMPLES]
+
+
+def _outcome(rests: list[dict[str, Floats]], seconds: float) -> Outcome:
+    errors, tilts = {}, {}
+    truth = np.array([rest['truth'] for rest in rests])
+    for name in ('raw', 'corrected'):
+        values = np.array([rest[name] for rest in rests])
+        sizes = np.linalg.norm(values, axis=1)
+        errors[name] = (sizes - 1.0) * MG
+        cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
+        tilts[name] = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return Outcome(len(rests), _rms(errors['raw']), _rms(errors['corrected']),
+                   float(np.max(np.abs(errors['raw']))),
+                   float(np.max(np.abs(errors['corrected']))), _rms(tilts['raw']),
+                   _rms(tilts['corrected']), seconds)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))

@@ -1,0 +1,199 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the calibrator says of itself: one record, judged in one place.
+
+`Health` is shown on ``/diagnostics`` and answers ``~/self_test``. Drift is the RMS of
+|a| - 1 g over the rests since the calibration was made or loaded, which took no part in the fit.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import TYPE_CHECKING
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from ..units import MG
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+_BAD_SHOWN_FOR = 60.0
+"""How long a reading that was not finite is warned of [s]."""
+
+_LIKELY_G = (0.2, 5.0)
+"""A |a| outside tells that the unit is wrong [g]."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """
+    The state of the calibrator.
+
+    Parameters
+    ----------
+    sensor, state, problem : str
+        Name; what it does now; what stands in the way, or empty.
+    calibration : str
+        Model and date, or empty.
+    file : str
+        Where the calibration is stored.
+    writable : bool
+        Whether it can be.
+    messages, bad : int
+        Imu messages so far; of these not finite.
+    bad_ago : float
+        Since the last that was not finite [s]; infinite: there was none.
+    rate : float
+        Messages a second, lately.
+    length : float
+        |a| of the last message [g]; NaN: not known, or native units.
+    temperature : float
+        Last one [°C]; NaN: none.
+    rest_ago : float
+        Since the last rest, by the header stamps [s]; NaN: there was none.
+    residual, drift, drift_warn : float
+        |a| - 1 g at the last rest; see the module; its limit [g]; NaN: not known.
+    poses : int
+        Poses captured.
+    interruptions : int
+        Gaps and jumps of the header stamps.
+    last_interruption : str
+        What the last of them was, or empty.
+    threshold : float
+        Largest standard deviation of a still axis [m/s², or native].
+
+    """
+
+    sensor: str
+    state: str
+    problem: str
+    calibration: str
+    file: str
+    writable: bool
+    messages: int
+    bad: int
+    bad_ago: float
+    rate: float
+    length: float
+    temperature: float
+    rest_ago: float
+    residual: float
+    drift: float
+    drift_warn: float
+    poses: int
+    interruptions: int
+    last_interruption: str
+    threshold: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    name: str
+    level: bytes
+    words: str
+
+
+def findings(health: Health) -> list[Finding]:
+    """Judge the state: one finding for each thing looked at."""
+    return [_messages(health), _values(health), _calibration(health), _drift(health),
+            _storage(health)]
+
+
+def _messages(health: Health) -> Finding:
+    if health.rate > 0.0:
+        return Finding('messages', _OK, f'{health.rate:.1f} Hz')
+    return Finding('messages', _WARN, 'no Imu messages on imu/data_raw: start the driver, or '
+                                      'remap the topic')
+
+
+def _values(health: Health) -> Finding:
+    if health.bad_ago < _BAD_SHOWN_FOR:
+        return Finding('values', _WARN, f'{health.bad} readings were NaN or infinite and were '
+                                        'dropped: look at the driver')
+    if health.length < _LIKELY_G[0] or health.length > _LIKELY_G[1]:
+        return Finding('values', _WARN, f'readings are {health.length:.3g} g long, expected '
+                                        'about 1 at rest: set the parameter units')
+    return Finding('values', _OK, 'finite, and about 1 g')
+
+
+def _calibration(health: Health) -> Finding:
+    if health.problem:
+        return Finding('calibration', _ERROR, health.problem)
+    if not health.calibration:
+        return Finding('calibration', _WARN, f'no calibration yet, {health.poses} poses captured: '
+                                             'turn the sensor, then call ~/fit')
+    return Finding('calibration', _OK, health.calibration)
+
+
+def _drift(health: Health) -> Finding:
+    if math.isnan(health.drift):
+        return Finding('drift', _OK, 'no rest since the calibration yet')
+    words = f'{health.drift * MG:.2f} mg off 1 g at rest since the calibration'
+    if health.drift > health.drift_warn:
+        return Finding('drift', _WARN, words + ': calibrate again')
+    return Finding('drift', _OK, words)
+
+
+def _storage(health: Health) -> Finding:
+    if health.writable:
+        return Finding('storage', _OK, health.file)
+    return Finding('storage', _ERROR, f'{health.file} cannot be written: mend the permissions, '
+                                      'or set calibration_file')
+
+
+def status_of(health: Health) -> DiagnosticStatus:
+    """Give the diagnostics: the worst finding speaks, figures follow."""
+    worst = max(findings(health), key=lambda finding: finding.level)
+    message = health.state if worst.level == _OK else worst.words
+    values = [KeyValue(key=key, value=value) for key, value in _figures(health)]
+    return DiagnosticStatus(level=worst.level, name='accel_calib: calibrator', message=message,
+                            hardware_id=health.sensor, values=values)
+
+
+def _figures(health: Health) -> Iterable[tuple[str, str]]:
+    yield 'state', health.state
+    yield 'sensor', health.sensor
+    yield 'calibration', health.calibration or 'none'
+    yield 'calibration file', health.file
+    yield 'rate [Hz]', f'{health.rate:.1f}'
+    yield 'messages', str(health.messages)
+    yield 'readings not finite', str(health.bad)
+    yield 'residual |a| - 1 g at last rest [mg]', _number(health.residual * MG)
+    yield 'drift since calibration [mg]', _number(health.drift * MG)
+    yield 'since last rest [s]', _number(health.rest_ago)
+    yield 'poses captured', str(health.poses)
+    yield 'interruptions of the clock', str(health.interruptions)
+    yield 'last interruption', health.last_interruption or 'none'
+    yield 'temperature [°C]', _number(health.temperature)
+    yield 'still below [m/s² or native]', f'{health.threshold:.4g}'
+
+
+def _number(value: float) -> str:
+    return f'{value:.3f}' if math.isfinite(value) else 'not known'
+
+
+def self_test_of(health: Health) -> list[DiagnosticStatus]:
+    """Give one status for each finding; all must be OK to pass."""
+    return [DiagnosticStatus(level=finding.level, name=f'accel_calib: {finding.name}',
+                             message=finding.words, hardware_id=health.sensor)
+            for finding in findings(health)]

@@ -1,0 +1,97 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses on the unit sphere, for rviz: those captured, and the next one asked for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from geometry_msgs.msg import Point
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from .conversion import vector3
+
+if TYPE_CHECKING:
+    from ..calibrate import NextPose
+    from ..table import Floats
+
+_CAPTURED = (0.2, 0.7, 0.3, 1.0)
+_ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
+_WORDS = (1.0, 1.0, 1.0, 1.0)
+_SPHERE = (0.6, 0.6, 0.7, 0.15)
+_NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
+
+
+def pose_markers(directions: Floats, asked: NextPose | None, frame_id: str) -> MarkerArray:
+    """
+    Draw poses.
+
+    Parameters
+    ----------
+    directions : (n, 3) array
+        Unit vectors that point up, in the axes of the sensor.
+    asked : NextPose or None
+        The next pose to turn to.
+    frame_id : str
+        Frame of the sensor.
+
+    Returns
+    -------
+    MarkerArray
+        Replaces all drawn before: namespaces ``sphere``, ``poses``, ``numbers``, ``next``.
+
+    """
+    markers = [Marker(action=Marker.DELETEALL),
+               _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
+    for k, direction in enumerate(directions):
+        markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
+        markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
+    if asked is not None:
+        arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
+        arrow.points = [Point(), _point(asked.direction)]
+        markers += [arrow, _text('next', 1, asked.words, asked.direction * _WORDS_AT)]
+    for marker in markers:
+        marker.header.frame_id = frame_id
+    return MarkerArray(markers=markers)
+
+
+def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...],
+            size: float) -> Marker:
+    red, green, blue, alpha = color
+    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
+                    color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
+    marker.scale.x = marker.scale.y = marker.scale.z = size
+    if kind == Marker.ARROW:
+        marker.scale.y = marker.scale.z = 2.0 * size
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _text(namespace: str, number: int, text: str, at: Floats) -> Marker:
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER)
+    marker.text = text
+    return _at(marker, at)
+
+
+def _at(marker: Marker, position: Floats) -> Marker:
+    marker.pose.position = _point(position)
+    return marker
+
+
+def _point(position: Floats) -> Point:
+    vector = vector3(position)
+    return Point(x=vector.x, y=vector.y, z=vector.z)

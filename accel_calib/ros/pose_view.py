@@ -1,0 +1,70 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses, stored and drawn as they come."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .fitting import asked_for, poses_up, warm_up
+from .markers import pose_markers
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from .calibrator_node import CalibratorNode
+    from ..calibrate import NextPose
+    from ..table import Poses
+
+
+class PoseView:
+    """
+    The poses of a calibrator node, as others see them.
+
+    Parameters
+    ----------
+    node : CalibratorNode
+        Whose poses these are.
+
+    """
+
+    def __init__(self, node: CalibratorNode) -> None:
+        self._node = node
+
+    def show(self, *, store: bool) -> None:
+        """Draw the poses and the next one asked for, and store them where that is asked."""
+        node = self._node
+        poses, units, model = node.watch.book.poses(), node.units, node.settings.model
+        where = node.store if store else None
+
+        def job() -> NextPose:
+            if where is not None:
+                where.save_poses(poses)
+            if len(poses):
+                warm_up()
+            return asked_for(poses, units, model)
+
+        node.worker.run(job, lambda done: self._draw(done, poses))
+
+    def _draw(self, done: Future[NextPose], poses: Poses) -> None:
+        """Draw the poses; say so where they could not be stored."""
+        node = self._node
+        asked = None
+        try:
+            asked = done.result()
+        except OSError as error:
+            node.get_logger().error(f'the poses cannot be stored: {error}; mend the permissions, '
+                                    'or set calibration_file', throttle_duration_sec=10.0)
+        node.poses.publish(pose_markers(poses_up(poses, node.units), asked, node.frame_id))

@@ -1,0 +1,105 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Start, spin and end a node; every way a user can end it is a clean one."""
+
+from __future__ import annotations
+
+from importlib import import_module
+import signal
+import sys
+from typing import TYPE_CHECKING
+
+from ..errors import AccelCalibError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_OK, _BAD_INPUT = 0, 2
+
+
+def run(node: str, args: Sequence[str] | None = None) -> int:
+    """
+    Run a node until it is told to end.
+
+    Parameters
+    ----------
+    node : str
+        ``module:class`` of the node, in this package.
+    args : sequence of str, optional
+        Command line with the program's name first; default: that of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0, or 2 where the input or ROS itself is missing or wrong.
+
+    """
+    try:
+        return _run(node, args)
+    except KeyboardInterrupt:
+        return _OK
+
+
+def _run(node: str, args: Sequence[str] | None) -> int:
+    """Start ROS, run the node, end ROS."""
+    try:
+        import rclpy
+    except ImportError as error:
+        return _refuse(f'ROS 2 is not here ({error}), expected rclpy of ROS 2 Jazzy; source '
+                       "/opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'")
+    from rclpy.executors import ExternalShutdownException
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:
+        return _refuse(f'ROS 2 does not start: {str(error).splitlines()[0]}; look at the '
+                       'parameters and arguments given')
+    try:
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except AccelCalibError as error:
+        return _refuse(str(error))
+    finally:
+        # Under launch a Ctrl-C comes twice, and the second would cut the shutdown short.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        rclpy.try_shutdown()
+    return _OK
+
+
+def _spin(node: str) -> None:
+    """Make the node and spin it."""
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    module, name = node.split(':')
+    instance = getattr(import_module(module, __package__), name)()
+    executor = SingleThreadedExecutor()
+    executor.add_node(instance)
+    try:
+        instance.start()
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except RuntimeError:
+        if instance.context.ok():
+            raise  # otherwise a callback was publishing while a signal came
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        instance.close()
+        executor.shutdown()
+        instance.destroy_node()
+
+
+def _refuse(line: str) -> int:
+    print(f'accel-calib: {line}', file=sys.stderr)
+    return _BAD_INPUT

@@ -1,0 +1,270 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Fixtures for the tests of the nodes.
+
+`bench` gives each test a DDS domain of its own and runs nodes as processes. Header stamps are the
+clock of the calibrator, so that a test may feed a minute of readings in a second. Waits are
+bounded, and wait for a condition.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+import itertools
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+_DOMAINS = itertools.cycle(range(1, 102))
+for _ in range(os.getpid() % 101):
+    next(_DOMAINS)  # two runs on one machine shall not meet
+
+GRAVITY = 9.80665
+RATE = 50.0
+_BATCH = 20
+
+
+class Bench:
+    """A node that drives and watches the nodes under test."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.home = folder / 'home'
+        self._domain = domain
+        self._environment = {**os.environ, 'ROS_HOME': str(self.home),
+                             'ROS_DOMAIN_ID': str(domain)}
+        self._processes: list[subprocess.Popen[str]] = []
+        self.stamp = 1000.0
+        self._join()
+
+    def _join(self) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, domain_id=self._domain)
+        self.node = Node('bench', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
+        self._imu: Any = None
+
+    def _leave(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def join_anew(self) -> None:
+        """Leave DDS and join it again: it takes killed processes for alive for 20 s."""
+        self._leave()
+        self._join()
+
+    def start(self, name: str, **parameters: Any) -> subprocess.Popen[str]:
+        """Start a node of the package as a process."""
+        given = [part for key, value in parameters.items()
+                 for part in ('-p', f'{key}:={_yaml(value)}')]
+        process = subprocess.Popen(
+            [sys.executable, '-m', f'accel_calib.ros.{name}', '--ros-args', *given], cwd=ROOT,
+            env=self._environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self._processes.append(process)
+        return process
+
+    def calibrator(self, **parameters: Any) -> subprocess.Popen[str]:
+        """Start a calibrator and wait until it listens."""
+        from sensor_msgs.msg import Imu
+        process = self.start('calibrator', **parameters)
+        if self._imu is None:
+            self._imu = self.node.create_publisher(Imu, 'imu/data_raw', 100)
+            self._came_out = self.listen(Imu, 'imu/data_calibrated')
+        self.spin(lambda: self._imu.get_subscription_count() > 0)
+        self.client('self_test')
+        return process
+
+    def end(self, process: subprocess.Popen[str], number: int) -> tuple[int, str]:
+        """Send a signal; give the exit status and all that was printed."""
+        process.send_signal(number)
+        printed = process.communicate(timeout=10)[0]
+        return process.returncode, printed
+
+    def spin(self, until: Callable[[], Any], seconds: float = 15.0) -> None:
+        """Spin until something is so."""
+        ends = time.monotonic() + seconds
+        while not until():
+            late = time.monotonic() > ends
+            assert not late, f'not so within {seconds} s'
+            # Looking takes time too: on a busy machine messages would pile up between looks.
+            look_again = time.monotonic() + 0.02
+            while time.monotonic() < look_again:
+                self._executor.spin_once(timeout_sec=0.02)
+
+    def listen(self, kind: Any, topic: str, *, latched: bool = False) -> list[Any]:
+        """Give a list to which the messages of a topic are added."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        qos = QoSProfile(depth=100)
+        if latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def client(self, name: str) -> Any:
+        """Give a client of a service of the calibrator that is there."""
+        from diagnostic_msgs.srv import SelfTest
+        from std_srvs.srv import SetBool, Trigger
+        kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f'calibrator/{name}')
+        self.spin(self._clients[name].service_is_ready)
+        return self._clients[name]
+
+    def call(self, name: str, **fields: Any) -> Any:
+        """Call a service of the calibrator and give its answer."""
+        client = self.client(name)
+        future = client.call_async(client.srv_type.Request(**fields))
+        self.spin(future.done)
+        return future.result()
+
+    def imu(self, reading: Any, **fields: Any) -> Any:
+        """Make an Imu message with the next stamp."""
+        from geometry_msgs.msg import Vector3
+        from rclpy.time import Time
+        from sensor_msgs.msg import Imu
+        self.stamp += 1.0 / RATE
+        message = Imu(**fields)
+        message.header.stamp = Time(nanoseconds=round(self.stamp * 1e9)).to_msg()
+        message.header.frame_id = message.header.frame_id or 'imu_link'
+        x, y, z = (float(part) for part in reading)
+        message.linear_acceleration = Vector3(x=x, y=y, z=z)
+        return message
+
+    def send(self, message: Any) -> None:
+        """Publish an Imu."""
+        self._imu.publish(message)
+
+    def feed(self, readings: Any) -> None:
+        """
+        Publish readings in m/s², `RATE` a second by their stamps, and faster by the clock.
+
+        What comes out of the calibrator sets the pace, for sensor data are dropped where it is
+        busy: without a calibration it needs `passthrough`.
+
+        """
+        if not self._came_out:
+            rng = np.random.default_rng(1)  # moving, until both sides have found each other
+            self.exchange(self._came_out, lambda: self.imu(readings[0] + 3.0 * rng.normal(size=3)))
+            self.spin(lambda ends=time.monotonic() + 0.2: time.monotonic() > ends)
+        for start in range(0, len(readings), _BATCH):
+            batch = [self.imu(reading) for reading in readings[start:start + _BATCH]]
+            self._came_out.clear()
+            for message in batch:
+                self.send(message)
+            self.spin(lambda batch=batch: len(self._came_out) >= len(batch), 5.0)
+
+    def echo(self, messages: Iterable[Any], heard: list[Any]) -> list[Any]:
+        """Publish messages, each when the one before was heard again; give what was heard."""
+        heard.clear()
+        for k, message in enumerate(messages):
+            self.send(message)
+            self.spin(lambda count=k: len(heard) > count, 2.0)
+        return heard
+
+    def exchange(self, heard: list[Any], make: Callable[[], Any]) -> Any:
+        """Publish what `make` gives, again and again, until something is heard; give that."""
+        heard.clear()
+
+        def sent() -> bool:
+            self.send(make())
+            return bool(heard)
+
+        self.spin(sent)
+        return heard[0]
+
+    def close(self) -> None:
+        """End all that was started."""
+        for process in self._processes:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+        self._leave()
+
+
+def _yaml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """Give a bench in a DDS domain of its own."""
+    pytest.importorskip('rclpy', exc_type=ImportError)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    made = Bench(tmp_path, next(_DOMAINS))
+    yield made
+    made.close()
+
+
+EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),
+                              'axis_gain': np.array([0.012, -0.015, 0.008]),
+                              'cross_axis': np.array([0.006, -0.004, 0.003])}
+
+
+@pytest.fixture
+def readings() -> Callable[..., Any]:
+    """Give a function that makes readings of a sensor that is turned through directions."""
+    from accel_calib.simulate import model_with, simulate_recording
+
+    def make(directions: Any, *, dwell: float = 1.8, rotation: Any = None,
+             effects: Mapping[str, Any] = EFFECTS) -> Any:
+        recording = simulate_recording(
+            model_with(effects, rotation), np.array(directions, float), np.random.default_rng(7),
+            noise_g=0.0005, rate_hz=RATE, dwell=dwell, turn=0.4)
+        return recording.reading * GRAVITY
+
+    return make
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Callable[..., Path]:
+    """Give a function that stores a calibration of known parameters."""
+    from accel_calib.calibrate import fit_poses, level
+    from accel_calib.files import write_calibration
+    from accel_calib.simulate import model_with, simulate_poses
+    from accel_calib.sphere import spread_directions
+    from accel_calib.units import units_of
+
+    def make(name: str = 'known.yaml', *, sensor: str = '', unit: Any = 'm/s2',
+             flat: Any = None) -> Path:
+        units = units_of(unit)
+        poses = simulate_poses(model_with(EFFECTS), spread_directions(20),
+                               np.random.default_rng(3), noise_g=0.0005)
+        poses = poses.with_columns(reading=units.from_g(poses.reading),
+                                   std=units.from_g(poses['std']))
+        calibration = fit_poses(poses, units, model='10', sensor=sensor,
+                                date='2026-01-01T00:00:00+00:00')
+        if flat is not None:
+            reading = calibration.predict(np.array([flat], float) * calibration.force_per_g)[0]
+            calibration = level(calibration, reading, 'ros')
+        write_calibration(tmp_path / name, calibration)
+        return tmp_path / name
+
+    return make

@@ -1,0 +1,111 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The main job over DDS: simulator, calibrator and user in processes of their own."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import Vector3Stamped  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+GRAVITY = 9.80665
+POSES = 12
+SIMULATED = {
+    'effects': ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
+                'cross_axis=0.006,-0.004,0.003'],
+    'mounting': [8.0, -5.0, 30.0], 'poses': POSES, 'rate': 200.0, 'dwell': 1.2, 'turn': 0.4,
+    'noise': 0.005, 'wait': 10.0, 'listeners': 2, 'flat_first': True}
+FLAT_FOR = 220
+CAPTURE = {'still_window': 0.25, 'min_dwell': 0.6}
+
+
+def vectors(messages: list[Any]) -> Any:
+    """Give the accelerations as an (n, 3) array, in g."""
+    return np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
+                     for m in messages]) / GRAVITY
+
+
+def count(markers: list[Any]) -> int:
+    """Give the number of poses drawn last."""
+    return sum(m.ns == 'poses' for m in markers[-1].markers) if markers else 0
+
+
+def is_level(truth: list[Any]) -> bool:
+    return all(message.vector.x == 0.0 and message.vector.z > 0.0 for message in truth)
+
+
+def rms_mg(forces: Any) -> float:
+    return float(np.sqrt(np.mean((np.linalg.norm(forces, axis=1) - 1.0) ** 2))) * 1e3
+
+
+def test_turned_sensor_is_calibrated_levelled_and_still_so_after_being_killed(bench: Any) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    raw = bench.listen(Imu, 'imu/data_raw')
+    truth = bench.listen(Vector3Stamped, 'simulator/truth')
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    node = bench.calibrator(**CAPTURE)
+    simulator = bench.start('simulator', **SIMULATED)
+    # Flat at first, 12 poses, flat again and held.
+    bench.spin(lambda: count(markers) == POSES + 1 and is_level(truth[-FLAT_FOR:]), 60.0)
+
+    assert not corrected
+    answer = bench.call('fit')
+    assert answer.success, answer.message
+    answer = bench.call('set_level')
+    assert answer.success, answer.message
+
+    corrected.clear()
+    bench.spin(lambda: len(corrected) > 300)
+    flat = vectors(corrected[100:])
+    up = flat.mean(axis=0)
+    assert rms_mg(flat) < 1.0
+    assert np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 0.2
+
+    assert bench.end(simulator, signal.SIGTERM)[0] == 0
+    still = [message for message in raw
+             if abs(message.angular_velocity.x) + abs(message.angular_velocity.y) < 0.02]
+    assert rms_mg(vectors(still)) > 10.0
+    assert rms_mg(vectors(bench.echo(still[::5], corrected))) < 1.0
+    bench.end(node, signal.SIGKILL)
+    check_restarted(bench, still[-100:], count(markers))
+
+
+def check_restarted(bench: Any, messages: list[Any], poses: int) -> None:
+    """See that a new process has the calibration and the poses of the one that was killed."""
+    bench.join_anew()
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.calibrator(**CAPTURE)
+    bench.exchange(corrected, lambda: messages[0])
+    bench.spin(lambda: count(markers) == poses)
+    bench.echo(messages, corrected)
+    up = vectors(corrected).mean(axis=0)
+    assert np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 0.2
+    bench.spin(lambda: diagnostics and 'model 10' in str(diagnostics[-1].status))
+    answer = bench.call('fit')
+    assert answer.success, answer.message
+    status, printed = bench.end(node, signal.SIGINT)
+    assert status == 0
+    assert 'Traceback' not in printed

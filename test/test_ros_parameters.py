@@ -1,0 +1,111 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One table of parameters: in the code, in the node and in config/calibrator.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from accel_calib.capture import CaptureSettings
+from accel_calib.errors import InputError
+from accel_calib.ros.parameters import changed, default_of, yaml_lines
+from accel_calib.ros.settings import CalibratorSettings, capture_settings, SimulatorSettings
+import pytest
+import yaml
+
+CONFIG = Path(__file__).parent.parent / 'config' / 'calibrator.yaml'
+SETTINGS = [CalibratorSettings, SimulatorSettings]
+
+
+def test_parameter_file_is_the_table() -> None:
+    """Write it again with: python test/test_ros_parameters.py."""
+    assert CONFIG.read_text(encoding='utf-8').splitlines() == list(yaml_lines(CalibratorSettings))
+
+
+def test_parameter_file_holds_the_defaults() -> None:
+    given = yaml.safe_load(CONFIG.read_text(encoding='utf-8'))['/**']['ros__parameters']
+    assert CalibratorSettings(**given) == CalibratorSettings()
+    assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
+
+
+@pytest.mark.parametrize('settings', SETTINGS)
+def test_defaults_are_values_that_parameters_take(settings: Any) -> None:
+    values = {parameter.name: default_of(parameter) for parameter in fields(settings)}
+    assert changed(settings(), values) == settings()
+
+
+def test_numbers_may_be_written_as_they_come() -> None:
+    settings = changed(CalibratorSettings(), {'model': 10, 'min_dwell': 2, 'sensor': 7,
+                                              'use_sim_time': True})
+    assert (settings.model, settings.min_dwell, settings.sensor) == ('10', 2.0, '7')
+    assert isinstance(settings.min_dwell, float)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('model', '12'), ('model', True), ('gravity', 0.5), ('gravity', float('nan')),
+    ('gravity', '9.8'), ('auto_capture', 1), ('auto_fit_poses', 12.5), ('auto_fit_poses', True),
+    ('units', 'counts'), ('sensor', ['a'])])
+def test_values_that_parameters_do_not_take_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
+        changed(CalibratorSettings(), {name: value})
+
+
+def test_lists_are_checked() -> None:
+    settings = changed(SimulatorSettings(), {'mounting': [1, 2.5, 3], 'effects': []})
+    assert settings.mounting == [1.0, 2.5, 3.0]
+    assert settings.effects == []
+    with pytest.raises(InputError, match='a list of 3 numbers'):
+        changed(SimulatorSettings(), {'mounting': [1.0]})
+
+
+def test_capture_has_the_defaults_of_the_library_but_for_parked_robots() -> None:
+    assert capture_settings(CalibratorSettings()) == CaptureSettings(repeated='merge')
+
+
+def test_settings_that_do_not_go_together_are_refused() -> None:
+    with pytest.raises(InputError, match='max_dwell'):
+        capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
+
+
+def test_node_declares_them_all_and_refuses_bad_values_while_it_runs(bench: Any) -> None:
+    from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+    from rclpy.parameter import Parameter
+    bench.calibrator()
+
+    def ask(kind: Any, name: str, **request: Any) -> Any:
+        client = bench.node.create_client(kind, f'calibrator/{name}')
+        bench.spin(client.service_is_ready)
+        future = client.call_async(kind.Request(**request))
+        bench.spin(future.done)
+        return future.result()
+
+    table = {parameter.name: parameter.metadata for parameter in fields(CalibratorSettings)}
+    names = ask(ListParameters, 'list_parameters').result.names
+    assert set(table) <= set(names)
+    described = ask(DescribeParameters, 'describe_parameters', names=list(table)).descriptors
+    assert {each.name: (each.description, not each.read_only) for each in described} == {
+        name: (about['words'], about['live']) for name, about in table.items()}
+    tried = [Parameter('model', value=7), Parameter('model', value='11'),
+             Parameter('gravity', value=9.81), Parameter('auto_fit_poses', value=2)]
+    results = ask(SetParameters, 'set_parameters',
+                  parameters=[each.to_parameter_msg() for each in tried]).results
+    assert [each.successful for each in results] == [True, False, False, False]
+    assert 'expected one of auto' in results[1].reason
+
+
+if __name__ == '__main__':
+    CONFIG.write_text('\n'.join(yaml_lines(CalibratorSettings)) + '\n', encoding='utf-8')

@@ -1,0 +1,205 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the services of the calibrator do, and what they answer where they cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', exc_type=ImportError)
+
+from accel_calib.files import read_calibration, read_poses  # noqa: E402
+from accel_calib.sphere import spread_directions  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from std_msgs.msg import Bool  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+Readings = Callable[..., Any]
+Stored = Callable[..., Path]
+
+
+def count(markers: list[Any], namespace: str = 'poses') -> int:
+    return sum(m.ns == namespace for m in markers[-1].markers) if markers else 0
+
+
+def test_services_say_what_is_missing(bench: Any) -> None:
+    bench.calibrator()
+    for name, words in (('fit', 'no Imu message has come'), ('set_level', 'no calibration yet'),
+                        ('capture_pose', 'no Imu message has come'), ('undo_pose', 'no poses'),
+                        ('save', 'no Imu message has come'), ('load', 'start the driver')):
+        answer = bench.call(name)
+        assert not answer.success, name
+        assert words in answer.message, answer.message
+        assert '\n' not in answer.message
+
+
+def test_fit_of_too_few_or_flat_poses_says_which_way_to_turn(bench: Any, readings: Readings
+                                                             ) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    bench.calibrator(sensor='arm', passthrough=True)
+    bench.spin(lambda: count(markers, 'next') == 2)
+    bench.feed(readings([[0, 0, 1], [1, 0, 0]]))
+    bench.spin(lambda: count(markers) == 2)
+    answer = bench.call('fit')
+    assert not answer.success
+    assert 'turn the sensor so that' in answer.message
+    angles = np.linspace(0.5, 2 * np.pi, 7)
+    bench.feed(readings(np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])))
+    bench.spin(lambda: count(markers) == 8)
+    answer = bench.call('fit')
+    assert not answer.success
+    assert 'turn the sensor so that' in answer.message
+    assert not list(bench.home.glob('accel_calib/*.yaml'))
+
+
+def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    still = bench.listen(Bool, 'calibrator/still', latched=True)
+    bench.calibrator(auto_capture=False, sensor='arm', passthrough=True)
+    poses = readings([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dwell=3.0)
+    bench.feed(poses[:140])
+    bench.spin(lambda: still and still[-1].data)
+    assert count(markers) == 0
+    answer = bench.call('capture_pose')
+    assert answer.success, answer.message
+    bench.spin(lambda: count(markers) == 1)
+    bench.feed(poses[140:165])
+    bench.spin(lambda: not still[-1].data)
+    answer = bench.call('capture_pose')
+    assert not answer.success
+    assert 'not still' in answer.message
+    bench.feed(poses[165:310])
+    bench.spin(lambda: still[-1].data)
+    assert bench.call('capture_pose').success
+    bench.spin(lambda: count(markers) == 2)
+    table = bench.home / 'accel_calib' / 'arm_poses.csv'
+    bench.spin(lambda: len(read_poses(table)) == 2)
+    assert bench.call('undo_pose').success
+    bench.spin(lambda: count(markers) == 1)
+    assert bench.call('undo_pose').success
+    assert not bench.call('undo_pose').success
+
+
+def test_poses_are_fitted_without_being_asked(bench: Any, readings: Readings) -> None:
+    path = bench.home / 'accel_calib' / 'arm.yaml'
+    bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=10, passthrough=True)
+    bench.feed(readings(spread_directions(11)))
+    bench.spin(path.exists)
+    found = read_calibration(path)
+    assert found.sensor == 'arm'
+    np.testing.assert_allclose(found.offset / 9.80665, [0.03, -0.02, 0.04], atol=1e-3)
+
+
+def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -> None:
+    path = stored('use.yaml', sensor='imu_link')
+    good = path.read_text()
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=path)
+    bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
+    other = stored('other.yaml', sensor='another').read_text()
+    for text, words in ((good.replace('version: 1', 'version: 999'), 'version 999'),
+                        (other, "of sensor 'another'"), ('', 'not a calibration'),
+                        (good.replace('readings: m/s2', 'readings: g'), 'in g')):
+        path.write_text(text)
+        answer = bench.call('load')
+        assert not answer.success
+        assert words in answer.message, answer.message
+        assert '\n' not in answer.message
+        bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
+    path.write_text(good)
+    assert bench.call('load').success
+
+
+def test_calibration_of_another_sensor_is_put_down_at_the_first_message(
+        bench: Any, stored: Stored) -> None:
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    path = stored(sensor='another')
+    before = path.read_bytes()
+    bench.calibrator(calibration_file=path)
+
+    def refused() -> bool:
+        bench.send(bench.imu([0, 0, 9.8]))
+        return any("'another'" in array.status[0].message for array in diagnostics)
+
+    bench.spin(refused)
+    assert not corrected
+    assert path.read_bytes() == before
+
+
+def test_reset_forgets_and_keeps_what_was_stored(bench: Any, readings: Readings) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    bench.calibrator(sensor='arm', passthrough=True)
+    bench.feed(readings(spread_directions(11)))
+    bench.spin(lambda: count(markers) == 11)
+    assert bench.call('fit').success
+    assert bench.call('save').success
+    folder = bench.home / 'accel_calib'
+    stored = (folder / 'arm.yaml').read_bytes()
+    answer = bench.call('reset')
+    assert answer.success, answer.message
+    bench.spin(lambda: count(markers) == 0)
+    assert not (folder / 'arm.yaml').exists()
+    assert not (folder / 'arm_poses.csv').exists()
+    assert (folder / 'arm.yaml.reset1').read_bytes() == stored
+    assert len(read_poses(folder / 'arm_poses.csv.reset1')) == 11
+    assert not bench.call('load').success
+
+
+def test_calibration_that_cannot_be_stored_is_used_and_told_of(
+        bench: Any, readings: Readings, tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('in the way')
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=tmp_path / 'file' / 'arm.yaml', passthrough=True)
+    bench.feed(readings(spread_directions(11)))
+    bench.spin(lambda: count(markers) == 11)
+    answer = bench.call('fit')
+    assert not answer.success
+    assert 'cannot be stored' in answer.message
+    got = bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
+    assert abs(got.linear_acceleration.x) > 0.1
+
+
+def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
+    rng = np.random.default_rng(1)
+
+    def moving() -> Imu:
+        return bench.imu(np.array([0, 0, 9.8]) + 3.0 * rng.normal(size=3))
+
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=stored('good.yaml'))
+    answer = bench.call('self_test')
+    assert answer.passed == b'\x00'
+    assert 'no Imu messages' in {status.name: status.message for status in answer.status}[
+        'accel_calib: messages']
+    bench.exchange(corrected, moving)
+    diagnostics.clear()
+
+    def running() -> bool:
+        bench.send(moving())
+        return len(diagnostics) > 1
+
+    bench.spin(running)
+    answer = bench.call('self_test')
+    assert answer.passed == b'\x01', [status.message for status in answer.status]
+    assert answer.id == 'imu_link'

@@ -1,0 +1,199 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What becomes of a message between imu/data_raw and imu/data_calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', exc_type=ImportError)
+
+from accel_calib.files import read_calibration  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from std_msgs.msg import Bool  # noqa: E402
+
+GRAVITY = 9.80665
+READING = np.array([1.0, -2.0, 9.3])
+RATE = np.array([0.1, 0.2, -0.3])
+KNOWN = np.array([4.0, 1.0, 0.0, 1.0, 5.0, 0.5, 0.0, 0.5, 6.0]) * 1e-3
+FLAT = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
+
+Stored = Callable[..., Path]
+
+
+def force_of(message: Imu) -> Any:
+    vector = message.linear_acceleration
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def rate_of(message: Imu) -> Any:
+    vector = message.angular_velocity
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def full(bench: Any, **fields: Any) -> Imu:
+    """Make a message with all fields set."""
+    return bench.imu(READING, orientation=Quaternion(x=0.5, y=0.5, z=0.5, w=0.5),
+                     angular_velocity=Vector3(x=RATE[0], y=RATE[1], z=RATE[2]), **fields)
+
+
+def test_corrected_message_speaks_of_the_levelled_frame(bench: Any, stored: Stored) -> None:
+    path = stored(flat=FLAT)
+    calibration = read_calibration(path)
+    rotation, gain = calibration.model.rotation, calibration.gain
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=path, output_frame_id='base_link')
+    sent: list[Imu] = []
+
+    def make() -> Imu:
+        sent.append(full(bench, angular_velocity_covariance=KNOWN,
+                         linear_acceleration_covariance=KNOWN, orientation_covariance=KNOWN))
+        return sent[-1]
+
+    got = bench.exchange(heard, make)
+    assert got.header.frame_id == 'base_link'
+    assert got.header.stamp in [message.header.stamp for message in sent]
+    assert got.orientation == sent[0].orientation
+    np.testing.assert_array_equal(got.orientation_covariance, KNOWN)
+    np.testing.assert_allclose(force_of(got), calibration.correct(READING[None])[0], atol=1e-12)
+    np.testing.assert_allclose(rate_of(got), rotation.T @ RATE, atol=1e-12)
+    known = KNOWN.reshape(3, 3)
+    np.testing.assert_allclose(got.angular_velocity_covariance.reshape(3, 3),
+                               rotation.T @ known @ rotation, atol=1e-15)
+    inverse = rotation.T @ np.linalg.inv(gain)
+    added = got.linear_acceleration_covariance.reshape(3, 3) - inverse @ known @ inverse.T
+    np.testing.assert_allclose(added, calibration.force_covariance(force_of(got)[None])[0],
+                               atol=1e-12)
+    assert np.all(np.linalg.eigvalsh(added) > 0.0)
+
+
+def test_covariances_that_say_absent_or_unknown_are_kept(bench: Any, stored: Stored) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=stored(flat=FLAT))
+    absent = np.array([-1.0] + [0.0] * 8)
+    got = bench.exchange(heard, lambda: full(
+        bench, angular_velocity_covariance=absent, orientation_covariance=absent))
+    np.testing.assert_array_equal(got.angular_velocity_covariance, absent)
+    np.testing.assert_array_equal(got.orientation_covariance, absent)
+    np.testing.assert_array_equal(got.linear_acceleration_covariance, np.zeros(9))
+    assert got.header.frame_id == 'imu_link'
+
+
+def test_readings_in_g_come_out_in_metres_per_second_squared(bench: Any, stored: Stored) -> None:
+    path = stored(unit='g')
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=path, units='g')
+    got = bench.exchange(heard, lambda: bench.imu(
+        READING / GRAVITY, linear_acceleration_covariance=KNOWN))
+    calibration = read_calibration(path)
+    force = calibration.correct(READING[None] / GRAVITY)[0]
+    np.testing.assert_allclose(force_of(got), force * GRAVITY, atol=1e-12)
+    assert got.linear_acceleration_covariance[0] == pytest.approx(KNOWN[0] * GRAVITY ** 2, rel=0.1)
+
+
+def test_readings_that_are_not_finite_are_dropped_and_warned_of(bench: Any, stored: Stored
+                                                                ) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=stored())
+    bench.exchange(heard, lambda: bench.imu(READING))
+    heard.clear()
+    for bad in (float('nan'), float('inf')):
+        bench.send(bench.imu([bad, 0.0, GRAVITY]))
+    last = bench.imu(READING)
+    bench.send(last)
+    bench.spin(lambda: any(message.header.stamp == last.header.stamp for message in heard))
+    assert all(np.all(np.isfinite(force_of(message))) for message in heard)
+    bench.spin(lambda: any('2 readings were NaN' in array.status[0].message
+                           for array in diagnostics))
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
+
+
+def test_nothing_goes_out_before_a_calibration(bench: Any) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(use_sim_time=True)  # and nobody gives /clock
+
+    def told() -> bool:
+        bench.send(bench.imu(READING))
+        return any('no calibration yet' in array.status[0].message for array in diagnostics)
+
+    bench.spin(told)
+    assert not heard
+
+
+def test_raw_messages_go_out_unchanged_with_passthrough_and_when_switched_off(
+        bench: Any, stored: Stored) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(passthrough=True, calibration_file=stored().with_name('new.yaml'),
+                     output_frame_id='base_link')
+    sent: list[Imu] = []
+
+    def make() -> Imu:
+        sent.append(full(bench, linear_acceleration_covariance=KNOWN))
+        return sent[-1]
+
+    assert bench.exchange(heard, make) in sent
+    stored('new.yaml')
+    assert bench.call('load').success
+    bench.exchange(heard, make)
+    bench.spin(lambda: heard[-1].header.frame_id == 'base_link')
+    assert bench.call('enable', data=False).success
+    bench.exchange(heard, make)
+    bench.spin(lambda: heard[-1] in sent)
+
+
+def test_motion_is_what_is_left_without_the_gravity_of_the_last_rest(
+        bench: Any, stored: Stored, readings: Callable[..., Any]) -> None:
+    path = stored(flat=FLAT)
+    calibration = read_calibration(path)
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    motion = bench.listen(Vector3Stamped, 'calibrator/linear_acceleration')
+    still = bench.listen(Bool, 'calibrator/still', latched=True)
+    bench.calibrator(calibration_file=path)
+    bench.exchange(corrected, lambda: bench.imu(READING))
+    assert not motion
+    bench.spin(lambda: still and not still[-1].data)
+    bench.feed(readings([FLAT], dwell=6.0))
+    bench.spin(lambda: still[-1].data and motion)
+    push = np.array([0.5, -1.0, 2.0])
+    reading = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]) + push)[0]
+    bench.exchange(motion, lambda: bench.imu(reading))
+    bench.spin(lambda: abs(motion[-1].vector.z - push[2]) < 0.02)
+    got = motion[-1].vector
+    np.testing.assert_allclose([got.x, got.y, got.z], push, atol=0.02)
+
+
+def test_breaks_of_the_stamps_are_reported(bench: Any) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(sensor='arm', passthrough=True)
+    level = [[0.0, 0.0, GRAVITY]] * 60
+    bench.feed(level)
+    bench.stamp -= 500.0
+    bench.feed(level)
+
+    def told() -> bool:
+        values = {value.key: value.value for value in diagnostics[-1].status[0].values}
+        return values['interruptions of the clock'] == '1' and 'jump_back' in values[
+            'last interruption']
+
+    bench.spin(lambda: diagnostics and told())
