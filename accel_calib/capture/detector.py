@@ -89,7 +89,7 @@ class StillDetector:
         else:
             extra = [math.nan, math.nan]
         buffer = self._buffer
-        buffer.append((time, *reading, *(rate or _NO_RATE), *extra))
+        buffer.append((time, *reading, *(_NO_RATE if rate is None else rate), *extra))
         if self._latest <= time < self._boundary and len(buffer) < _BUFFER:
             self._latest = time
             return []

@@ -144,6 +144,8 @@ def _search(poses_g: Poses, base: Model, patience: float) -> Found:
                 state = plus(state, state.candidates_among((candidate.effect,))[
                     candidate.effect])
                 names = (*names, candidate.effect)
+        state, more = _climb(state)  # what was missing may have hidden a rung
+        added = (*added, *more)
         state, names = _tried_anew(state, names)
     if out.size or names:
         state, out, start = _settled_again(poses_g, start, state, names)
@@ -157,6 +159,10 @@ def _search(poses_g: Poses, base: Model, patience: float) -> Found:
 def _end(poses_g: Poses, base: Model, state: State, added: tuple[str, ...],
          out: NDArray[np.intp], back: tuple[str, ...]) -> Found:
     kept = np.delete(np.arange(len(poses_g)), out)
+    there = {*state.model.values, WANDER}
+    if 'axis_gain' in there:
+        there.add('gain')  # a rung below it
+    added = tuple(name for name in added if name in there)
     return Found(beginning(poses_g.take(kept), base), state, added, out, back)
 
 

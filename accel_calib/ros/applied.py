@@ -27,10 +27,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .context import context_of_rest
+
 if TYPE_CHECKING:
     from ..calibrate import Calibration
     from ..capture import Dwell
-    from ..effects import Context
     from ..table import Floats
 
 
@@ -79,9 +80,10 @@ class Applied:
 
     def _force(self, rest: Dwell) -> Floats | None:
         """Give the corrected force of a rest [m/s²]; None where it cannot be corrected."""
-        context = context_of(rest)
-        if self.calibration is None or any(key not in context
-                                           for key in self.calibration.model.needs):
+        if self.calibration is None:
+            return None
+        context = context_of_rest(rest, self.calibration.units)
+        if any(key not in context for key in self.calibration.model.needs):
             return None
         return self.calibration.correct(rest.mean[np.newaxis], context)[0] * self.scale
 
@@ -98,11 +100,6 @@ class Applied:
     def drift(self) -> float:
         """RMS of |a| - 1 g over the rests with this calibration [g]; NaN: there were none."""
         return math.sqrt(self._squares / self._rests) if self._rests else math.nan
-
-
-def context_of(rest: Dwell) -> Context:
-    """Give the context of a rest as one row."""
-    return {key: np.array([value]) for key, value in rest.context.items()}
 
 
 def output_scale(calibration: Calibration, gravity: float) -> float:

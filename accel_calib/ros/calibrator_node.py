@@ -38,6 +38,7 @@ from visualization_msgs.msg import MarkerArray
 from . import conversion, qos
 from .applied import Applied
 from .commands import Commands
+from .context import context_of_message
 from .declare import declared, follow
 from .fitting import title
 from .health import status_of
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from ..calibrate import Calibration
+    from ..effects import Context
 
 _SAY_AGAIN = 10.0
 """A line about the stream is logged at most once in this time [s]."""
@@ -150,7 +152,7 @@ class CalibratorNode(Node):
         elif applied.calibration is not None:
             try:
                 corrected = conversion.corrected_message(
-                    message, applied.calibration, applied.scale, self.message_context,
+                    message, applied.calibration, applied.scale, self._context_of(message),
                     settings.output_frame_id)
             except AccelCalibError as error:
                 self.get_logger().error(f'messages are not corrected: {error}',
@@ -158,6 +160,12 @@ class CalibratorNode(Node):
                 return
             self._calibrated.publish(corrected)
             self._send_motion(corrected)
+
+    def _context_of(self, message: Imu) -> Context:
+        """Give what the effects of the calibration in use need beside a message."""
+        calibration = self.applied.calibration
+        needs = () if calibration is None else calibration.model.needs
+        return context_of_message(message, needs, self.message_context)
 
     def _send_motion(self, corrected: Imu) -> None:
         """Publish the acceleration without gravity, as the last rest had it."""

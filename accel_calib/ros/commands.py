@@ -27,8 +27,8 @@ from diagnostic_msgs.srv import SelfTest
 from std_srvs.srv import SetBool
 
 from .answers import Answers
-from .applied import context_of
-from .fitting import fitted, summary
+from .context import context_of_rest
+from .fitting import fitted, refined, story, summary
 from .health import self_test_of
 from .pose_view import PoseView
 from ..calibrate import level
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from .storage import Store
     from .worker import Promise
     from ..calibrate import Calibration
+    from ..refine import Refinement
 
 _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and call ~/fit first')
 
@@ -65,8 +66,8 @@ class Commands:
         self.view = PoseView(node)
         triggers: dict[str, Callable[[], str | Promise]] = {
             'capture_pose': self.capture_pose, 'undo_pose': self.undo_pose, 'fit': self.fit,
-            'set_level': self.set_level, 'save': self.save, 'load': self.load,
-            'reset': self.reset}
+            'refine': self.refine, 'set_level': self.set_level, 'save': self.save,
+            'load': self.load, 'reset': self.reset}
         for name, command in triggers.items():
             self._answers.serve(name, command)
         node.create_service(SetBool, '~/enable', self._on_enable)
@@ -136,6 +137,23 @@ class Commands:
 
         return self._answers.later(job, finish)
 
+    def refine(self) -> Promise:
+        """Find what the calibration lacks, use and store the refined one."""
+        node, store = self._node, self._store()
+        node.watch.refresh()
+        poses, before = node.watch.book.poses(), node.applied.calibration
+        units, sensor = node.units, node.sensor
+
+        def job() -> tuple[Refinement, OSError | None]:
+            refinement = refined(poses, units, sensor, before)
+            return refinement, _stored(store, refinement.calibration)
+
+        def finish(found: tuple[Refinement, OSError | None]) -> str:
+            self._use(found[0].calibration, found[1])
+            return f'{story(found[0])}; stored in {store.calibration}'
+
+        return self._answers.later(job, finish)
+
     def _use(self, calibration: Calibration, not_stored: OSError | None) -> None:
         """Use a calibration, stored or not."""
         self._node.adopt(calibration)
@@ -152,7 +170,8 @@ class Commands:
         if rest is None:
             raise self._not_still()
         store = self._store()
-        levelled = level(calibration, rest.mean, node.settings.frame, context_of(rest))
+        levelled = level(calibration, rest.mean, node.settings.frame,
+                         context_of_rest(rest, node.units))
 
         def finish(not_stored: OSError | None) -> str:
             self._use(levelled, not_stored)

@@ -25,11 +25,13 @@ import numpy as np
 from ..calibrate import directions_of, fit_poses, level, next_pose
 from ..calibrate.mounting import flat_direction
 from ..errors import RefusedFitError
+from ..refine import refine
 
 if TYPE_CHECKING:
     from .settings import CalibratorSettings
     from ..calibrate import Calibration, NextPose
     from ..effects import Context
+    from ..refine import Refinement
     from ..table import Floats, Poses
     from ..units import Units
 
@@ -67,18 +69,61 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
         If the readings are plainly in another unit.
 
     """
-    date = datetime.now(timezone.utc).isoformat(timespec='seconds')
-    try:
-        calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
-                                sensor=sensor, date=date)
-    except RefusedFitError as error:
-        asked = asked_for(poses, units, settings.model)
-        raise RefusedFitError(error.message, f'{error.advice}: {asked.words}') from error
+    date = _now()
+    calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
+                            sensor=sensor, date=date)
     if before is None or np.array_equal(before.model.rotation, np.eye(3)):
         return calibration
     flat = flat_direction(before.frame) * before.force_per_g
     reading = before.predict(flat[np.newaxis], context)[0]
     return level(calibration, reading, before.frame, context)
+
+
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
+    """
+    Find what a calibration lacks.
+
+    Parameters
+    ----------
+    poses : Poses
+        All poses.
+    units : Units
+        Unit of the readings.
+    sensor : str
+        Name of the sensor.
+    before : Calibration or None
+        The calibration in use; without one, what a fit would take.
+
+    Raises
+    ------
+    RefusedFitError
+        If there are too few poses.
+    InputError
+        If the readings are plainly in another unit.
+
+    """
+    return refine(poses, units, base='auto' if before is None else before, sensor=sensor,
+                  date=_now())
+
+
+def story(refinement: Refinement) -> str:
+    """Say in a line what a refinement came to."""
+    words = {'no_gap': 'nothing is missing', 'explained': 'what was missing is named',
+             'unexplained': 'a gap remains that no known effect explains'}
+    lines = [f'{words[refinement.verdict]}: {refinement.gap_mg:.3f} mg before, '
+             f'{refinement.remaining_gap_mg:.3f} mg after']
+    for step in refinement.steps:
+        rivals = f' (or {", ".join(step.rivals)})' if step.rivals else ''
+        lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '
+                     f'{step.gap_after_mg:.3f} mg, {step.where}')
+    if refinement.disturbed_poses:
+        rows = ', '.join(str(row) for row in refinement.disturbed_poses)
+        lines.append(f'disturbed poses: {rows}')
+    return '; '.join([*lines, *refinement.advice])
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:

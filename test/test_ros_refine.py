@@ -1,0 +1,101 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node finds what its calibration lacks, and corrects with it."""
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+from accel_calib.files import read_calibration
+from accel_calib.sphere import spread_directions
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', exc_type=ImportError)
+
+from accel_calib.ros.context import context_of_message
+from sensor_msgs.msg import Imu, Temperature
+from visualization_msgs.msg import MarkerArray
+
+Readings = Callable[..., Any]
+POSES = 26
+MOVES = np.array([0.002, -0.0015, 0.001])
+"""Offset per °C [g]."""
+
+
+def warmed(bench: Any, readings: Readings, publisher: Any) -> None:
+    """Feed poses, each at another temperature."""
+    for k, direction in enumerate(spread_directions(POSES)):
+        temperature = 25.0 + 12.0 * np.sin(2.1 * k)
+        told(bench, publisher, temperature, 0.05 if k else 1.0)  # until both have met
+        shift = MOVES * (temperature - 25.0) * 9.80665
+        bench.feed(readings([direction], dwell=1.8) + shift)
+
+
+def told(bench: Any, publisher: Any, temperature: float, seconds: float) -> None:
+    """Tell a temperature, again and again."""
+    ends = time.monotonic() + seconds
+
+    def late() -> bool:
+        publisher.publish(Temperature(temperature=temperature))
+        return time.monotonic() > ends
+
+    bench.spin(late)
+
+
+def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: Readings) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    publisher = bench.node.create_publisher(Temperature, 'temperature', 10)
+    bench.calibrator(sensor='arm', passthrough=True)
+    bench.spin(lambda: publisher.get_subscription_count() > 0)
+    warmed(bench, readings, publisher)
+    bench.spin(lambda: sum(m.ns == 'poses' for m in markers[-1].markers) >= POSES - 1)
+    answer = bench.call('refine')
+    assert answer.success, answer.message
+    assert 'offset_temperature' in answer.message
+    found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
+    np.testing.assert_allclose(found.model.values['offset_temperature'], MOVES, atol=2e-4)
+
+    for temperature in (10.0, 40.0):
+        told(bench, publisher, temperature, 0.2)
+        shift = MOVES * (temperature - 25.0) * 9.80665
+        bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
+                   corrected)
+        up = np.mean([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
+                      for m in corrected], axis=0)
+        assert np.linalg.norm(up) == pytest.approx(9.80665, abs=0.02)
+
+
+def test_refinement_of_too_few_poses_is_refused(bench: Any, readings: Readings) -> None:
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    bench.calibrator(sensor='arm', passthrough=True)
+    bench.feed(readings([[0, 0, 1], [1, 0, 0]]))
+    bench.spin(lambda: markers and sum(m.ns == 'poses' for m in markers[-1].markers) >= 2)
+    answer = bench.call('refine')
+    assert not answer.success
+    assert 'too few' in answer.message
+
+
+def test_context_holds_what_is_needed_and_no_more() -> None:
+    message = Imu()
+    message.header.stamp.sec, message.angular_velocity.z = 7, 0.5
+    warm = {'temperature': np.array([31.0])}
+    assert context_of_message(message, (), warm) == {}
+    found = context_of_message(message, ('time', 'rate', 'temperature', 'std'), warm)
+    assert found['time'] == [7.0]
+    np.testing.assert_array_equal(found['rate'], [[0.0, 0.0, 0.5]])
+    assert found['temperature'] == [31.0]
+    assert 'supply_voltage' not in context_of_message(message, ('supply_voltage',), warm)
