@@ -19,15 +19,11 @@ from __future__ import annotations
 import signal
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
 import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', exc_type=ImportError)
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import Vector3Stamped  # noqa: E402
-from sensor_msgs.msg import Imu  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
+from sensor_msgs.msg import Imu
+from visualization_msgs.msg import MarkerArray
 
 GRAVITY = 9.80665
 POSES = 12

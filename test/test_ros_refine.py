@@ -19,13 +19,10 @@ import time
 from typing import Any
 
 from accel_calib.files import read_calibration
+from accel_calib.ros.context import context_of_message
 from accel_calib.sphere import spread_directions
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy', exc_type=ImportError)
-
-from accel_calib.ros.context import context_of_message
 from sensor_msgs.msg import Imu, Temperature
 from visualization_msgs.msg import MarkerArray
 

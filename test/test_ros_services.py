@@ -20,17 +20,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from accel_calib.files import read_calibration, read_poses
+from accel_calib.sphere import spread_directions
+from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
-import pytest
-
-pytest.importorskip('rclpy', exc_type=ImportError)
-
-from accel_calib.files import read_calibration, read_poses  # noqa: E402
-from accel_calib.sphere import spread_directions  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from sensor_msgs.msg import Imu  # noqa: E402
-from std_msgs.msg import Bool  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Bool
+from visualization_msgs.msg import MarkerArray
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]

@@ -20,16 +20,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from accel_calib.files import read_calibration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy', exc_type=ImportError)
-
-from accel_calib.files import read_calibration  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped  # noqa: E402
-from sensor_msgs.msg import Imu  # noqa: E402
-from std_msgs.msg import Bool  # noqa: E402
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Bool
 
 GRAVITY = 9.80665
 READING = np.array([1.0, -2.0, 9.3])

@@ -20,16 +20,13 @@ import threading
 import time
 from typing import Any
 
+from accel_calib.errors import InputError
+from accel_calib.ros.answers import Answers
+from accel_calib.ros.worker import Worker
 import pytest
-
-rclpy = pytest.importorskip('rclpy', exc_type=ImportError)
-
-from accel_calib.errors import InputError  # noqa: E402
-from accel_calib.ros.answers import Answers  # noqa: E402
-from accel_calib.ros.worker import Worker  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.task import Future  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.task import Future
 
 WORK = 0.2
 

@@ -86,7 +86,7 @@ def _directions(force: Floats, share: Floats) -> str:
     means = np.where(counts > 0, near @ share / np.maximum(counts, 1), 0.0)
     largest = [k for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]]
     return 'with ' + ', '.join(
-        f'{_name(signs[k])} up ({means[k]:+.2g} mg, {counts[k]} pose{"" if counts[k] == 1 else "s"})'
+        f'{_name(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share)} poses)'
         for k in largest)
 
 

@@ -93,12 +93,12 @@ class Applied:
 
     @property
     def residual(self) -> float:
-        """|a| - 1 g at the last rest [g]; NaN where it is not known."""
+        """Give |a| - 1 g at the last rest [g]; NaN where it is not known."""
         return math.nan if self.gravity is None else self._error(self.gravity)
 
     @property
     def drift(self) -> float:
-        """RMS of |a| - 1 g over the rests with this calibration [g]; NaN: there were none."""
+        """Give the RMS of |a| - 1 g over the rests with this calibration [g]; NaN: none."""
         return math.sqrt(self._squares / self._rests) if self._rests else math.nan
 
 

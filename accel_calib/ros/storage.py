@@ -60,7 +60,7 @@ class Store:
 
     @property
     def poses(self) -> Path:
-        """The pose table."""
+        """Give the path of the pose table."""
         return self.calibration.with_name(f'{self.calibration.stem}_poses.csv')
 
     def load_calibration(self, sensor: str, units: str) -> Calibration | None:

@@ -68,7 +68,7 @@ class Vitals:
 
     @property
     def length_g(self) -> float:
-        """|a| of the last message [g]; NaN where it is not known."""
+        """Give |a| of the last message [g]; NaN where it is not known."""
         return math.hypot(*self._reading) / self._per_g
 
     def health(self, node: CalibratorNode) -> Health:
