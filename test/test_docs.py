@@ -55,3 +55,16 @@ def test_links_lead_somewhere(page):
     path = ROOT / page
     for link in re.findall(r'\]\(([^)#]+)\)', path.read_text(encoding='utf-8')):
         assert link.startswith('http') or (path.parent / link).exists(), link
+
+
+def test_services_and_topics_of_the_readme_are_those_of_the_node():
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    source = ''.join((ROOT / 'accel_calib' / 'ros' / name).read_text(encoding='utf-8')
+                     for name in ('calibrator_node.py', 'commands.py', 'pose_view.py'))
+    table = [line for line in text.splitlines() if line.startswith('| `')]
+    told = set(re.findall(r'`(~/\w+|imu/\w+|/diagnostics|temperature)`', '\n'.join(
+        line for line in table if '_msgs/' in line or 'std_srvs' in line)))
+    made = set(re.findall(r"'(~/\w+|imu/\w+|/diagnostics|temperature)'", source))
+    triggers = re.search(r'triggers.*?= \{(.*?)\}', source, re.DOTALL).group(1)
+    made |= {f'~/{name}' for name in re.findall(r"'(\w+)':", triggers)}
+    assert told == made
