@@ -165,6 +165,14 @@ def test_shared_orientation_shows_temperature_across_gravity():
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4], atol=3e-5)
 
 
+def test_what_was_looked_for_and_not_found_is_not_called_untestable(taken):
+    listed = [effect for effect, _ in refine(taken(13, poses=60)[0], MPS2).not_testable]
+    assert listed == ['misalignment']
+    bare = refine(taken(13, poses=60, dropped=('temperature', 'time'))[0], MPS2).not_testable
+    assert {'offset_temperature', 'gain_temperature', 'offset_drift', 'warm_up', 'offset_step',
+            'offset_wander', 'misalignment'} == {effect for effect, _ in bare}
+
+
 def test_too_few_poses_are_refused():
     poses = simulate_poses(model_with({}), spread_directions(3), np.random.default_rng(1))
     with pytest.raises(RefusedFitError, match='3 poses are too few'):

@@ -96,7 +96,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     verdict: Verdict = ('unexplained' if not noise else 'explained' if steps else 'no_gap')
     left_out = tuple(int(row) for row in poses.row[found.knocked])
     alike = tuple(rival for step in steps for rival in step.rivals)
-    untestable = tuple(not_testable(found.final.poses_g, found.final.found,
+    testable = {**found.final.found, **found.final.candidates_among(LADDER)}
+    untestable = tuple(not_testable(found.final.poses_g, testable,
                                     (*found.final.model.effects, *alike)))
     kept = found.final.poses_g
     return Refinement(
