@@ -135,7 +135,11 @@ def _search(poses_g: Poses, base: Model, patience: float) -> Found:
     state, out = _settle(state, np.arange(len(poses_g)), patience)
     start, added = state, ladder
     names: tuple[str, ...] = ()
+    been: set[frozenset[str]] = set()  # a name may go again when another comes: not for ever
     while len(names) < _LARGEST and not (names and is_down_to_noise(state)):
+        if frozenset(names) in been:
+            break
+        been.add(frozenset(names))
         step = _next(state)
         if not step:
             break
