@@ -207,7 +207,7 @@ class Bench:
         for process in self._processes:
             if process.poll() is None:
                 process.kill()
-            print(process.communicate()[0])  # pytest shows it where a test failed
+            sys.stdout.write(process.communicate()[0])  # pytest shows it where a test failed
         self._leave()
 
 
