@@ -103,7 +103,7 @@ def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
     assert status == 0
     assert result['poses_used'] == 29
-    expected = rotation_from_rpy(*np.radians((20, -30, 0)))[:, 2]
+    expected = rotation_from_rpy(*np.radians((20, -30, 0)))[2]
     np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
 
 

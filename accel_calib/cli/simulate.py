@@ -61,7 +61,7 @@ def add_to(commands: Any) -> None:
     made.add_argument('--temperature', type=float, nargs=2, metavar=('FIRST', 'LAST'),
                       help='temperature, moving from the one to the other [degC]')
     made.add_argument('--mounting', type=float, nargs=3, default=(0.0, 0.0, 0.0),
-                      metavar=('ROLL', 'PITCH', 'YAW'), help='of the robot against the sensor '
+                      metavar=('ROLL', 'PITCH', 'YAW'), help='of the sensor on the robot '
                       '[deg]; the first pose is flat')
     made.add_argument('--reference', action='store_true',
                       help='write the true force too (known orientation)')
@@ -84,7 +84,8 @@ def run(args: argparse.Namespace) -> int:
 def _setting(args: argparse.Namespace) -> tuple[Model, Floats, np.random.Generator]:
     """Give the sensor, the directions of its poses, and the source of noise."""
     effects = dict(parse_effect(text) for text in args.effect)
-    model = model_with(effects, rotation_from_rpy(*np.radians(args.mounting)))
+    # ΔR takes the robot's axes to the sensor's; the attitude of the sensor is the way back.
+    model = model_with(effects, rotation_from_rpy(*np.radians(args.mounting)).T)
     flat = np.array([[0.0, 0.0, 1.0]])
     directions = np.vstack([flat, spread_directions(args.poses)[1:]])
     return model, directions, np.random.default_rng(args.seed)
