@@ -144,15 +144,15 @@ def _search(poses_g: Poses, base: Model, patience: float) -> Found:
         if not step:
             break
         for candidate in step:
-            if candidate.effect in state.candidates_among((candidate.effect,)):
-                state = plus(state, state.candidates_among((candidate.effect,))[
-                    candidate.effect])
+            among = state.candidates_among((candidate.effect,))
+            if candidate.effect in among:
+                state = plus(state, among[candidate.effect])
                 names = (*names, candidate.effect)
         state, more = _climb(state)  # what was missing may have hidden a rung
         added = (*added, *more)
         state, names = _tried_anew(state, names)
     if out.size or names:
-        state, out, start = _settled_again(poses_g, start, state, names)
+        state, out, start = _settled_again(poses_g, start, state)
     names, state, back = _judged(start, state, names)
     if _walks(state):
         state, names = _called_for_beside_walk(state, names)
@@ -229,7 +229,7 @@ def _settle(state: State, rows: NDArray[np.intp], patience: float
     return state.without(standing.poses), rows[standing.poses]
 
 
-def _settled_again(poses_g: Poses, start: State, state: State, names: tuple[str, ...]
+def _settled_again(poses_g: Poses, start: State, state: State
                    ) -> tuple[State, NDArray[np.intp], State]:
     """Judge all poses anew in the model that was found."""
     # Near the model of the good poses: one that the knocked ones shaped bends the equations.
