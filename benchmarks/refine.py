@@ -17,7 +17,7 @@ How often the refinement names the hidden effect: the figures that were asked fo
 
 The sets come from `test/generator.py`, which shares no code with the package::
 
-    python benchmarks/refine.py --sets 60 --jobs 2 --markdown docs/refine_figures.md
+    python benchmarks/refine.py --sets 60 --jobs 2 --markdown docs/figures/refine.md
 
 """
 
@@ -26,7 +26,6 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 import multiprocessing
 import os
 from pathlib import Path
@@ -36,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
+from figures import Line, table  # noqa: E402
 from generator import OUTSIDE  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import Case, Outcome, run, SHOWS  # noqa: E402
@@ -49,17 +49,6 @@ from refine_rows import (  # noqa: E402
     ROWS,
     SMALL,
 )
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of the table: what, measured, asked, sets, and whether it is met."""
-
-    what: str
-    measured: str
-    asked: str
-    sets: int
-    met: bool | None
 
 
 def share(outcomes: Sequence[Outcome], good: Callable[[Outcome], bool]) -> tuple[float, str]:
@@ -193,13 +182,6 @@ def _found(outcome: Outcome) -> bool:
 
 def _clean(outcome: Outcome) -> bool:
     return outcome.disturbed <= set(outcome.knocked) and outcome.verdict != 'error'
-
-
-def table(lines: Sequence[Line]) -> str:
-    """Write the table as Markdown."""
-    marks = {True: 'yes', False: '**no**', None: ''}
-    rows = [f'| {x.what} | {x.measured} | {x.asked} | {x.sets} | {marks[x.met]} |' for x in lines]
-    return '\n'.join(['| | measured | asked | sets | met |', '|---|---|---|---|---|', *rows])
 
 
 def by_effect(outcomes: Sequence[Outcome]) -> str:

@@ -50,7 +50,7 @@ def test_commands_of_the_readme_exist():
 
 
 @pytest.mark.parametrize('page', ['README.md', 'CONTRIBUTING.md', *(
-    f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))])
+    str(path.relative_to(ROOT)) for path in (ROOT / 'docs').rglob('*.md'))])
 def test_links_lead_somewhere(page):
     path = ROOT / page
     for link in re.findall(r'\]\(([^)#]+)\)', path.read_text(encoding='utf-8')):

@@ -1,0 +1,39 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tables that the benchmarks print and write into the docs: asked beside measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a table: what, measured, asked, over how many sets, and whether it is met."""
+
+    what: str
+    measured: str
+    asked: str
+    sets: int
+    met: bool | None
+
+
+def table(lines: Sequence[Line]) -> str:
+    """Give the table as Markdown; `met` is empty where nothing was asked."""
+    rows = ['| | measured | asked | sets | met |', '|---|---|---|---|---|']
+    words = {True: 'yes', False: '**no**', None: ''}
+    rows += [f'| {x.what} | {x.measured} | {x.asked} | {x.sets} | {words[x.met]} |' for x in lines]
+    return '\n'.join(rows)
