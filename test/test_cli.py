@@ -254,6 +254,20 @@ def test_module_runs_as_a_process(poses):
     assert 'gap (RMS)' in done.stdout
 
 
+@pytest.mark.parametrize(('arguments', 'without'), [
+    (['--help'], ['numpy', 'yaml', 'rich']), (['fly'], ['numpy']),
+    (['fit', '{poses}'], ['matplotlib', 'rosbags', 'accel_calib.refine', 'accel_calib.report'])])
+def test_only_what_is_used_is_imported(arguments, without, poses):
+    code = ('import sys\nfrom accel_calib.cli.main import main\n'
+            'try:\n    main()\nexcept SystemExit:\n    pass\n'
+            'print(*sys.modules, file=sys.stderr)')
+    done = subprocess.run([sys.executable, '-c', code, *(
+        argument.format(poses=poses) for argument in arguments)], capture_output=True, text=True,
+        timeout=60, check=True)
+    assert not set(without) & set(done.stderr.split())
+    assert 'accel_calib.cli.main' in done.stderr
+
+
 def test_json_holds_no_nan():
     assert plain({'a': np.array([1.0, np.nan]), 'b': (np.inf, None)}) == {
         'a': [1.0, None], 'b': [None, None]}

@@ -18,20 +18,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from . import options
 from ..calibrate import Calibration, check_units
 from ..errors import InputError
 from ..files import correct_bag, is_bag, read_calibration, read_samples, write_table
 
-_SUMMARY = 'correct a recording with a calibration'
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'apply', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('recording', type=Path, metavar='RECORDING',
                       help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',

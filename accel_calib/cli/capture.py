@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from . import options
 from ..calibrate import check_units
@@ -28,13 +27,12 @@ from ..errors import InputError
 from ..files import read_recording, write_table
 from ..units import Units, units_of
 
-_SUMMARY = 'find the still stretches of a recording and write the pose table'
 _EXAMPLE = 'accel-calib capture recording.mcap -o poses.csv'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'capture', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('recording', type=Path, metavar='RECORDING',
                       help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',

@@ -26,13 +26,12 @@ from ..errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-_SUMMARY = 'the main job without hardware: simulated Imu, calibrator node, before and after'
 _EXAMPLE = 'accel-calib demo'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'demo', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     options.add_json(made)
     made.set_defaults(run=run)
 

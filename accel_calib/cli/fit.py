@@ -29,13 +29,12 @@ from ..calibrate import Calibration, fit_poses, FRAMES, level, METHODS, MODEL_NA
 from ..errors import AccelCalibError, InputError
 from ..files import read_poses, write_calibration
 
-_SUMMARY = 'fit a calibration to still poses'
 _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'fit', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
                       help='where to store the calibration (YAML); a folder for several POSES')

@@ -12,32 +12,57 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command ``accel-calib``."""
+"""
+The command ``accel-calib``.
+
+Only the module of the command that is asked for is imported, so that ``--help`` does not wait for
+numpy.
+
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from importlib import import_module
 import sys
 
-from . import apply, capture, demo, fit, nodes, refine, report, simulate, verify
 from .. import __version__
 from ..errors import AccelCalibError
 
 BAD_INPUT = 2
 INTERRUPTED = 130
 
+COMMANDS = {
+    'demo': 'the main job without hardware: simulated Imu, calibrator node, before and after',
+    'capture': 'find the still stretches of a recording and write the pose table',
+    'fit': 'fit a calibration to still poses',
+    'verify': 'say how well a calibration does on poses it has not seen',
+    'refine': 'find where simulation and measurement disagree, name the missing effect and add it',
+    'apply': 'correct a recording with a calibration',
+    'simulate': 'simulate poses or a recording of a sensor with known effects',
+    'report': 'show what a calibration still lacks: figures, and one self-contained page',
+    'node': 'run the calibrator node',
+    'simulator': 'run the simulated Imu node',
+}
+"""What each command does."""
 
-def parser() -> argparse.ArgumentParser:
-    """Make the parser of the whole command line."""
+_MODULES = {'node': 'nodes', 'simulator': 'nodes'}
+
+
+def parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """Make the parser of the command line, with the options of the commands that are wanted."""
     top = argparse.ArgumentParser(
         prog='accel-calib', description='Calibrate an accelerometer from still poses: all that '
         'is needed is that gravity is 1 g.')
     top.add_argument('--version', action='version', version=__version__)
     commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND',
                                   required=True)
-    for command in (demo, capture, fit, verify, refine, apply, simulate, report, nodes):
-        command.add_to(commands)
+    for name, summary in COMMANDS.items():
+        made = commands.add_parser(name, help=summary,
+                                   description=f'{summary[0].upper()}{summary[1:]}.')
+        if name in wanted:
+            import_module(f'.{_MODULES.get(name, name)}', __package__).add_to(made)
     return top
 
 
@@ -51,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0, or 2 after bad input, with one line on standard error.
 
     """
-    own, for_ros = nodes.split(sys.argv[1:] if arguments is None else arguments)
-    args = parser().parse_args(own)
+    own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
+    args = parser(own[:1]).parse_args(own)
     args.for_ros = for_ros
     try:
         status: int = args.run(args)
@@ -64,6 +89,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     return status
+
+
+def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """Part the arguments of this program from those of ROS, which argparse would not let by."""
+    at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    return arguments[:at], arguments[at:]
 
 
 def _refuse(command: str, line: str) -> int:

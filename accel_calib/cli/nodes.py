@@ -17,33 +17,24 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
 
 from . import options
 
-
-def add_to(commands: Any) -> None:
-    """Add both commands."""
-    for name, module, summary, example in (
-            ('node', 'calibrator', 'run the calibrator node',
-             'accel-calib node --ros-args -r imu/data_raw:=/imu/raw'),
-            ('simulator', 'simulator', 'run the simulated Imu node',
-             'accel-calib simulator --ros-args -p poses:=12')):
-        made = options.command(commands, name, summary, example)
-        made.epilog = f'{made.epilog}\n\nall from --ros-args on is passed on to ROS'
-        made.set_defaults(run=run, module=module)
+_MODULES = {'node': 'calibrator', 'simulator': 'simulator'}
+_EXAMPLES = {'node': 'accel-calib node --ros-args -r imu/data_raw:=/imu/raw',
+             'simulator': 'accel-calib simulator --ros-args -p poses:=12'}
 
 
-def split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Part the arguments of this program from those of ROS, which argparse would not let by."""
-    at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
-    return arguments[:at], arguments[at:]
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLES[made.prog.split()[-1]])
+    made.epilog = f'{made.epilog}\n\nall from --ros-args on is passed on to ROS'
+    made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the node until it is told to stop."""
-    module = import_module(f'accel_calib.ros.{args.module}')
+    module = import_module(f'accel_calib.ros.{_MODULES[args.command]}')
     status: int = module.main([args.command, *args.for_ros])
     return status

@@ -30,14 +30,10 @@ from ..table import Poses
 from ..units import STANDARD_GRAVITY, UNIT_NAMES, Units, units_of
 
 
-def command(commands: Any, name: str, summary: str, example: str, **described: Any
-            ) -> argparse.ArgumentParser:
-    """Add a command with an example to its help."""
-    made: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=f'{summary[0].upper()}{summary[1:]}.',
-        epilog=f'example:\n  {example}', formatter_class=argparse.RawDescriptionHelpFormatter,
-        **described)
-    return made
+def add_example(made: argparse.ArgumentParser, example: str) -> None:
+    """End the help with an example."""
+    made.epilog = f'example:\n  {example}'
+    made.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def positive(text: str) -> float:

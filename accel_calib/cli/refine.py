@@ -44,15 +44,14 @@ from ..report.words import gap_words, verdict_words
 from ..table import Poses, Recording
 from ..units import Units, units_of
 
-_SUMMARY = 'find where simulation and measurement disagree, name the missing effect and add it'
 _EXAMPLE = 'accel-calib refine poses.csv -o refined.yaml --report report.html'
 _SAMPLES_APART_S = 0.5
 _MANY_ROWS = 5000
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'refine', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
                       help='pose table (CSV), or a recording: bags, and tables of samples')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',

@@ -18,19 +18,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from . import options
 from .refine import add_inputs, refine_file
 from ..report import check_matplotlib, write_figures, write_page
 
-_SUMMARY = 'show what a calibration still lacks: figures, and one self-contained page'
 _EXAMPLE = 'accel-calib report poses.csv -o report.html --figures figures'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'report', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('poses', type=Path, metavar='POSES',
                       help='pose table (CSV), or a recording: bags, and tables of samples')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',

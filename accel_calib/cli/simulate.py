@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,14 +30,13 @@ from ..sphere import rotation_from_rpy, spread_directions
 from ..table import Floats, Poses, Recording
 from ..units import Units
 
-_SUMMARY = 'simulate poses or a recording of a sensor with known effects'
 _EXAMPLE = ('accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
             '--effect axis_gain=0.01')
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'simulate', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
                       help='CSV table to write')
     made.add_argument('--effect', action='append', default=[], metavar='NAME=VALUE,...',

@@ -27,13 +27,12 @@ from ..calibrate import check_units, verify
 from ..errors import AccelCalibError
 from ..files import read_calibration, read_poses
 
-_SUMMARY = 'say how well a calibration does on poses it has not seen'
 _EXAMPLE = 'accel-calib verify other_poses.csv -c calibration.yaml'
 
 
-def add_to(commands: Any) -> None:
-    """Add the command."""
-    made = options.command(commands, 'verify', _SUMMARY, _EXAMPLE)
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
                       help='pose table (CSV), in the unit of the calibration')
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',

@@ -108,8 +108,8 @@ def _as_text(values: NDArray[Any]) -> list[list[str]]:
 def _read(path: Path, needed: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read a table into columns of `COLUMNS`."""
     try:
-        lines = [line for line in path.read_text(encoding='utf-8').splitlines()
-                 if line.strip() and not line.startswith('#')]
+        filled = filter(str.strip, path.read_text(encoding='utf-8').splitlines())
+        lines = [line for line in filled if line[0] != '#']
     except UnicodeDecodeError as err:
         raise InputError(f'{path} is not a text file', 'give a CSV table or a bag') from err
     if not lines:
