@@ -16,8 +16,9 @@
 
 from .calibration import Calibration, level, Quality, Rejected
 from .fit import check_units, directions_of, fit_poses, METHODS, MODEL_NAMES
-from .geometry import coverage, next_pose, NextPose
+from .geometry import coverage, Identifiability, identifiability
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
+from .next_pose import next_pose, NextPose
 from .quality import in_g, Verification, verify
 from .sensing_axes import sensing_axes, SensingAxes
 
@@ -27,6 +28,7 @@ __all__ = [
            'MODEL_NAMES',
            'Calibration',
            'FrameName',
+           'Identifiability',
            'NextPose',
            'Quality',
            'Rejected',
@@ -36,6 +38,7 @@ __all__ = [
            'coverage',
            'directions_of',
            'fit_poses',
+           'identifiability',
            'in_g',
            'level',
            'mounting',

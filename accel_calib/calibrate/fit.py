@@ -31,9 +31,10 @@ import numpy as np
 from . import closed_form
 from .calibration import Calibration, Rejected
 from .disturbed import disturbed
-from .geometry import dilution, free_parameters, NORM_MODELS, refuse_if_unfit, WEAK_DILUTION
+from .geometry import dilution, free_parameters, noise_along, NORM_MODELS, WEAK_DILUTION
 from .likelihood import Fit, fit_norm, fit_reference, judge
 from .quality import in_g, quality_of
+from .refusal import carries, refuse_if_unfit, unseen
 from .selection import choose
 from .sensing_axes import lower_triangular, TIES
 from ..errors import InputError, RefusedFitError
@@ -122,17 +123,24 @@ def directions_of(poses: Poses, units: Units) -> Floats:
     poses : Poses
         In the unit of the readings.
     units : Units
-        That unit; native readings are seen from the centre of their sphere.
+        That unit; native readings mean nothing but from the centre of their sphere.
 
     Returns
     -------
     (n, 3) array
-        Unit vectors in the axes of the sensor.
+        Unit vectors in the axes of the sensor, from the centre of the readings where that is
+        plain.
 
     """
-    centre = closed_form.fit_4(poses.reading)[1] if units.name == 'native' else np.zeros(3)
-    force = poses.reading - centre
-    return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    raw = _unit(poses.reading)
+    if units.name != 'native' and dilution('4', raw) > WEAK_DILUTION:
+        return raw
+    return _unit(poses.reading - closed_form.fit_4(poses.reading)[1])
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Give (n, 3) vectors at length 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
 def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor: str,
@@ -143,39 +151,36 @@ def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor:
             refuse_if_unfit('4', np.zeros((len(poses), 3)))
         units = Units('native', float(closed_form.fit_4(poses.reading)[0][0, 0]))
     directions = directions_of(poses, units)
-    refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions)
+    noise = noise_along(poses.noise, directions)
+    refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions, noise)
     poses_g = in_g(poses, units)
     kept, reason = np.arange(len(poses)), f'model {model} was asked for'
-    largest = _carried(directions)[-1] if model == 'auto' else model
+    largest = _carried(directions, noise)[-1] if model == 'auto' else model
     out = np.zeros(0, int)
+    unasked: tuple[str, ...] = ()
     if method == 'ml':
         out = disturbed(lambda rows: _fit_rows(poses_g.take(rows), largest, 'ml'), len(poses))
         kept = np.delete(kept, out)
-        refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions[kept])
+        refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions[kept],
+                        noise[kept])
     if model == 'auto':
-        carried = _carried(directions[kept])
+        carried = _carried(directions[kept], noise[kept])
+        unasked = unseen(carried[-1], directions[kept], noise[kept])
         choice = choose({name: _fit_rows(poses_g.take(kept), name, method) for name in carried})
         model, reason = choice.name, choice.reason
     fit = _fit_rows(poses_g.take(kept), model, method)
     rejected = _rejections(poses_g, fit, out)
     quality = quality_of(fit, poses_g.take(kept), units, directions[kept])
-    warnings = _warnings(fit, dilution(model, directions[kept]))
+    warnings = _warnings(fit, dilution(model, directions[kept], noise[kept])) + unasked
     return Calibration(model, method, fit.model, units, sensor, 'ros', date, fit.covariance,
                        quality, poses, rejected, reason, warnings)
 
 
-def _carried(directions: Floats) -> list[str]:
+def _carried(directions: Floats, noise: Floats) -> list[str]:
     """Name the models that the poses carry with at least one to spare, the smallest always."""
-    def carries(name: str) -> bool:
-        if len(directions) <= free_parameters(name):
-            return False
-        try:
-            refuse_if_unfit(name, directions)
-        except RefusedFitError:
-            return False
-        return True
-
-    return [NORM_MODELS[0], *(name for name in NORM_MODELS[1:] if carries(name))]
+    return [NORM_MODELS[0], *(name for name in NORM_MODELS[1:]
+                              if len(directions) > free_parameters(name)
+                              and carries(name, directions, noise))]
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
@@ -214,11 +219,12 @@ def _fit_known(poses: Poses, units: Units, method: Method, sensor: str, date: st
     if units.name == 'native':
         mat_x = closed_form.fit_12(poses.reading, poses['reference'])[0]
         units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
+    directions = poses['reference'] / np.linalg.norm(poses['reference'], axis=1, keepdims=True)
+    refuse_if_unfit('12', directions)
     poses_g = in_g(poses, units)
     noise = poses_g.noise if method == 'ml' else None
     fit = fit_reference(MODELS['12'], poses_g.reading, poses_g['reference'], poses_g.columns,
                         noise)
-    directions = poses['reference'] / np.linalg.norm(poses['reference'], axis=1, keepdims=True)
     quality = quality_of(fit, poses_g, units, directions)
     return Calibration('12', method, fit.model, units, sensor, 'ros', date, fit.covariance,
                        quality, poses, (), reason, _warnings(fit, 0.0))

@@ -11,38 +11,45 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-
 """
-What the directions of the poses determine, and which pose would help most.
+What the directions of the poses determine: how well, and what they leave open.
 
-A pose of unknown orientation with force u sees the values of a model through the row
-φ(u) = û · basis(u) (see `accel_calib.calibrate.likelihood`, with A near I). For n poses of equal
-noise s the corrected |force| in a direction d is then uncertain by
+A pose with force u sees the values of a model through the rows Φ(u): of unknown orientation the
+one row û · basis(u) (see `accel_calib.calibrate.likelihood`, with A near I), of known orientation
+the three rows basis(u). With s_i the noise of a pose over that of the median pose, the poses have
+the information
 
-    s √(φ(d)ᵀ (ΦᵀΦ)⁻¹ φ(d))
+    M = Σ Φ_iᵀ Φ_i / s_i²
 
-and the largest such root over the sphere, the dilution, says how far the poses are stretched:
-about 1 for 12 poses spread evenly. The pose that adds most to det(ΦᵀΦ) (D-optimal design, Fedorov
-1972) is the one in the direction where that root is largest.
+and the corrected |force| (of known orientation: the force) in a direction d is uncertain by
+
+    √(Φ(d) M⁻¹ Φ(d)ᵀ)
+
+times the noise of a pose. The largest such root over the sphere, the dilution, says how far the
+poses are stretched: about 1 for 12 poses spread evenly. From the singular values of the rows come
+the combinations of parameters in the order in which the poses determine them; those that would
+push the dilution beyond a limit are left open.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
+from functools import lru_cache
 
 import numpy as np
 
+from .likelihood import believable
 from ..effects import EFFECTS
-from ..errors import RefusedFitError
-from ..model import MODELS
+from ..model import MODELS, parameter_names
 from ..sphere import spread_directions
 from ..table import Floats
 
-LARGEST_DILUTION = 40.0
-"""Beyond this a fit is refused: 12 poses in a 45° cone have 400, the worst 5 % of 12 poses in
-random directions 13."""
+LARGEST_DILUTION = 25.0
+"""Beyond this a fit is refused. 12 poses in a 45° cone have 400, in five directions and 2° about
+them 100, the worst 1 % of 12 poses in random directions 24. At 0.3 mg a pose it is an error of
+7 mg, no better than that of leaving a cross-axis gain of 1 % out."""
 
 WEAK_DILUTION = 10.0
 """Beyond this a fit warns: somewhere the error of |force| is ten times that of a pose."""
@@ -52,50 +59,198 @@ NORM_MODELS = ('4', '7', '10')
 
 _NEAR = np.cos(np.radians(45.0))
 _SAME = np.cos(np.radians(5.0))
-_SINGULAR = 1e-7
-_SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
+_SINGULAR, _SMALL = 1e-7, 1e-3
+_OPEN_PART = 0.1
+"""Part of a parameter in what is left open from which it is not determined."""
+
+_SAID_PART = 0.3
+"""Part of the largest weight in a combination that is told in words."""
 
 
 @dataclass(frozen=True)
-class NextPose:
+class Combination:
     """
-    The pose that would help the fit most.
+    A combination of parameters that poses leave open.
 
     Parameters
     ----------
-    direction : (3,) array
-        What is to point up, a unit vector in the axes of the sensor.
-    words : str
-        The same for a person.
+    weights : mapping of str to float
+        By name of the parameter, the largest first; their squares add up to 1.
+    deviation : float
+        Its standard deviation over the noise of a pose; infinite where nothing tells it.
 
     """
 
-    direction: Floats
-    words: str
+    weights: Mapping[str, float]
+    deviation: float
+
+    @property
+    def words(self) -> str:
+        """Say it for a person, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
+        least = _SAID_PART * max(map(abs, self.weights.values()))
+        said = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
+        if len(said) == 1:
+            return said[0][0]
+        first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
+                          for name, weight in said)
+        return ' '.join([first.removeprefix('+ '), *others])
 
 
-def _rows(name: str, directions: Floats) -> Floats:
-    """Give φ for each direction, (n, p), in the effects of a model that the norm can carry."""
-    effects = MODELS['10' if name == '9' else name]
-    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0)) for effect in effects]
-    return np.einsum('ni,nip->np', directions, np.concatenate(parts, axis=2))
+@dataclass(frozen=True)
+class Identifiability:
+    """
+    What poses determine of a model.
+
+    Parameters
+    ----------
+    model : str
+        The model.
+    deviations : mapping of str to float
+        Of each parameter, standard deviation over the noise of a pose; infinite where nothing
+        tells it.
+    undetermined : tuple of Combination
+        What the poses leave open, so that without it they would carry the model.
+    dilution, mean_dilution : float
+        Error of |force| over that of a pose: the largest and the RMS over the sphere.
+
+    """
+
+    model: str
+    deviations: Mapping[str, float]
+    undetermined: tuple[Combination, ...]
+    dilution: float
+    mean_dilution: float
+
+    @property
+    def open_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the poses do not determine."""
+        part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in self.undetermined)
+                for name in self.deviations}
+        return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
+
+
+def parameters_of(name: str) -> tuple[str, ...]:
+    """Name the parameters of a model; 9 is 10 in other axes."""
+    return parameter_names(MODELS['10' if name == '9' else name])
+
+
+def rows_of(name: str, directions: Floats) -> Floats:
+    """Give Φ for each of these (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
+    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0))
+             for effect in MODELS['10' if name == '9' else name]]
+    basis = np.concatenate(parts, axis=2)
+    return basis if name == '12' else np.einsum('ni,nip->np', directions, basis)[:, np.newaxis]
+
+
+def noise_along(noise: Floats | None, directions: Floats) -> Floats:
+    """Give the (n,) noise of |reading| from that of (n, 3) pose means; ones if it is unknown."""
+    believed = None if noise is None or not len(noise) else believable(noise)
+    if believed is None:
+        return np.ones(len(directions))
+    along: Floats = np.linalg.norm(directions * believed, axis=1)
+    return along
+
+
+def relative_weights(noise: Floats | None, count: int) -> Floats:
+    """Give 1 / s², (count,), from the noise of each pose in any unit; ones where it is unknown."""
+    if noise is None or count == 0:
+        return np.ones(count)
+    weights: Floats = (np.median(noise) / noise) ** 2
+    return weights
+
+
+@lru_cache(maxsize=8)
+def over_the_sphere(name: str) -> Floats:
+    """Give Φ of directions spread evenly over the sphere, (m, 1 or 3, p)."""
+    return rows_of(name, spread_directions(300))
+
+
+def information_of(name: str, directions: Floats, weights: Floats) -> Floats:
+    """Give M, (p, p)."""
+    rows = rows_of(name, directions)
+    information: Floats = np.einsum('n,nip,niq->pq', weights, rows, rows)
+    return information
 
 
 def free_parameters(name: str) -> int:
     """Count the free parameters of a model: 4, 6 (g is known), 9, 9 or 12."""
-    return {'4': 4, '7': 6, '9': 9, '10': 9, '12': 12}[name]
+    return len(parameters_of(name))
 
 
-def dilution(name: str, directions: Floats) -> float:
+def poses_needed(name: str) -> int:
+    """Give the fewest poses that can determine a model."""
+    return 4 if name == '12' else free_parameters(name)
+
+
+def _spectrum(name: str, directions: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Give the p singular values of the weighted rows, descending, and their (p, p) rows."""
+    rows = rows_of(name, directions) * np.sqrt(weights)[:, np.newaxis, np.newaxis]
+    triangle = np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode='r')
+    square = np.zeros((rows.shape[2], rows.shape[2]))
+    square[:len(triangle)] = triangle
+    _, scales, axes = np.linalg.svd(square)
+    return np.where(scales > _SINGULAR * max(scales[0], 1.0), scales, 0.0), axes
+
+
+def identifiability(name: str, directions: Floats, noise: Floats | None = None
+                    ) -> Identifiability:
     """
-    Say how far the poses are stretched by a model.
+    Work out what poses determine.
 
     Parameters
     ----------
-    name : {'4', '7', '9', '10'}
+    name : {'4', '7', '9', '10', '12'}
         The model.
     directions : (n, 3) array
-        Unit vectors of force in the axes of the sensor.
+        Unit vectors of force in the axes of the sensor; n may be 0.
+    noise : (n,) array, optional
+        Noise of each pose, in any unit; equal where it is not given.
+
+    Returns
+    -------
+    Identifiability
+        From the directions alone, before any fit.
+
+    """
+    scales, axes = _spectrum(name, directions, relative_weights(noise, len(directions)))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        spread = (over_the_sphere(name) @ axes.T / scales) ** 2
+        parts = (axes.T / scales) ** 2
+    errors = np.cumsum(np.nan_to_num(np.sum(spread, axis=1), nan=0.0, posinf=np.inf), axis=1)
+    deviations = np.sqrt(np.sum(np.where(np.abs(axes.T) < _SINGULAR, 0.0, parts), axis=1))
+    worst = np.where(scales > 0.0, np.sqrt(np.max(errors, axis=0)), np.inf)
+    mean = float(np.sqrt(np.mean(errors[:, -1]))) if scales[-1] > 0.0 else np.inf
+    names = parameters_of(name)
+    open_ = _combinations(names, axes[worst > LARGEST_DILUTION], scales[worst > LARGEST_DILUTION])
+    return Identifiability(name, dict(zip(names, map(float, deviations), strict=True)), open_,
+                           float(worst[-1]), mean)
+
+
+def _combinations(names: tuple[str, ...], axes: Floats, scales: Floats
+                  ) -> tuple[Combination, ...]:
+    """Say by few parameters each what the space of these (k, p) combinations is."""
+    from scipy.linalg import qr
+
+    if not len(axes):
+        return ()
+    pivots = qr(axes, mode='r', pivoting=True)[1][:len(axes)]
+    mixed = np.linalg.inv(axes[:, pivots])  # each combination has one pivot of its own
+    mixed = mixed / np.linalg.norm(mixed @ axes, axis=1, keepdims=True)
+    weights = mixed @ axes
+    with np.errstate(divide='ignore', invalid='ignore'):
+        shares = np.where(np.abs(mixed) < _SINGULAR, 0.0, np.abs(mixed) / scales)
+    found = []
+    for row, deviation in zip(weights, np.linalg.norm(shares, axis=1), strict=True):
+        order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
+        sign = np.sign(row[order[0]])
+        found.append(Combination({names[k]: float(sign * row[k]) for k in order},
+                                 float(deviation)))
+    return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
+
+
+def dilution(name: str, directions: Floats, noise: Floats | None = None) -> float:
+    """
+    Say how far the poses are stretched by a model; arguments as `identifiability`.
 
     Returns
     -------
@@ -104,12 +259,7 @@ def dilution(name: str, directions: Floats) -> float:
         leave a parameter open.
 
     """
-    left, scales, right = np.linalg.svd(_rows(name, directions), full_matrices=False)
-    del left
-    if len(scales) < free_parameters(name) or scales[-1] < _SINGULAR * scales[0]:
-        return np.inf
-    spread = _rows(name, spread_directions(300)) @ (right.T / scales)
-    return float(np.sqrt(np.max(np.sum(spread ** 2, axis=1))))
+    return identifiability(name, directions, noise).dilution
 
 
 def coverage(directions: Floats) -> float:
@@ -125,88 +275,3 @@ def distinct(directions: Floats) -> int:
         if all(direction @ other < _SAME for other in kept):
             kept.append(direction)
     return len(kept)
-
-
-def next_pose(directions: Floats, name: str = '10') -> NextPose:
-    """
-    Find the pose that would help the fit most.
-
-    Parameters
-    ----------
-    directions : (n, 3) array
-        Unit vectors of force so far, in the axes of the sensor; n may be 0.
-    name : {'4', '7', '9', '10'}
-        The model that is to be fitted.
-
-    Returns
-    -------
-    NextPose
-        One of the 6 faces, 12 edges and 8 corners of the sensor.
-
-    """
-    signs = np.array([s for s in product((0, 1, -1), repeat=3) if any(s)], float)
-    signs = signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')]  # faces first
-    candidates = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    phi, so_far = _rows(name, candidates), _rows(name, directions)
-    information = so_far.T @ so_far + 1e-3 * np.eye(phi.shape[1])
-    gain = np.einsum('np,np->n', phi, np.linalg.solve(information, phi.T).T)
-    best = int(np.argmax(np.round(gain, 6)))
-    return NextPose(candidates[best], _words(signs[best]))
-
-
-def _words(signs: Floats) -> str:
-    """Say for a person which face, edge or corner is to point up."""
-    sides = [pair[0 if sign > 0 else 1] for pair, sign in zip(_SIDES, signs, strict=True) if sign]
-    axes = ''.join(f' {"+" if sign > 0 else "-"}{axis}'
-                   for axis, sign in zip('xyz', signs, strict=True) if sign)
-    what = {1: 'the {} side', 2: 'the edge between {} and {}',
-            3: 'the corner of {}, {} and {}'}[len(sides)]
-    return f'turn the sensor so that {what.format(*sides)} points up ({axes.strip()})'
-
-
-def refuse_if_unfit(name: str, directions: Floats) -> None:
-    """
-    Make sure that the poses can carry a model.
-
-    Parameters
-    ----------
-    name : {'4', '7', '9', '10'}
-        The model.
-    directions : (n, 3) array
-        Unit vectors of force in the axes of the sensor.
-
-    Raises
-    ------
-    RefusedFitError
-        With what is wrong with the poses, the larger model that they do carry and the next pose.
-
-    """
-    needed = free_parameters(name)
-    if len(directions) >= needed and dilution(name, directions) <= LARGEST_DILUTION:
-        return
-    smaller = [other for other in NORM_MODELS if free_parameters(other) < needed
-               and len(directions) >= free_parameters(other)
-               and dilution(other, directions) <= LARGEST_DILUTION]
-    offer = f', or use model {smaller[-1]}, which these poses carry' if smaller else ''
-    raise RefusedFitError(f'{_shape(directions, needed)}, model {name} needs at least {needed} '
-                          'poses spread over the sphere',
-                          f'{next_pose(directions, name).words}, hold it still and go on{offer}')
-
-
-def _shape(directions: Floats, needed: int) -> str:
-    """Say in words what is wrong with these directions."""
-    count = len(directions)
-    if count < 2:
-        return f'{count} pose{"" if count else "s"}'
-    mean = directions.mean(axis=0)
-    unit = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    cone = np.degrees(np.arccos(np.clip(np.min(directions @ unit), -1.0, 1.0)))
-    if distinct(directions) == 1:
-        return f'the {count} poses all have the same orientation'
-    if count < needed:
-        return f'{count} poses'
-    if cone < 75.0:
-        return f'the {count} poses lie within {cone:.0f}° of one direction'
-    if np.linalg.svd(directions - mean, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
-        return f'the {count} poses lie in a plane'
-    return f'the {count} poses point in {distinct(directions)} directions that leave a gap'

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..calibrate import directions_of, fit_poses, level, next_pose
+from ..calibrate.geometry import noise_along
 from ..calibrate.mounting import flat_direction
 from ..errors import RefusedFitError
 from ..refine import refine
@@ -145,8 +146,11 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 
 
 def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
-    """Give the pose that would help most next."""
-    return next_pose(poses_up(poses, units), '10' if model == 'auto' else model)
+    """Give the pose that would help most next, or that none does."""
+    up = poses_up(poses, units)
+    known = poses.noise is not None and units.name != 'native' and len(up) > 0
+    noise = units.to_g(noise_along(poses.noise, up)) if known else None
+    return next_pose(up, '10' if model == 'auto' else model, noise)
 
 
 def warm_up() -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import Point
+import numpy as np
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -33,6 +34,7 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 
@@ -45,7 +47,7 @@ def pose_markers(directions: Floats, asked: NextPose | None, frame_id: str) -> M
     directions : (n, 3) array
         Unit vectors that point up, in the axes of the sensor.
     asked : NextPose or None
-        The next pose to turn to.
+        The next pose to turn to, or the word that more poses no longer pay.
     frame_id : str
         Frame of the sensor.
 
@@ -60,7 +62,9 @@ def pose_markers(directions: Floats, asked: NextPose | None, frame_id: str) -> M
     for k, direction in enumerate(directions):
         markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
         markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
-    if asked is not None:
+    if asked is not None and asked.direction is None:
+        markers.append(_text('next', 1, asked.words, _ABOVE))
+    elif asked is not None and asked.direction is not None:
         arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
         arrow.points = [Point(), _point(asked.direction)]
         markers += [arrow, _text('next', 1, asked.words, asked.direction * _WORDS_AT)]

@@ -1,0 +1,150 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+When the poses cannot carry a model: what is wrong, what is left open, and the way out.
+
+The way out is the poses to add, and the larger one of the smaller models that the poses do carry.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .geometry import (
+    Combination,
+    dilution,
+    distinct,
+    identifiability,
+    LARGEST_DILUTION,
+    NORM_MODELS,
+    poses_needed,
+)
+from .next_pose import missing_poses
+from ..errors import RefusedFitError
+from ..table import Floats
+
+_SAID = 3
+"""Combinations left open that are told one by one."""
+
+
+def carries(name: str, directions: Floats, noise: Floats | None = None) -> bool:
+    """Tell whether poses carry a model; arguments as `refuse_if_unfit`."""
+    return (len(directions) >= poses_needed(name)
+            and dilution(name, directions, noise) <= LARGEST_DILUTION)
+
+
+def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) -> None:
+    """
+    Make sure that the poses can carry a model.
+
+    Parameters
+    ----------
+    name : {'4', '7', '9', '10', '12'}
+        The model.
+    directions : (n, 3) array
+        Unit vectors of force in the axes of the sensor.
+    noise : (n,) array, optional
+        Noise of each pose, in any unit; equal where it is not given.
+
+    Raises
+    ------
+    RefusedFitError
+        With what is wrong with the poses, what they leave open, the poses to add and the larger
+        one of the smaller models that they do carry.
+
+    """
+    if carries(name, directions, noise):
+        return
+    smaller = [other for other in NORM_MODELS if poses_needed(other) < poses_needed(name)
+               and carries(other, directions, noise)]
+    offer = f', or use model {smaller[-1]}, which these poses carry' if smaller else ''
+    few = len(directions) < poses_needed(NORM_MODELS[0])
+    open_ = () if few else identifiability(name, directions, noise).undetermined
+    raise RefusedFitError(
+        f'{_shape(name, directions)}, model {name} needs at least {poses_needed(name)} '
+        f'poses spread over the sphere{f"; left open: {words_of(open_)}" if open_ else ""}',
+        f'{_add(missing_poses(name, directions, noise))}, hold it still and go on{offer}')
+
+
+def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tuple[str, ...]:
+    """
+    Say what the largest model would show that the poses do not let be seen.
+
+    Parameters
+    ----------
+    chosen : str
+        The largest model that was looked at.
+    directions, noise
+        As `refuse_if_unfit`.
+
+    Returns
+    -------
+    tuple of str
+        A warning, or none where the largest model is carried.
+
+    """
+    largest = NORM_MODELS[-1]
+    if chosen not in NORM_MODELS[:-1]:
+        return ()
+    open_ = identifiability(largest, directions, noise).undetermined
+    missing = missing_poses(largest, directions, noise)
+    if not open_ or not missing:
+        return (f'with {len(directions)} poses nothing would be left to check model {largest} '
+                f'with, so that model {chosen} was the largest to choose; take more poses',)
+    return (f'the poses do not determine {words_of(open_)}, so that model {chosen} was the '
+            f'largest to choose; to see them, {_add(missing)}',)
+
+
+def words_of(open_: Sequence[Combination]) -> str:
+    """Say what is left open."""
+    words = [each.words for each in open_[:_SAID]]
+    if len(open_) > _SAID:
+        words.append(f'{len(open_) - _SAID} more')
+    return _and(words)
+
+
+def _add(missing: Sequence[str]) -> str:
+    """Say which way to turn the sensor."""
+    if len(missing) <= 1:
+        return f'turn the sensor so that {"".join(missing) or "another side"} points up'
+    return f'turn the sensor so that one after another {_and(missing)} point up'
+
+
+def _and(words: Sequence[str]) -> str:
+    """Join words."""
+    return ' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))
+
+
+def _shape(name: str, directions: Floats) -> str:
+    """Say in words what is wrong with these directions."""
+    count = len(directions)
+    if count < 2:
+        return f'{count} pose{"" if count else "s"}'
+    mean = directions.mean(axis=0)
+    unit = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    cone = np.degrees(np.arccos(np.clip(np.min(directions @ unit), -1.0, 1.0)))
+    if distinct(directions) == 1:
+        return f'the {count} poses all have the same orientation'
+    if count < poses_needed(name):
+        return f'{count} poses'
+    if carries(name, directions):
+        return f'some of the {count} poses are noisy, and without them'
+    if cone < 75.0:
+        return f'the {count} poses lie within {cone:.0f}° of one direction'
+    if np.linalg.svd(directions - mean, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
+        return f'the {count} poses lie in a plane'
+    return f'the {count} poses point in {distinct(directions)} directions that leave a gap'

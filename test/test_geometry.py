@@ -1,0 +1,292 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the poses determine, what they leave open, and which pose comes next."""
+
+import re
+
+from accel_calib.calibrate import fit_poses, identifiability, next_pose
+from accel_calib.calibrate.geometry import dilution, rows_of
+from accel_calib.calibrate.next_pose import missing_poses
+from accel_calib.calibrate.refusal import carries, refuse_if_unfit
+from accel_calib.errors import RefusedFitError
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.units import Units, units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+G = units_of('g')
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+TURN = 2.0 * np.pi * np.arange(12) / 12.0
+RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
+CROSS = ('cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz')
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def about(directions, count, degrees, rng):
+    """Repeat directions up to a count, each a little off."""
+    chosen = directions[np.arange(count) % len(directions)]
+    return unit(chosen + rng.normal(size=chosen.shape) * np.radians(degrees))
+
+
+def cone(degrees, rng, count=12):
+    z = rng.uniform(np.cos(np.radians(degrees)), 1.0, count)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    radius = np.sqrt(1.0 - z ** 2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+def named(text):
+    """Give the direction that words such as ``(+x -z)`` name."""
+    signs = dict.fromkeys('xyz', 0.0)
+    for sign, axis in re.findall(r'([+-])([xyz])', re.findall(r'\(([^)]*)\)', text)[-1]):
+        signs[axis] = float(f'{sign}1')
+    return unit(np.array(list(signs.values())))
+
+
+def all_named(text):
+    return np.array([named(part) for part in re.findall(r'\([+-xyz ]*\)', text)]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize('model', ['10', '9'])
+def test_faces_alone_leave_the_cross_axis_gains_open_and_nothing_else(model):
+    found = identifiability(model, np.repeat(FACES, 2, axis=0))
+    assert found.open_parameters == CROSS
+    assert tuple(each.words for each in found.undetermined) == CROSS
+    assert all(np.isinf(found.deviations[name]) for name in CROSS)
+    assert all(each < 1.0 for name, each in found.deviations.items() if name not in CROSS)
+    assert np.isinf(found.dilution)
+    assert np.isinf(found.mean_dilution)
+
+
+@pytest.mark.parametrize('model', ['4', '7'])
+def test_faces_alone_determine_the_smaller_models(model):
+    found = identifiability(model, FACES)
+    assert found.undetermined == found.open_parameters == ()
+    assert found.dilution <= 1.01
+
+
+def test_poses_in_a_plane_leave_open_what_lies_across_it():
+    assert identifiability('4', RING).open_parameters == ('offset.z',)
+    assert identifiability('10', RING).open_parameters == (
+        'offset.z', 'axis_gain.z', 'cross_axis.xz', 'cross_axis.yz')
+
+
+@pytest.mark.parametrize('model', ['4', '7', '10', '12'])
+def test_what_is_left_open_is_not_seen_by_any_pose(model):
+    directions = RING @ rotation_from_rpy(0.5, 0.4, 0.3).T
+    found = identifiability(model, directions)
+    names = list(found.deviations)
+    rows = rows_of(model, directions).reshape(-1, len(names))
+    assert len(found.undetermined) == len(names) - np.linalg.matrix_rank(rows)
+    for each in found.undetermined:
+        vector = np.array([each.weights.get(name, 0.0) for name in names])
+        assert np.linalg.norm(vector) == pytest.approx(1.0, abs=1e-2)
+        np.testing.assert_allclose(rows @ vector, 0.0, atol=5e-3)
+
+
+def test_weak_combination_is_told_with_its_weights():
+    found = identifiability('7', cone(45.0, np.random.default_rng(1)))
+    (open_,) = found.undetermined
+    assert {'axis_gain.x', 'axis_gain.y'} < set(open_.weights) <= set(found.deviations)
+    assert list(open_.weights)[:2] in (['offset.z', 'axis_gain.z'], ['axis_gain.z', 'offset.z'])
+    assert open_.weights['offset.z'] * open_.weights['axis_gain.z'] < -0.3
+    assert re.fullmatch(r'0\.\d\d \w+\.z - 0\.\d\d \w+\.z( [+-] 0\.\d\d axis_gain\.[xy])*',
+                        open_.words)
+    assert 50.0 < open_.deviation < 2.0 * found.dilution
+
+
+@pytest.mark.parametrize(('model', 'noisy'), [('10', 1.0), ('7', 3.0), ('12', 3.0)])
+def test_deviations_and_dilution_are_those_of_the_covariance(model, noisy):
+    directions = random_directions(20, np.random.default_rng(2))
+    noise = np.where(np.arange(20) < 5, noisy, 1.0)
+    rows = rows_of(model, directions)
+    weighted = (rows / noise[:, np.newaxis, np.newaxis]).reshape(-1, rows.shape[2])
+    covariance = np.linalg.inv(weighted.T @ weighted)
+    found = identifiability(model, directions, noise * 7.0)
+    np.testing.assert_allclose(list(found.deviations.values()), np.sqrt(np.diag(covariance)))
+    sphere = rows_of(model, spread_directions(3000))
+    errors = np.einsum('nip,pq,niq->n', sphere, covariance, sphere)
+    assert found.dilution == pytest.approx(np.sqrt(np.max(errors)), rel=0.02)
+    assert found.mean_dilution == pytest.approx(np.sqrt(np.mean(errors)), rel=0.01)
+
+
+def test_expected_error_is_that_of_fits():
+    rng = np.random.default_rng(3)
+    directions = random_directions(15, rng)
+    model, errors = sensor(rng), []
+    fresh = simulate_poses(model, random_directions(300, rng), rng, noise_g=1e-9).reading
+    for _ in range(60):
+        fit = fit_poses(simulate_poses(model, directions, rng), G, model='10')
+        errors.append(np.linalg.norm(fit.correct(fresh), axis=1) - 1.0)
+    expected = identifiability('10', directions).mean_dilution * 0.0003
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(('draw', 'least', 'most'), [
+    (lambda rng: about(random_directions(5, rng), 12, 1.0, rng), 0.98, 1.0),
+    (lambda rng: about(random_directions(5, rng), 12, 2.0, rng), 0.90, 1.0),
+    (lambda rng: cone(45.0, rng), 1.0, 1.0),
+    (lambda rng: about(RING, 12, 3.0, rng), 0.98, 1.0),
+    (lambda rng: random_directions(12, rng), 0.0, 0.03),
+    (lambda rng: about(spread_directions(12), 12, 10.0, rng), 0.0, 0.0),
+    (lambda rng: about(spread_directions(36), 36, 10.0, rng), 0.0, 0.0)],
+    ids=['five, 1°', 'five, 2°', 'cone', 'plane, 3°', 'random', 'spread', '36 spread'])
+def test_poses_are_refused_where_a_fit_would_be_wrong_and_only_there(draw, least, most):
+    refused = [not carries('10', draw(np.random.default_rng(seed))) for seed in range(100)]
+    assert least <= np.mean(refused) <= most
+
+
+@pytest.mark.parametrize('directions', [
+    np.repeat(FACES, 2, axis=0), FACES, FACES[:1], RING, RING @ rotation_from_rpy(1, 2, 3).T,
+    cone(45.0, np.random.default_rng(4)), np.repeat(spread_directions(5), 3, axis=0)])
+@pytest.mark.parametrize('model', ['4', '7', '10'])
+def test_poses_that_a_refusal_asks_for_make_the_fit_possible(model, directions):
+    if carries(model, directions):
+        assert refuse_if_unfit(model, directions) is None
+        return
+    with pytest.raises(RefusedFitError) as refusal:
+        refuse_if_unfit(model, directions)
+    asked = all_named(refusal.value.advice)
+    assert len(asked) == len(missing_poses(model, directions))
+    assert dilution(model, np.vstack([directions, asked])) <= 10.0
+    assert not carries(model, np.vstack([directions, asked[:-1]])) or dilution(
+        model, np.vstack([directions, asked[:-1]])) > 10.0
+
+
+@pytest.mark.parametrize(('directions', 'model', 'open_', 'offer'), [
+    (np.repeat(FACES, 2, axis=0), '10', ', '.join(CROSS[:2]) + ' and ' + CROSS[2], 'model 7'),
+    (FACES, '9', 'cross_axis.xy, ', 'model 7'),
+    (RING, '4', 'offset.z', ''),
+    (RING, '12', 'axis_gain.z, 0.71 ', '')])
+def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, open_, offer):
+    rng = np.random.default_rng(5)
+    known = {'reference': directions} if model == '12' else {}
+    poses = simulate_poses(sensor(rng), directions, rng, context=known)
+    with pytest.raises(RefusedFitError, match=f'left open: {re.escape(open_)}') as refusal:
+        fit_poses(poses, G, model=model)
+    assert refusal.value.advice.endswith(
+        f'or use {offer}, which these poses carry' if offer else 'hold it still and go on')
+
+
+def test_known_faces_carry_model_12():
+    rng = np.random.default_rng(6)
+    poses = simulate_poses(sensor(rng), FACES, rng)
+    assert fit_poses(poses, G, model='12').name == '12'
+
+
+def test_noisy_poses_do_not_carry_a_model():
+    directions = spread_directions(12)
+    noise = np.where(np.arange(12) < 5, 300.0, 1.0)
+    refuse_if_unfit('7', directions, noise)
+    with pytest.raises(RefusedFitError, match='some of the 12 poses are noisy') as refusal:
+        refuse_if_unfit('10', directions, noise)
+    assert 'or use model 7' in refusal.value.advice
+
+
+def test_auto_says_what_the_poses_did_not_let_it_see():
+    rng = np.random.default_rng(7)
+    poses = simulate_poses(sensor(rng, 'offset', 'axis_gain'), np.repeat(FACES, 3, axis=0), rng)
+    (told,) = [text for text in fit_poses(poses, G).warnings if 'do not determine' in text]
+    assert ', '.join(CROSS[:2]) + ' and ' + CROSS[2] in told
+    assert carries('10', np.vstack([FACES, all_named(told)]))
+    free = fit_poses(simulate_poses(sensor(rng), spread_directions(18), rng), G)
+    assert not any('do not determine' in text for text in free.warnings)
+
+
+def test_next_pose_is_told_in_words_and_as_a_direction():
+    for count in range(12):
+        asked = next_pose(spread_directions(20)[:count])
+        assert asked.words.startswith('turn the sensor so that the ')
+        np.testing.assert_allclose(asked.direction, named(asked.words))
+    asked = next_pose(np.delete(FACES, 1, axis=0), '7')
+    assert asked.words == 'turn the sensor so that the left side points up (+y)'
+
+
+@pytest.mark.parametrize('count', [1, 5, 40])
+def test_the_same_attitude_is_never_asked_for_again(count):
+    for face in FACES:
+        tilted = about(face[np.newaxis], count, 2.0, np.random.default_rng(count))
+        asked = next_pose(tilted)
+        assert np.max(tilted @ asked.direction) < np.cos(np.radians(30.0))
+
+
+def follow(count, model='10', noise=None):
+    """Turn as asked, up to so many poses."""
+    directions = np.zeros((0, 3))
+    while len(directions) < count:
+        asked = next_pose(directions, model, None if noise is None else noise[:len(directions)])
+        if asked.direction is None:
+            break
+        directions = np.vstack([directions, asked.direction])
+    return directions
+
+
+@pytest.mark.parametrize('model', ['4', '7', '9', '10'])
+def test_following_ends_when_a_pose_more_no_longer_pays(model):
+    directions = follow(40, model)
+    assert 12 < len(directions) < 22
+    found = identifiability(model, directions)
+    assert found.dilution < 1.5
+    asked = next_pose(directions, model)
+    assert asked.words == (f'more poses no longer pay: {len(directions)} poses determine |a| to '
+                           f'{found.mean_dilution:.2g} times the noise of a pose')
+    assert asked.error == pytest.approx(found.mean_dilution)
+
+
+def test_how_well_the_poses_determine_is_told_in_mg():
+    directions = follow(40)
+    expected = identifiability('10', directions).mean_dilution * 0.4
+    words = next_pose(directions, '10', np.full(len(directions), 0.0004)).words
+    assert words.endswith(f'determine |a| to {expected:.2g} mg')
+
+
+def test_poses_without_a_spread_never_seem_enough():
+    rng = np.random.default_rng(8)
+    for directions in (cone(30.0, rng, 200), about(FACES, 200, 0.3, rng), np.repeat(RING, 9, 0)):
+        assert next_pose(directions).direction is not None
+
+
+def test_following_reaches_the_aim_with_far_fewer_poses_than_random_order():
+    assert identifiability('10', follow(12)).mean_dilution < 0.95
+    at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
+                 .mean_dilution for seed in range(50)]
+    assert np.median(at_random) > 1.4
+
+
+def test_a_noisy_pose_does_not_stand_for_its_direction():
+    directions = spread_directions(14)
+    noise = np.where(directions[:, 2] > 0.6, 30.0, 1.0)
+    assert next_pose(directions, noise=noise).direction[2] > 0.5
+
+
+def test_model_12_asks_for_the_six_faces():
+    directions = follow(40, '12')
+    assert sorted(map(tuple, directions)) == sorted(map(tuple, FACES))
+
+
+def test_next_pose_in_counts_is_that_in_g():
+    rng = np.random.default_rng(9)
+    poses = simulate_poses(sensor(rng), random_directions(8, rng), rng)
+    counts = Units('native', 4000.0)
+    native = poses.with_columns(reading=counts.from_g(poses.reading) + 9000.0)
+    with pytest.raises(RefusedFitError) as in_g:
+        fit_poses(poses, G, model='10')
+    with pytest.raises(RefusedFitError) as in_counts:
+        fit_poses(native.with_columns(std=poses['std'] * 4000.0), units_of('native'), model='10')
+    assert in_counts.value.advice == in_g.value.advice
