@@ -30,7 +30,8 @@ EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.
            '--effect', 'cross_axis=0.004,0.002,-0.003']
 FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_sd', 'covariance',
             'poses_used', 'poses_rejected', 'rms_before_mg', 'rms_after_mg', 'max_after_percent',
-            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings'}
+            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings',
+            'uncertainty_mg', 'identifiability', 'next_pose'}
 
 
 def run(*arguments):
@@ -65,6 +66,37 @@ def test_fit_finds_the_effects_that_were_simulated(poses, capsys):
     assert result['rms_after_mg'] < 0.5 < result['rms_before_mg']
     assert np.array(result['covariance']).shape == (9, 9)
     assert len(result['parameters']) == 9
+
+
+@pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
+def test_fit_tells_the_next_pose_until_more_no_longer_pay(model, tmp_path, capsys):
+    few, many = tmp_path / 'few.csv', tmp_path / 'many.csv'
+    run('simulate', '-o', few, '--poses', 12)
+    run('simulate', '-o', many, '--poses', 30)
+    capsys.readouterr()
+    asked = run_json(capsys, 'fit', few, '--model', model)[1]['next_pose']
+    assert asked['words'].startswith('turn the sensor so that the ')
+    assert np.linalg.norm(asked['direction']) == pytest.approx(1.0)
+    result = run_json(capsys, 'fit', many, '--model', model)[1]
+    assert result['next_pose'] is None
+    assert run('fit', many, '--model', model) == 0
+    assert (f'next pose: more poses no longer pay: 30 poses determine |a| to '
+            f'{result["uncertainty_mg"]:.2g} mg' in capsys.readouterr().out) or model == 'auto'
+
+
+def test_fit_tells_what_six_faces_do_not_determine(tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    rows = [f'{sign * 9.8 * (k == 0) + 0.2},{sign * 9.8 * (k == 1)},{sign * 9.8 * (k == 2)}'
+            for k in range(3) for sign in (1, -1, 1.001, -1.001)]
+    path.write_text('\n'.join(['ax,ay,az', *rows]) + '\n', encoding='utf-8')
+    status, result = run_json(capsys, 'fit', path)
+    told = result['identifiability']
+    assert (status, told['model'], told['dilution']) == (0, '10', None)
+    unseen = [name for name, each in told['parameters'].items() if not each['determined']]
+    assert unseen == ['cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz']
+    assert [each['words'] for each in told['undetermined']] == unseen
+    assert told['undetermined'][0]['weights']['cross_axis.xy'] == pytest.approx(1.0, abs=1e-3)
+    assert told['parameters']['offset.x']['dilution'] < 1.0
 
 
 @pytest.mark.parametrize(('model', 'keys'), [('9', {'shifts', 'scales', 'angles'}),

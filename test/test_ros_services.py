@@ -18,10 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+import re
 from typing import Any
 
 from accel_calib.files import read_calibration, read_poses
+from accel_calib.model import Model
+from accel_calib.ros.fitting import asked_for, then
+from accel_calib.ros.markers import pose_markers
+from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
+from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from sensor_msgs.msg import Imu
@@ -66,6 +72,20 @@ def test_fit_of_too_few_or_flat_poses_says_which_way_to_turn(bench: Any, reading
     assert not list(bench.home.glob('accel_calib/*.yaml'))
 
 
+def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
+    poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
+    asked = asked_for(poses, units_of('g'), 'auto')
+    assert re.fullmatch(r'more poses no longer pay: 24 poses determine \|a\| to 0\.18 mg; call '
+                        '~/fit', then(asked))
+    markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
+    assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
+    few = asked_for(poses.take(slice(0, 8)), units_of('g'), 'auto')
+    arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers
+                   if m.ns == 'next']
+    np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
+    assert then(few) == text.text == few.words
+
+
 def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     still = bench.listen(Bool, 'calibrator/still', latched=True)
@@ -76,7 +96,10 @@ def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) 
     assert count(markers) == 0
     answer = bench.call('capture_pose')
     assert answer.success, answer.message
+    assert re.match(r'1 poses: .*; turn the sensor so that the .* points up \([-+xyz ]+\)$',
+                    answer.message)
     bench.spin(lambda: count(markers) == 1)
+    assert markers[-1].markers[-1].text in answer.message
     bench.feed(poses[140:165])
     bench.spin(lambda: not still[-1].data)
     answer = bench.call('capture_pose')

@@ -19,6 +19,7 @@ from .fit import check_units, directions_of, fit_poses, METHODS, MODEL_NAMES
 from .geometry import coverage, Identifiability, identifiability
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
 from .next_pose import next_pose, NextPose
+from .outlook import Outlook, outlook
 from .quality import in_g, Verification, verify
 from .sensing_axes import sensing_axes, SensingAxes
 
@@ -30,6 +31,7 @@ __all__ = [
            'FrameName',
            'Identifiability',
            'NextPose',
+           'Outlook',
            'Quality',
            'Rejected',
            'SensingAxes',
@@ -44,6 +46,7 @@ __all__ = [
            'mounting',
            'mounting_with_heading',
            'next_pose',
+           'outlook',
            'sensing_axes',
            'verify',
 ]

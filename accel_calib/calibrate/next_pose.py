@@ -97,7 +97,8 @@ def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None) -> NextPose:
+def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
+              in_g: bool = True) -> NextPose:
     """
     Find the pose that would help the fit most.
 
@@ -108,7 +109,9 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None)
     name : {'4', '7', '9', '10', '12'}
         The model that is to be fitted; for 12 the six faces are asked for.
     noise : (n,) array, optional
-        Noise of each pose [g]; equal and unknown where it is not given.
+        Noise of each pose; equal and unknown where it is not given.
+    in_g : bool
+        Whether that noise is in g, and not of a unit of its own.
 
     Returns
     -------
@@ -118,14 +121,15 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None)
     """
     information = information_of(name, directions, relative_weights(noise, len(directions)))
     error = _error(name, information, len(directions))
+    noise_g = float(np.median(noise)) if noise is not None and in_g and len(noise) else None
     best = _best(name, directions, information)
     if best is None:
-        return NextPose(None, _enough(len(directions), error, noise), error)
+        return NextPose(None, _enough(len(directions), error, noise_g), error)
     signs = _attitudes()[best]
     up = _unit(signs[np.newaxis])
     after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
     if error * np.sqrt(poses_needed(name)) < WEAK_DILUTION and after > (1 - _LEAST_GAIN) * error:
-        return NextPose(None, _enough(len(directions), error, noise), error)
+        return NextPose(None, _enough(len(directions), error, noise_g), error)
     return NextPose(up[0], f'turn the sensor so that {words_of(signs)} points up '
                     f'({_axes(signs)})', error)
 
@@ -189,9 +193,9 @@ def _error(name: str, information: Floats, count: int) -> float:
     return float(np.sqrt(np.trace(np.linalg.solve(information, _mean_information(name)))))
 
 
-def _enough(count: int, error: float, noise: Floats | None) -> str:
+def _enough(count: int, error: float, noise_g: float | None) -> str:
     """Say that more poses no longer pay."""
-    certain = (f'{error * float(np.median(noise)) * MG:.2g} mg' if noise is not None
+    certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
                else f'{error:.2g} times the noise of a pose')
     return f'more poses no longer pay: {count} poses determine |a| to {certain}'
 

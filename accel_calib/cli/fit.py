@@ -25,7 +25,15 @@ from typing import Any
 
 from . import options
 from .results import fit_result, parameter_table, quality_table
-from ..calibrate import Calibration, fit_poses, FRAMES, level, METHODS, MODEL_NAMES
+from ..calibrate import (
+    Calibration,
+    fit_poses,
+    FRAMES,
+    level,
+    METHODS,
+    MODEL_NAMES,
+    outlook,
+)
 from ..errors import AccelCalibError, InputError
 from ..files import read_poses, write_calibration
 
@@ -79,7 +87,7 @@ def _run_one(args: argparse.Namespace) -> int:
         options.write_json(args.json, {'error': err.message, 'advice': err.advice})
         raise
     _store(calibration, args.output)
-    options.write_json(args.json, {'file': args.poses[0], **fit_result(calibration)})
+    options.write_json(args.json, {'file': args.poses[0], **fit_result(calibration, args.model)})
     _show(args, calibration)
     return 0
 
@@ -106,7 +114,7 @@ def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
         return {'file': path, 'error': f'{path}: {err.strerror}', 'advice': 'check its name'}
-    result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration)})
+    result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration, args.model)})
     return result
 
 
@@ -132,5 +140,7 @@ def _show(args: argparse.Namespace, calibration: Calibration) -> None:
         console.print(f'left out: row {rejected.row}, {rejected.reason}', markup=False)
     for warning in calibration.warnings:
         console.print(f'note: {warning}', markup=False)
+    asked = outlook(calibration, args.model).next_pose
+    console.print(f'next pose: {asked.words}', markup=False)
     if args.output is not None:
         console.print(f'stored in {args.output}', markup=False)

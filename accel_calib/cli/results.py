@@ -21,15 +21,15 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, sensing_axes
+from ..calibrate import Calibration, Outlook, outlook, sensing_axes
 from ..units import MG
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-def fit_result(calibration: Calibration) -> dict[str, Any]:
-    """Give the result of ``fit``, in the names of the documentation."""
+def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
+    """Give the result of ``fit`` of the model asked for, in the names of the documentation."""
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -40,7 +40,24 @@ def fit_result(calibration: Calibration) -> dict[str, Any]:
         'poses_used': len(calibration.poses) - len(calibration.rejected),
         'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
         **asdict(calibration.quality), 'reason': calibration.reason,
-        'warnings': calibration.warnings, **_own_names(calibration)}
+        'warnings': calibration.warnings, **_own_names(calibration),
+        **_outlook(outlook(calibration, asked))}
+
+
+def _outlook(found: Outlook) -> dict[str, Any]:
+    """Give what the poses determine, and the next one."""
+    told, asked = found.identifiability, found.next_pose
+    unseen = told.open_parameters
+    return {
+        'uncertainty_mg': found.uncertainty_mg,
+        'identifiability': {
+            'model': told.model, 'dilution': told.dilution, 'mean_dilution': told.mean_dilution,
+            'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
+                           for name, deviation in told.deviations.items()},
+            'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
+                             for open_ in told.undetermined]},
+        'next_pose': None if asked.direction is None else {
+            'direction': asked.direction, 'words': asked.words}}
 
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:

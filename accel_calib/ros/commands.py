@@ -28,7 +28,7 @@ from std_srvs.srv import SetBool
 
 from .answers import Answers
 from .context import context_of_rest
-from .fitting import fitted, refined, story, summary
+from .fitting import asked_for, fitted, refined, story, summary, then
 from .health import self_test_of
 from .pose_view import PoseView
 from ..calibrate import level
@@ -94,8 +94,10 @@ class Commands:
         if dwell is None:
             raise self._not_still()
         self.poses_changed()
-        return (f'{len(self._node.watch.book.poses())} poses: the sensor has been still for '
-                f'{dwell.end - dwell.start:.1f} s')
+        poses = self._node.watch.book.poses()
+        asked = asked_for(poses, self._node.units, self._node.settings.model)
+        return (f'{len(poses)} poses: the sensor has been still for '
+                f'{dwell.end - dwell.start:.1f} s; {then(asked)}')
 
     def _not_still(self) -> InputError:
         """Say why there is no rest."""

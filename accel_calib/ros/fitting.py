@@ -148,9 +148,15 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
     """Give the pose that would help most next, or that none does."""
     up = poses_up(poses, units)
-    known = poses.noise is not None and units.name != 'native' and len(up) > 0
-    noise = units.to_g(noise_along(poses.noise, up)) if known else None
-    return next_pose(up, '10' if model == 'auto' else model, noise)
+    known = poses.noise is not None and len(up) > 0
+    return next_pose(up, '10' if model == 'auto' else model,
+                     units.to_g(noise_along(poses.noise, up)) if known else None,
+                     in_g=units.name != 'native')
+
+
+def then(asked: NextPose) -> str:
+    """Say what to do next."""
+    return asked.words if asked.direction is not None else f'{asked.words}; call ~/fit'
 
 
 def warm_up() -> None:

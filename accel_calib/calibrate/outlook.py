@@ -1,0 +1,89 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the poses of a calibration determine, and which pose would better it most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .calibration import Calibration
+from .geometry import Identifiability, identifiability, noise_along
+from .next_pose import next_pose, NextPose
+from ..sphere import spread_directions
+from ..table import Floats
+from ..units import MG
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """
+    How a calibration could be better.
+
+    Parameters
+    ----------
+    identifiability : Identifiability
+        Of the model that was asked for; of the largest where the choice was free.
+    next_pose : NextPose
+        Planned for that model.
+    uncertainty_mg : float or None
+        Stated error of a corrected |force| (model 12: of the force), RMS over the sphere [mg];
+        None where the poses leave nothing to judge it by.
+
+    """
+
+    identifiability: Identifiability
+    next_pose: NextPose
+    uncertainty_mg: float | None
+
+
+def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
+    """
+    Look at the poses of a calibration again, as its result shows them.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the linear models, as `accel_calib.calibrate.fit_poses` gives it.
+    asked : {'auto', '4', '7', '9', '10', '12'}
+        The model that was asked for.
+
+    """
+    left_out = [rejected.row for rejected in calibration.rejected]
+    poses = calibration.poses.take(~np.isin(calibration.poses.row, left_out))
+    mat_w, vec_v = calibration.model.linear_part
+    force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
+    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
+    noise = noise_along(poses.noise, directions)
+    uncertainty = _uncertainty(calibration)
+    planned = asked if asked != 'auto' else '12' if calibration.name == '12' else '10'
+    fitted = identifiability(calibration.name, directions, noise).mean_dilution
+    known = None
+    if np.isfinite(uncertainty) and np.isfinite(fitted):
+        known = noise / np.median(noise) * (uncertainty / fitted)
+    return Outlook(identifiability(planned, directions, noise),
+                   next_pose(directions, planned, noise if known is None else known,
+                             in_g=known is not None),
+                   uncertainty * MG if np.isfinite(uncertainty) else None)
+
+
+def _uncertainty(calibration: Calibration) -> float:
+    """Give the stated error of a corrected force, RMS over the sphere [g]."""
+    up: Floats = spread_directions(300)
+    per_g = calibration.force_per_g
+    covariance = calibration.force_covariance(up * per_g) / per_g ** 2
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.name == '12'
+              else np.einsum('ni,nij,nj->n', up, covariance, up))
+    return float(np.sqrt(np.mean(errors)))
