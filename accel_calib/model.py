@@ -47,9 +47,12 @@ MODELS: dict[str, tuple[str, ...]] = {
 """Effects of each model. 9 and 10 differ in their axes alone: 9 fixes them to the sensing axes
 (ESGI'95 report), 10 makes W symmetric (AN5286)."""
 
-_LARGEST_ITERATIONS = 100
-_CONVERGED_G = 1e-13
-_LARGEST_FORCE_G = 1e6
+LARGEST_ITERATIONS = 100
+CONVERGED_G = 1e-13
+"""The iteration ends when u changes by less [g]."""
+
+LARGEST_FORCE_G = 1e6
+"""It has run away when u is larger [g]."""
 
 
 def _identity() -> Floats:
@@ -234,15 +237,20 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     if all(EFFECTS[name].linear for name in model.values):
         return u
     linear = u
-    for _ in range(_LARGEST_ITERATIONS):
+    for _ in range(LARGEST_ITERATIONS):
         before = u
-        if np.max(np.abs(u), initial=0.0) > _LARGEST_FORCE_G:
+        if np.max(np.abs(u), initial=0.0) > LARGEST_FORCE_G:
             break
         u = linear - model._added(u, context, linear=False) @ model._inverse_gain.T
-        if np.max(np.abs(u - before), initial=0.0) < _CONVERGED_G:
+        if np.max(np.abs(u - before), initial=0.0) < CONVERGED_G:
             return u
-    raise InputError('the effects of the model are too large to be undone at this reading',
-                     'calibrate again, with readings in the range in which the sensor is used')
+    raise too_large()
+
+
+def too_large() -> InputError:
+    """Make the error of a reading that belongs to no one force."""
+    return InputError('the effects of the model are too large to be undone at this reading',
+                      'calibrate again, with readings in the range in which the sensor is used')
 
 
 def correct(model: Model, reading: Floats, context: Context) -> Floats:

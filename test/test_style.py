@@ -33,7 +33,7 @@ LAYERS = (
     ('model',),
     ('calibrate', 'capture', 'simulate'),
     ('refine',),
-    ('imu',),
+    ('imu', 'plain', 'plain_effects'),
     ('files',),
     ('report',),
     ('ros',),

@@ -1,0 +1,106 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One reading in plain floats is corrected as many are in arrays, for every effect there is."""
+
+from dataclasses import replace
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.effects import EFFECTS
+from accel_calib.errors import InputError
+from accel_calib.model import Model
+from accel_calib.plain import plain_correct, plain_spread
+from accel_calib.plain_effects import plain_effect
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
+KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
+         'std': (0.01, 0.02, 0.03), 'approach': (0.0, 0.6, -0.8)}
+SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0}
+SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
+
+
+def calibration_with(*names, unit='m/s2', seed=1, levelled=True):
+    """Give a calibration of a linear fit and these effects, with a covariance for all."""
+    rng = np.random.default_rng(seed)
+    units = units_of(unit)
+    poses = simulate_poses(sensor(rng), spread_directions(20), rng)
+    poses = poses.with_columns(reading=units.from_g(poses.reading),
+                               std=units.from_g(poses['std']))
+    fitted = fit_poses(poses, units, model='10')
+    values = dict(fitted.model.values)
+    for name in names:
+        effect = EFFECTS[name]
+        own = rng.normal(size=len(effect.parameters)) * SIZES.get(effect.unit, 0.003)
+        values[name] = np.concatenate([own, [SHAPES[part] for part in effect.shape]])
+    rotation = rotation_from_rpy(0.3, -0.2, 1.0) if levelled else np.eye(3)
+    model = Model(values, rotation)
+    root = rng.normal(size=(len(model.vector), len(model.vector))) * 1e-4
+    return replace(fitted, model=model, covariance=root @ root.T)
+
+
+def arrays():
+    return {key: np.array([value]) for key, value in KNOWN.items()}
+
+
+def check(calibration, scale):
+    """Compare forces and covariances at readings of 0.1 to 3 g."""
+    correct, spread = plain_correct(calibration, scale), plain_spread(calibration, scale)
+    rng = np.random.default_rng(5)
+    for reading in random_directions(20, rng) * rng.uniform(0.1, 3.0, (20, 1)):
+        reading = calibration.units.from_g(reading)
+        force = calibration.correct(reading[np.newaxis], arrays())
+        found = correct(*reading.tolist(), KNOWN)
+        np.testing.assert_allclose(found, force[0] * scale, rtol=0, atol=1e-12)
+        expected = calibration.force_covariance(force, arrays())[0] * scale ** 2
+        np.testing.assert_allclose(np.reshape(spread(found, KNOWN), (3, 3)), expected,
+                                   rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize('levelled', [False, True])
+@pytest.mark.parametrize(('unit', 'scale'), [('m/s2', 1.0), ('g', 9.80665), ('native', 9.81)])
+def test_linear_calibration_is_that_of_the_arrays(unit, scale, levelled):
+    check(calibration_with(unit=unit, levelled=levelled), scale)
+
+
+@pytest.mark.parametrize('name', OTHERS)
+def test_each_effect_is_that_of_the_catalogue(name):
+    assert plain_effect(name, np.zeros(len(EFFECTS[name].values))) is not None
+    check(calibration_with(name), 1.0)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_models_of_several_effects_are_those_of_the_arrays(seed):
+    rng = np.random.default_rng(seed)
+    names = rng.choice(OTHERS, size=4, replace=False)
+    check(calibration_with(*names, unit='g', seed=seed), 9.80665)
+
+
+def test_effect_that_is_not_known_in_plain_floats_goes_through_arrays(monkeypatch):
+    monkeypatch.delitem(plain_effect.__globals__['_MAKERS'], 'quadratic')
+    check(calibration_with('quadratic', 'offset_temperature'), 2.0)
+
+
+def test_effects_too_large_to_be_undone_are_refused():
+    calibration = calibration_with()
+    model = Model({**calibration.model.values, 'cubic': np.full(3, -0.5)})
+    large = replace(calibration, model=model,
+                    covariance=np.zeros((len(model.vector), len(model.vector))))
+    with pytest.raises(InputError, match='too large'):
+        plain_correct(large)(30.0, 0.0, 0.0, {})
