@@ -76,9 +76,9 @@ def plain_correct(calibration: Calibration, scale: float = 1.0) -> Correct:
     offset = -np.linalg.solve(mat_w, vec_v)
     turn = calibration.model.rotation.T * (calibration.force_per_g * scale)
     if not others:
-        return _linear(turn @ from_reading, turn @ offset)
-    return _solving(_linear(from_reading, offset), np.linalg.inv(mat_w), others,
-                    _linear(turn, np.zeros(3)))
+        return linear(turn @ from_reading, turn @ offset)
+    return _solving(linear(from_reading, offset), np.linalg.inv(mat_w), others,
+                    linear(turn, np.zeros(3)))
 
 
 def _others(model: Model) -> list[PlainEffect] | None:
@@ -89,8 +89,8 @@ def _others(model: Model) -> list[PlainEffect] | None:
     return known if len(known) == len(found) else None
 
 
-def _linear(matrix: Floats, offset: Floats) -> Correct:
-    """Make the function matrix @ reading + offset."""
+def linear(matrix: Floats, offset: Floats) -> Correct:
+    """Make the function matrix @ reading + offset, whatever the context."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     j, k, m = offset.tolist()
 
@@ -100,15 +100,15 @@ def _linear(matrix: Floats, offset: Floats) -> Correct:
     return correct
 
 
-def _solving(linear: Correct, inverse: Floats, others: list[PlainEffect], turn: Correct
+def _solving(undisturbed: Correct, inverse: Floats, others: list[PlainEffect], turn: Correct
              ) -> Correct:
     """Make the function that solves for u as `model.sensor_force` does, and turns it."""
     constant = [each.added for each in others if each.constant]
     bends = [each.added for each in others if not each.constant]
-    undone = _linear(-inverse, np.zeros(3))
+    undone = linear(-inverse, np.zeros(3))
 
     def correct(x: float, y: float, z: float, context: PlainContext) -> Triple:
-        u = linear(x, y, z, context)
+        u = undisturbed(x, y, z, context)
         fixed = _summed(constant, u, context)
         base = _sum(u, undone(*fixed, context))
         if not bends:
@@ -229,12 +229,11 @@ def _bent_spread(model: Model, covariance: Floats, unit: float) -> Spread:
     names = [name for name, values in model.values.items() for _ in values]
     order = sorted(range(len(names)), key=lambda k: not EFFECTS[names[k]].linear)
     known = covariance[np.ix_(order, order)]
-    linear = _linear_basis(model, unit)
-    width = linear.shape[2]
-    flat = linear.reshape(4, -1)
+    growth = _linear_basis(model, unit)
+    width, flat = growth.shape[2], growth.reshape(4, -1)
     others = _others(model) or []
     mat_w, turn = model.linear_part[0], model.rotation.T * unit
-    into = _linear(model.rotation / unit, np.zeros(3))
+    into = linear(model.rotation / unit, np.zeros(3))
 
     def spread(force: Triple, context: PlainContext) -> Sequence[float]:
         u = into(*force, context)

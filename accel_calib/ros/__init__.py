@@ -22,6 +22,8 @@ The nodes: convert, call, publish.
 `run`                 init, spin, clean shutdown
 `settings`            parameters of both nodes, in one table each; `parameters`, `declare`
 `conversion`, `qos`   messages to plain numbers and back
+`stream`              from imu/data_raw to imu/data_calibrated
+`serialized`          where what is in a serialized Imu; `rewriter` corrects one (no ROS)
 `watch`, `pose_book`  samples to rests to poses (no ROS)
 `applied`             the calibration in use, gravity held from the last rest (no ROS)
 `fitting`             poses to calibration, and words about it (no ROS)

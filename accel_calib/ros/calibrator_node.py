@@ -15,9 +15,9 @@
 """
 The calibrator node: Imu in, corrected Imu out, poses on the way.
 
-The stream is here; what services do is in `commands`. Header stamps are the clock of all that is
-measured, so that a bag or a simulation may run at any speed; only the diagnostics go by a steady
-clock, and come without ``/clock`` too.
+The stream is in `stream`; what services do in `commands`. Header stamps are the clock of all that
+is measured, so that a bag or a simulation may run at any speed; only the diagnostics go by a
+steady clock, and come without ``/clock`` too.
 
 """
 
@@ -35,29 +35,24 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 from visualization_msgs.msg import MarkerArray
 
-from . import conversion, qos
+from . import qos
 from .applied import Applied
 from .commands import Commands
-from .context import context_of_message
 from .declare import declared, follow
 from .fitting import title
 from .health import status_of
 from .settings import CalibratorSettings, capture_settings
 from .storage import load, Loaded, Store, store_of
+from .stream import Stream
 from .vitals import Vitals
 from .watch import Change, Watch
 from .worker import Worker
-from ..errors import AccelCalibError
 from ..units import units_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from ..calibrate import Calibration
-    from ..effects import Context
-
-_SAY_AGAIN = 10.0
-"""A line about the stream is logged at most once in this time [s]."""
 
 
 class CalibratorNode(Node):
@@ -68,7 +63,6 @@ class CalibratorNode(Node):
         self.settings = declared(self, CalibratorSettings)
         follow(self, lambda: self.settings, self._set_settings)
         self.units = units_of(self.settings.units, self.settings.gravity)
-        self.watch = Watch(capture_settings(self.settings), self.units)
         self.applied = Applied(self.settings.gravity)
         self.worker = Worker(self)
         self.store: Store | None = None
@@ -76,11 +70,10 @@ class CalibratorNode(Node):
         self.frame_id = ''
         self.problem = ''
         self.message_context: dict[str, Any] = {}
-        self._sample_context: dict[str, float] = {}
         self._known = False
-        self._still = False
         self.vitals = Vitals(self.units.per_g if self.units.name != 'native' else math.nan)
         self._publish_all()
+        self.stream = Stream(self, Watch(capture_settings(self.settings), self.units))
         self.commands = Commands(self)
         if self.sensor or self.settings.calibration_file:
             self.store = store_of(self.settings.calibration_file, self.sensor)
@@ -91,16 +84,25 @@ class CalibratorNode(Node):
         self.commands.view.show(store=False)
         self._subscribe_all()
 
+    @property
+    def watch(self) -> Watch:
+        """Give the watch, which has seen all messages so far."""
+        return self.stream.watch
+
     def _publish_all(self) -> None:
-        self._calibrated = self.create_publisher(Imu, 'imu/data_calibrated', qos.STREAM)
-        self._motion = self.create_publisher(Vector3Stamped, '~/linear_acceleration', qos.STREAM)
-        self._still_state = self.create_publisher(Bool, '~/still', qos.LATCHED)
+        self.calibrated = self.create_publisher(Imu, 'imu/data_calibrated', qos.STREAM)
+        self.motion = self.create_publisher(Vector3Stamped, '~/linear_acceleration', qos.STREAM)
+        self.still = self.create_publisher(Bool, '~/still', qos.LATCHED)
         self.poses = self.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._still_state.publish(Bool(data=False))
+        self.still.publish(Bool(data=False))
 
     def _subscribe_all(self) -> None:
-        self.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR)
+        try:
+            self.create_subscription(Imu, 'imu/data_raw', self.stream.on_serialized, qos.SENSOR,
+                                     raw=True)
+        except TypeError:  # an rclpy that gives no serialized messages
+            self.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, qos.SENSOR)
         self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
         self.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -116,67 +118,11 @@ class CalibratorNode(Node):
 
     def _on_temperature(self, message: Temperature) -> None:
         if math.isfinite(message.temperature):
+            self.stream.heat(message.temperature)
             self.vitals.temperature = message.temperature
-            self._sample_context = {'temperature': message.temperature}
             self.message_context = {'temperature': np.array([message.temperature])}
 
-    def _on_imu(self, message: Imu) -> None:
-        reading = conversion.reading_of(message)
-        if not conversion.is_finite(reading):
-            self._drop(reading)
-            return
-        if not self._known:
-            self._identify(message.header.frame_id)
-        self._send(message)
-        stamp = conversion.seconds(message.header)
-        self.vitals.good(stamp, reading)
-        change = self.watch.push(stamp, reading, conversion.rate_of(message),
-                                 self._sample_context, self.settings.auto_capture)
-        if self.watch.detector.still is not self._still:
-            self._still = not self._still
-            self._still_state.publish(Bool(data=self._still))
-        if change is not None:
-            self._note(change)
-
-    def _drop(self, reading: conversion.Triple) -> None:
-        self.vitals.bad()
-        self.get_logger().warning(
-            f'an Imu has the linear_acceleration {reading}, expected three finite numbers; it is '
-            'dropped: look at the driver', throttle_duration_sec=_SAY_AGAIN)
-
-    def _send(self, message: Imu) -> None:
-        """Publish the corrected message, or the raw one where that is asked for."""
-        applied, settings = self.applied, self.settings
-        if not applied.enabled or (applied.calibration is None and settings.passthrough):
-            self._calibrated.publish(message)
-        elif applied.calibration is not None:
-            try:
-                corrected = conversion.corrected_message(
-                    message, applied.calibration, applied.scale, self._context_of(message),
-                    settings.output_frame_id)
-            except AccelCalibError as error:
-                self.get_logger().error(f'messages are not corrected: {error}',
-                                        throttle_duration_sec=_SAY_AGAIN)
-                return
-            self._calibrated.publish(corrected)
-            self._send_motion(corrected)
-
-    def _context_of(self, message: Imu) -> Context:
-        """Give what the effects of the calibration in use need beside a message."""
-        calibration = self.applied.calibration
-        needs = () if calibration is None else calibration.model.needs
-        return context_of_message(message, needs, self.message_context)
-
-    def _send_motion(self, corrected: Imu) -> None:
-        """Publish the acceleration without gravity, as the last rest had it."""
-        gravity = self.applied.gravity
-        if gravity is None or not self._motion.get_subscription_count():
-            return
-        force = np.array(conversion.reading_of(corrected))
-        self._motion.publish(Vector3Stamped(header=corrected.header,
-                                            vector=conversion.vector3(force - gravity)))
-
-    def _note(self, change: Change) -> None:
+    def note(self, change: Change) -> None:
         """Act on a rest and on poses."""
         if change.rest is not None:
             self.applied.rested(change.rest)
@@ -188,8 +134,10 @@ class CalibratorNode(Node):
         if change.poses:
             self.commands.poses_changed(ended=bool(change.ended))
 
-    def _identify(self, frame_id: str) -> None:
+    def identify(self, frame_id: str) -> None:
         """Learn from the first message which sensor this is."""
+        if self._known:
+            return
         self._known = True
         self.frame_id = frame_id
         self.sensor = self.settings.sensor or frame_id

@@ -26,7 +26,12 @@ from ..errors import AccelCalibError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rclpy.executors import Executor
+
 _OK, _BAD_INPUT = 0, 2
+
+_LOOK_EVERY = 0.25
+"""How often it is looked whether ROS was shut down [s]."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
@@ -80,14 +85,17 @@ def _run(node: str, args: Sequence[str] | None) -> int:
 
 def _spin(node: str) -> None:
     """Make the node and spin it."""
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.task import Future
     module, name = node.split(':')
     instance = getattr(import_module(module, __package__), name)()
-    executor = SingleThreadedExecutor()
+    executor = _executor()
     executor.add_node(instance)
     try:
         instance.start()
-        executor.spin()
+        while instance.context.ok():
+            # EventsExecutor.spin() hears no signal, and a future would keep each of these calls.
+            executor.spin_until_future_complete(Future(), timeout_sec=_LOOK_EVERY)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except RuntimeError:
@@ -98,6 +106,16 @@ def _spin(node: str) -> None:
         instance.close()
         executor.shutdown()
         instance.destroy_node()
+
+
+def _executor() -> Executor:
+    """Make the executor that costs least."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+        return SingleThreadedExecutor()
+    return EventsExecutor()
 
 
 def _refuse(line: str) -> int:

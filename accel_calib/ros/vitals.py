@@ -49,9 +49,9 @@ class Vitals:
         self.stamp = math.nan
         self.temperature = math.nan
 
-    def good(self, stamp: float, reading: Triple) -> None:
-        """Count a message."""
-        self.messages += 1
+    def good(self, stamp: float, reading: Triple, count: int) -> None:
+        """Count messages, of which this is the last."""
+        self.messages += count
         self.stamp, self._reading = stamp, reading
 
     def bad(self) -> None:

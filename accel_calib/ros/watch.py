@@ -27,6 +27,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .pose_book import overlap, PoseBook
 from ..capture import StillDetector
 
@@ -34,10 +36,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ..capture import CaptureSettings, Dwell
+    from ..table import Floats
     from ..units import Units
 
 _LOOK_EVERY = 0.1
 """Between looks at a rest that is going on [s]."""
+
+_PIECE = 0.05
+"""Samples that come together are looked at in pieces of this length, by their stamps [s]."""
 
 _NOISE_FELL = 0.9
 """The threshold fell by this factor: poses captured before are judged again."""
@@ -117,7 +123,31 @@ class Watch:
             None for nearly all samples.
 
         """
-        ended = self.detector.push(time, reading, rate, context)
+        return self._after(self.detector.push(time, reading, rate, context), time, capture)
+
+    def push_block(self, samples: Floats, capture: bool) -> list[Change]:
+        """
+        Take many samples.
+
+        Parameters
+        ----------
+        samples : (n, 9) array
+            As `StillDetector.push_block`.
+        capture : bool
+            As `push`.
+
+        Returns
+        -------
+        list of Change
+            Empty for nearly all blocks.
+
+        """
+        found = [self._after(self.detector.push_block(piece), float(piece[-1, 0]), capture)
+                 for piece in _pieces(samples)]
+        return [change for change in found if change is not None]
+
+    def _after(self, ended: list[Dwell], time: float, capture: bool) -> Change | None:
+        """Say what changed with the samples up to this time."""
         if ended:
             return self._end(ended, capture)
         still = self.detector.still
@@ -203,6 +233,14 @@ class Watch:
             return 0
         self._judged_at = threshold
         return self.book.keep_only({dwell.start for dwell in self.detector.dwells()})
+
+
+def _pieces(samples: Floats) -> list[Floats]:
+    """Cut samples so that between two looks there is never more than `_PIECE`."""
+    times = samples[:, 0]
+    if 0.0 <= times[-1] - times[0] < _PIECE:
+        return [samples]
+    return np.split(samples, np.flatnonzero(np.diff(np.floor(times / _PIECE))) + 1)
 
 
 def _length(dwell: Dwell | None, same_as: Dwell | None = None) -> float:

@@ -1,0 +1,162 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Serialized Imu messages, corrected without being taken apart.
+
+What becomes of the numbers is said in `accel_calib.imu` and `conversion`; here the same is done
+in plain floats, and a test compares the two field by field. What drivers send again and again, the
+covariances, is turned once.
+
+"""
+
+from __future__ import annotations
+
+import math
+from operator import add
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .serialized import layout_with, LITTLE_ENDIAN, NAME_AT, NINE, STAMP, THREE
+from .. import imu
+from ..model import check_context
+from ..plain import linear, plain_correct, plain_spread
+
+if TYPE_CHECKING:
+    from .serialized import Layout
+    from ..calibrate import Calibration
+    from ..plain_effects import PlainContext, Triple
+    from ..table import Floats
+
+_ABSENT = struct.pack('<d', -1.0)
+_NONE: Triple = (0.0, 0.0, 0.0)
+_NO_CONTEXT: PlainContext = {}
+
+
+class Rewriter:
+    """
+    Correct messages of one layout; see `conversion.corrected_message`.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the messages.
+    calibration : Calibration
+        In the unit of the readings.
+    scale : float
+        m/s² in one unit of its corrected force.
+    frame_id : str
+        New name of the frame; empty: keep it.
+
+    """
+
+    def __init__(self, layout: Layout, calibration: Calibration, scale: float, frame_id: str
+                 ) -> None:
+        model = calibration.model
+        self._rotation = model.rotation
+        self._turns = not np.array_equal(model.rotation, np.eye(3))
+        self._turn = linear(model.rotation.T, np.zeros(3))
+        self._model, self._needs = model, model.needs
+        self._inverse = model.rotation.T @ np.linalg.inv(calibration.gain) * scale
+        self._correct = plain_correct(calibration, scale)
+        self._uncertainty = plain_spread(calibration, scale)
+        self._begin = layout.begin
+        self._rate = layout.begin + 8 * imu.ANGULAR_VELOCITY.start
+        self._rate_spread = layout.begin + 8 * imu.ANGULAR_VELOCITY_COVARIANCE.start
+        self._force = layout.begin + 8 * imu.ACCELERATION.start
+        self._force_spread = layout.begin + 8 * imu.ACCELERATION_COVARIANCE.start
+        self.layout = layout_with(frame_id) if frame_id else layout
+        padding = self.layout.begin - self.layout.name_end
+        self._name = self.layout.name + bytes(padding) if frame_id else b''
+        self._seen_force = self._seen_rate = self._turned_rate = b''
+        self._own: list[float] | None = None
+
+    def __call__(self, data: bytes, temperature: float) -> bytes | None:
+        """
+        Give a corrected message.
+
+        Parameters
+        ----------
+        data : bytes
+            A message of the layout.
+        temperature : float
+            The last one [°C]; NaN: none came.
+
+        Returns
+        -------
+        bytes or None
+            In the layout ``self.layout``; None where the reading is not finite.
+
+        Raises
+        ------
+        InputError
+            If the model needs context that is not there.
+
+        """
+        x, y, z = THREE.unpack_from(data, self._force)
+        if not math.isfinite(x + y + z):
+            return None
+        context = self._context(data, temperature) if self._needs else _NO_CONTEXT
+        force = self._correct(x, y, z, context)
+        spread = data[self._force_spread:]
+        if spread != self._seen_force:
+            self._see_force(spread)
+        if self._own is not None:
+            spread = NINE.pack(*map(add, self._own, self._uncertainty(force, context)))
+        front = self._front(data) if self._turns or self._name else data[:self._force]
+        return front + THREE.pack(*force) + spread
+
+    def _context(self, data: bytes, temperature: float) -> PlainContext:
+        """Give what `context.context_of_message` gives, in plain floats."""
+        seconds, nanoseconds = STAMP.unpack_from(data, 4)
+        rate: Triple = THREE.unpack_from(data, self._rate)
+        absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
+        known = {'time': seconds + nanoseconds * 1e-9, 'std': _NONE, 'approach': _NONE,
+                 'rate': _NONE if absent or not math.isfinite(sum(rate)) else rate}
+        if not math.isnan(temperature):
+            known['temperature'] = temperature
+        for key in self._needs:
+            if key not in known:
+                check_context(self._model, known)
+        return known
+
+    def _see_force(self, spread: bytes) -> None:
+        """Learn how sure the messages say that the acceleration is."""
+        self._seen_force = spread
+        self._own = _turned(self._inverse, spread)
+
+    def _front(self, data: bytes) -> bytes:
+        """Give the message up to the acceleration, renamed and turned where that is asked for."""
+        head = LITTLE_ENDIAN + data[4:NAME_AT] + self._name if self._name else data[:self._begin]
+        if not self._turns:
+            return head + data[self._begin:self._force]
+        spread = data[self._rate_spread:self._force]
+        if spread != self._seen_rate:
+            self._seen_rate = spread
+            turned = _turned(self._rotation.T, spread)
+            self._turned_rate = spread if turned is None else NINE.pack(*turned)
+        x, y, z = THREE.unpack_from(data, self._rate)
+        rate = THREE.pack(*self._turn(x, y, z, _NO_CONTEXT))
+        return head + data[self._begin:self._rate] + rate + self._turned_rate
+
+
+def _turned(matrix: Floats, spread: bytes) -> list[float] | None:
+    """Give A C Aᵀ of a covariance that is known; None where it is absent or unknown."""
+    covariance = np.frombuffer(spread, '<f8')
+    if covariance[0] == -1.0 or not np.any(covariance):
+        return None
+    turned: list[float] = (matrix @ covariance.reshape(3, 3) @ matrix.T).ravel().tolist()
+    return turned
