@@ -19,100 +19,154 @@ The pose whose residual is the largest against what the other poses say (externa
 with the moderated variance of `accel_calib.calibrate.likelihood.Fit`) is taken out, and so on,
 several times over; as many are then called disturbed as the generalised extreme studentised
 deviate test (Rosner 1983) finds at the level `_LEVEL`, which is not masked when several poses are
-disturbed. Between the poses taken out the fit is followed to first order; it is then made anew
-without them, and the search goes on until it finds no more.
+disturbed. Between the poses taken out the fit is followed to first order, by updates of rank one;
+it is then made anew without them, and the search goes on until it finds no more.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .likelihood import Fit
+from .uncertainty import belief_in
 from ..table import Floats
 
-_LEVEL = 0.01
+ROUNDS = 4
+"""Most fits made anew."""
+
+_LEVEL = 0.007
 _LARGEST_SHARE = 0.25
-_ROUNDS = 4
+_TOLD_BY_OTHERS = 1e-6
+_NEVER_EXTREME = 2.0
+_MANY = 50
+"""Of more poses than these, when all are within `_NEVER_EXTREME`, none is disturbed unseen."""
+
+_DOUBTED = 1.0
+_DOUBT_BELOW = 0.01
+"""What measured noise counts as where the poses left contradict it, by the probability of chi²."""
 
 
-def disturbed(fit_rows: Callable[[NDArray[np.int64]], Fit], count: int) -> NDArray[np.int64]:
+@dataclass(frozen=True)
+class _Order:
     """
-    Find disturbed poses.
+    Poses taken out one after another.
 
     Parameters
     ----------
-    fit_rows : callable
-        Fits the poses at these indices.
-    count : int
-        Number of poses.
-
-    Returns
-    -------
-    (d,) array of int
-        Indices of the disturbed poses.
+    pose : (m, k) array of int
+        The most extreme of those left.
+    squared : (m, k) array
+        Its squared residual when the others are fitted, in units of its variance.
+    rss : (m, k + 1) array
+        Squared residuals before each is taken out, and at the end.
+    dof : (m, 1) array of int
+        Degrees of freedom at the beginning.
+    count : (m, 1) array of int
+        Poses at the beginning.
 
     """
-    kept = np.arange(count)
-    for _ in range(_ROUNDS):
-        fit = fit_rows(kept)
-        most = int(_LARGEST_SHARE * count) - (count - len(kept))
-        found = _extreme(fit, min(most, fit.dof - 1))
-        if not found:
-            break
-        kept = np.delete(kept, found)
-    return np.setdiff1d(np.arange(count), kept)
+
+    pose: NDArray[np.intp]
+    squared: Floats
+    rss: Floats
+    dof: NDArray[np.int64]
+    count: NDArray[np.int64]
+
+    def extreme(self, belief: float, limit: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Say how many of them are extreme, (m,), at most so many."""
+        number = np.arange(self.pose.shape[1])
+        dof = np.maximum(belief + self.dof - number - 1.0, 1e-9)
+        others = np.maximum(belief + self.rss[:, :-1] - self.squared, 1e-300) / dof
+        size = np.sqrt(self.squared / others)
+        is_extreme = size > _critical(size, dof, self.count - number)
+        is_extreme &= number < limit[:, np.newaxis]
+        return np.max(np.where(is_extreme, number + 1, 0), axis=1, initial=0)
 
 
-def _extreme(fit: Fit, most: int) -> list[int]:
-    """Give the residuals that the test calls extreme, among at most so many."""
-    rows, found = np.arange(len(fit.residual)), 0
-    out: list[int] = []
-    belief = fit.variance_dof - fit.dof
-    for _ in range(most):
-        sizes, dof = studentised(fit.weighted[rows], fit.jacobian[rows], belief)
-        worst = int(np.argmax(sizes))
-        if sizes[worst] > _critical(dof, len(rows)):
-            found = len(out) + 1
-        out.append(int(rows[worst]))
-        rows = np.delete(rows, worst)
-    return out[:found]
-
-
-def studentised(weighted: Floats, jacobian: Floats, belief: float) -> tuple[Floats, float]:
+def extreme(weighted: Floats, jacobian: Floats, kept: NDArray[np.bool_], noise_known: bool,
+            total: int) -> NDArray[np.bool_]:
     """
-    Give each residual over its deviation as the others tell it.
+    Find the poses whose residuals are extreme, for many sensors at once.
 
     Parameters
     ----------
-    weighted : (m,) array
-        Residuals over their noise, of a fit that need not be these rows' own.
-    jacobian : (m, q) array
+    weighted : (m, n) array
+        Residuals over their noise, of the m sensors' fits to the poses that are kept.
+    jacobian : (m, n, q) array
         Their derivative by the free values.
-    belief : float
-        Degrees of freedom that the measured noise counts as.
+    kept : (m, n) array of bool
+        Poses fitted.
+    noise_known : bool
+        Whether the noise was measured. Even so it is believed only as far as the poses left
+        agree with it: noise that is stated too small must not make clean poses look disturbed.
+    total : int
+        Poses of each sensor before any was left out.
 
     Returns
     -------
-    (m,) array, float
-        Student's t of each, and its degrees of freedom; 0 where the others cannot tell.
+    (m, n) array of bool
+        Poses to leave out now: in all no more than a quarter, and no more than are left to
+        tell which they are.
 
     """
-    onto = np.linalg.qr(jacobian)[0]
-    residual = weighted - onto @ (onto.T @ weighted)
-    own = 1.0 - np.sum(onto ** 2, axis=1)
-    tells = own > 1e-6
-    squared = np.where(tells, residual ** 2 / np.where(tells, own, 1.0), 0.0)
-    dof = belief + len(weighted) - jacobian.shape[1] - 1.0
-    others = np.maximum(belief + residual @ residual - squared, 1e-300) / max(dof, 1e-9)
-    return np.sqrt(squared / others), dof
+    from scipy.special import chdtrc
+
+    count, free = np.sum(kept, axis=1), jacobian.shape[2]
+    most = np.minimum(int(_LARGEST_SHARE * total), (total - free) // 2)
+    limit = np.maximum(most - (total - count), 0)
+    order = _one_after_another(weighted * kept, jacobian * kept[..., np.newaxis], kept,
+                               int(np.max(limit)))
+    found = order.extreme(belief_in(noise_known), limit)
+    if noise_known and np.any(found):
+        left = np.take_along_axis(order.rss, found[:, np.newaxis], axis=1)[:, 0]
+        doubted = chdtrc(np.maximum(count - free - found, 1), left) < _DOUBT_BELOW
+        found = np.where(doubted, order.extreme(_DOUBTED, limit), found)
+    out = np.zeros_like(kept)
+    sensor, place = np.nonzero(np.arange(order.pose.shape[1]) < found[:, np.newaxis])
+    out[sensor, order.pose[sensor, place]] = True
+    return out
 
 
-def _critical(dof: float, count: int) -> float:
+def _one_after_another(residual: Floats, rows: Floats, left: NDArray[np.bool_], most: int
+                       ) -> _Order:
+    """Take out the most extreme pose time after time; following the fit to first order."""
+    sensor, count = np.arange(len(left)), np.sum(left, axis=1, keepdims=True)
+    transposed = np.swapaxes(rows, 1, 2)
+    spread = np.linalg.pinv(transposed @ rows, hermitian=True)
+    onto = rows @ spread
+    own = np.sum(onto * rows, axis=2)
+    residual = residual - (onto @ (transposed @ residual[..., np.newaxis]))[..., 0]
+    poses: list[NDArray[np.intp]] = []
+    sizes: list[Floats] = []
+    rss = [np.sum(residual ** 2, axis=1)]
+    dof = count - rows.shape[2]
+    for k in range(most):
+        told = left & (1.0 - own > _TOLD_BY_OTHERS)
+        squared = np.where(told, residual ** 2 / np.where(told, 1.0 - own, 1.0), 0.0)
+        at = np.argmax(squared, axis=1)
+        largest, alone = squared[sensor, at], np.maximum(1.0 - own[sensor, at], _TOLD_BY_OTHERS)
+        if left.shape[1] > _MANY and np.all(largest * (dof[:, 0] - k)
+                                            < _NEVER_EXTREME ** 2 * rss[-1]):
+            break
+        poses, sizes, rss = [*poses, at], [*sizes, largest], [*rss, rss[-1] - largest]
+        moved = (spread @ rows[sensor, at][..., np.newaxis])[..., 0] / np.sqrt(alone)[:, None]
+        along = (rows @ moved[..., np.newaxis])[..., 0]
+        residual = residual + along * (residual[sensor, at] / np.sqrt(alone))[:, np.newaxis]
+        own = own + along ** 2
+        spread = spread + moved[:, :, np.newaxis] * moved[:, np.newaxis]
+        left = left & (np.arange(left.shape[1]) != at[:, np.newaxis])
+    empty = np.zeros((len(left), 0))
+    return _Order(np.column_stack([empty, *poses]).astype(np.intp),
+                  np.column_stack([empty, *sizes]), np.column_stack(rss), dof, count)
+
+
+def _critical(size: Floats, dof: Floats, count: NDArray[np.int64]) -> Floats:
     """Give Student's t that one of `count` clean poses exceeds with probability `_LEVEL`."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(max(dof, 1.0), 1.0 - _LEVEL / (2.0 * count)))
+    critical, near = np.full(size.shape, np.inf), size > _NEVER_EXTREME
+    critical[near] = stdtrit(np.maximum(dof[near], 1.0), 1.0 - _LEVEL / (2.0 * count[near]))
+    return critical

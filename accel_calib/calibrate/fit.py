@@ -27,18 +27,20 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import closed_form
 from .calibration import Calibration, Rejected
-from .disturbed import disturbed
+from .disturbed import extreme, ROUNDS
 from .geometry import dilution, free_parameters, noise_along, NORM_MODELS, WEAK_DILUTION
-from .likelihood import Fit, fit_norm, fit_reference, judge
+from .likelihood import Fit, fit_norm, fit_reference, judge, norm_fit_at
+from .norm_fit import form_of
 from .quality import in_g, quality_of
 from .refusal import carries, refuse_if_unfit, unseen
 from .selection import choose
-from .sensing_axes import lower_triangular, TIES
+from .sensing_axes import lower_triangular
 from ..errors import InputError, RefusedFitError
-from ..model import Model, MODELS, with_linear_part
+from ..model import MODELS
 from ..table import Floats, Poses, Table
 from ..units import MG, Units
 
@@ -155,12 +157,9 @@ def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor:
     refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions, noise)
     poses_g = in_g(poses, units)
     kept, reason = np.arange(len(poses)), f'model {model} was asked for'
-    largest = _carried(directions, noise)[-1] if model == 'auto' else model
-    out = np.zeros(0, int)
     unasked: tuple[str, ...] = ()
     if method == 'ml':
-        out = disturbed(lambda rows: _fit_rows(poses_g.take(rows), largest, 'ml'), len(poses))
-        kept = np.delete(kept, out)
+        kept = _undisturbed(poses_g, _carried(directions, noise)[-1] if model == 'auto' else model)
         refuse_if_unfit(NORM_MODELS[0] if model == 'auto' else model, directions[kept],
                         noise[kept])
     if model == 'auto':
@@ -169,7 +168,7 @@ def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor:
         choice = choose({name: _fit_rows(poses_g.take(kept), name, method) for name in carried})
         model, reason = choice.name, choice.reason
     fit = _fit_rows(poses_g.take(kept), model, method)
-    rejected = _rejections(poses_g, fit, out)
+    rejected = _rejections(poses_g, fit, np.setdiff1d(np.arange(len(poses)), kept))
     quality = quality_of(fit, poses_g.take(kept), units, directions[kept])
     warnings = _warnings(fit, dilution(model, directions[kept], noise[kept])) + unasked
     return Calibration(model, method, fit.model, units, sensor, 'ros', date, fit.covariance,
@@ -177,30 +176,35 @@ def _fit_unknown(poses: Poses, units: Units, model: str, method: Method, sensor:
 
 
 def _carried(directions: Floats, noise: Floats) -> list[str]:
-    """Name the models that the poses carry with at least one to spare, the smallest always."""
+    """Name the models that the poses carry, the smallest always."""
     return [NORM_MODELS[0], *(name for name in NORM_MODELS[1:]
-                              if len(directions) > free_parameters(name)
-                              and carries(name, directions, noise))]
+                              if carries(name, directions, noise))]
+
+
+def _undisturbed(poses_g: Poses, name: str) -> NDArray[np.intp]:
+    """Give the indices of the poses that are not disturbed, as this model sees them."""
+    kept = np.arange(len(poses_g))
+    for _ in range(ROUNDS):
+        fit = _fit_rows(poses_g.take(kept), name, 'ml')
+        out = extreme(fit.weighted[np.newaxis], fit.jacobian[np.newaxis],
+                      np.ones((1, len(kept)), bool), fit.noise_known, len(poses_g))[0]
+        if not np.any(out):
+            break
+        kept = kept[~out]
+    return kept
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     """Fit a model for unknown orientation to poses in g."""
     mat_w, vec_v = _CLOSED_FORMS[name](poses_g.reading)
-    ties = TIES if name == '9' else None
-    start = _in_effects(name, lower_triangular(mat_w) if name == '9' else mat_w, vec_v)
+    if name == '9':
+        mat_w = lower_triangular(mat_w)
     if method == 'ml':
-        return fit_norm(start, poses_g.reading, poses_g.columns, poses_g.noise, ties)
+        return fit_norm(name, mat_w, vec_v, poses_g.reading, poses_g.noise)
     if name == '9':  # the cost of the report is the likelihood without weights
-        start = fit_norm(start, poses_g.reading, poses_g.columns, None, ties).model
-    return judge(start, poses_g.reading, poses_g.columns, poses_g.noise, ties)
-
-
-def _in_effects(name: str, mat_w: Floats, vec_v: Floats) -> Model:
-    """Give W and V as the effects of this model."""
-    if name == '4':
-        return Model({'offset': vec_v, 'gain': mat_w[:1, 0] - 1.0})
-    values = with_linear_part(mat_w, vec_v).values
-    return Model({effect: values.get(effect, np.zeros(3)) for effect in MODELS[name]})
+        mat_w, vec_v = fit_norm(name, mat_w, vec_v, poses_g.reading, None).model.linear_part
+    free = form_of(name).free(mat_w, vec_v)
+    return norm_fit_at(name, free, poses_g.reading, poses_g.noise)
 
 
 def _fit_known(poses: Poses, units: Units, method: Method, sensor: str, date: str) -> Calibration:

@@ -24,9 +24,9 @@ row vector a = ûᵀ A⁻¹, the variance is Σ_j a_j² s_j². The Jacobian is e
 B to the reading moves u by -A⁻¹ B, so that de/dk = -a B. A pose of known orientation tells three
 numbers, reading - predict(reference), linear in the parameters.
 
-Both are least squares, weighted by the noise; the covariance is (JᵀJ)⁻¹. Where the noise is not
-known, or the residuals exceed it significantly, the residuals set its scale: poses often repeat
-worse than their samples say.
+Both are least squares, weighted by the noise; the covariance is (JᵀJ)⁻¹, times what
+`accel_calib.calibrate.uncertainty` makes of the residuals: poses often repeat worse than their
+samples say.
 
 """
 
@@ -36,8 +36,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .norm_fit import form_of, noise_along, solution_at, solve
+from .uncertainty import belief_in, variance_factor
 from ..effects import Context
-from ..errors import InputError, RefusedFitError
+from ..errors import RefusedFitError
 from ..model import (
     force_slope,
     Model,
@@ -49,18 +51,14 @@ from ..model import (
 )
 from ..table import Floats
 
-_CHI2_SURPRISE = 0.01
-"""Below this probability of the chi², the residuals and not the samples set the noise."""
-
 _NO_NOISE_G = 1e-9
 """Samples that scatter less do not scatter at all."""
 
 _LEAST_NOISE = 0.1
 """A pose that claims less than this part of the median noise is not believed."""
 
-
-_BELIEF = 8.0
-"""What the measured noise of the poses counts as, in degrees of freedom."""
+_USUAL_NOISE_G = 5e-4
+"""Noise of a pose of a common MEMS sensor, where it was not measured."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class Fit:
     residual : (m,) array
         |force| - 1 of each pose, or the three components of each reading one after another [g].
     sigma : (m,) array
-        Noise of each residual [g]; 1 where it is not known.
+        Noise of each residual [g]; the same for all where it is not known.
     jacobian : (m, q) array
         Derivative of residual / sigma by the q free parameters.
     noise_known : bool
@@ -109,20 +107,13 @@ class Fit:
 
     @property
     def variance(self) -> float:
-        """
-        Variance of a weighted residual: 1 as far as the measured noise is believed.
-
-        The measured noise counts as `_BELIEF` degrees of freedom beside those of the residuals
-        (moderated variance, Smyth 2004).
-
-        """
-        belief = _BELIEF if self.noise_known else 0.0
-        return (belief + self.chi2) / (belief + self.dof) if belief + self.dof > 0 else np.nan
+        """Variance of a weighted residual: 1 as far as the noise is believed."""
+        return (belief_in(self.noise_known) + self.chi2) / self.variance_dof
 
     @property
     def variance_dof(self) -> float:
         """Degrees of freedom of `variance`."""
-        return self.dof + (_BELIEF if self.noise_known else 0.0)
+        return belief_in(self.noise_known) + self.dof
 
     @property
     def leverage(self) -> Floats:
@@ -151,23 +142,23 @@ def believable(noise: Floats) -> Floats | None:
     return np.maximum(noise, _LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
-def fit_norm(start: Model, reading: Floats, context: Context, noise: Floats | None,
-             ties: Floats | None = None) -> Fit:
+def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Floats | None
+             ) -> Fit:
     """
     Fit a model to poses of unknown orientation.
 
     Parameters
     ----------
-    start : Model
-        Effects to fit and where to begin.
+    name : {'4', '7', '9', '10'}
+        The model.
+    mat_w : (3, 3) array
+        Gain to begin with.
+    vec_v : (3,) array
+        Offset to begin with [g].
     reading : (n, 3) array
         Pose means [g].
-    context : mapping of str to array
-        What the effects need.
     noise : (n, 3) array or None
         Standard deviation of the pose means [g].
-    ties : (p, q) array, optional
-        All p values from the q that are free; without it each is free.
 
     Returns
     -------
@@ -180,62 +171,57 @@ def fit_norm(start: Model, reading: Floats, context: Context, noise: Floats | No
         If the fit does not converge.
 
     """
-    ties = np.eye(len(start.vector)) if ties is None else ties
-    noise = None if noise is None else believable(noise)
-    model = start
-    for _ in range(1 if noise is None else 2):  # the weights hardly depend on the model
-        u = sensor_force(model, reading, context)
-        model = _minimise(model, reading, context, _sigma(model, u, context, noise), ties)
-    return judge(model, reading, context, noise, ties)
-
-
-def judge(model: Model, reading: Floats, context: Context, noise: Floats | None,
-          ties: Floats | None = None) -> Fit:
-    """Say what poses of unknown orientation tell of this model; arguments as `fit_norm`."""
-    ties = np.eye(len(model.vector)) if ties is None else ties
-    u = sensor_force(model, reading, context)
-    sigma = _sigma(model, u, context, None if noise is None else believable(noise))
-    jacobian = norm_jacobian(model, u, context) @ ties / sigma[:, np.newaxis]
-    residual = np.linalg.norm(u, axis=1) - 1.0
-    covariance = ties @ covariance_of(jacobian, residual / sigma, noise is not None) @ ties.T
-    return Fit(model, covariance, residual, sigma, jacobian, noise is not None)
-
-
-def _sigma(model: Model, u: Floats, context: Context, noise: Floats | None) -> Floats:
-    """Give the (n,) noise of |u|, or ones where the (n, 3) noise is not known."""
-    if noise is None:
-        return np.ones(len(u))
-    return np.sqrt(np.sum((norm_rows(model, u, context) * noise) ** 2, axis=1))
-
-
-def _minimise(start: Model, reading: Floats, context: Context, sigma: Floats,
-              ties: Floats) -> Model:
-    """Move the free values of the model to the least sum of squares."""
-    from scipy.optimize import least_squares
-
-    def model_at(free: Floats) -> Model:
-        return with_vector(start.effects, ties @ free)
-
-    def residuals(free: Floats) -> Floats:
-        u = sensor_force(model_at(free), reading, context)
-        weighted: Floats = (np.linalg.norm(u, axis=1) - 1.0) / sigma
-        return weighted
-
-    def jacobian(free: Floats) -> Floats:
-        model = model_at(free)
-        u = sensor_force(model, reading, context)
-        return norm_jacobian(model, u, context) @ ties / sigma[:, np.newaxis]
-
-    free = np.linalg.lstsq(ties, start.vector, rcond=None)[0]
-    try:
-        found = least_squares(residuals, free, jac=jacobian, method='lm',
-                              ftol=1e-14, xtol=1e-12, gtol=1e-14)
-    except (np.linalg.LinAlgError, InputError):
-        found = None
-    if found is None or not found.success:
+    form = form_of(name)
+    believed = None if noise is None else believable(noise)
+    start = form.free(mat_w, vec_v)
+    # The weights hardly depend on the model: those of the start will do.
+    sigma = (np.full(len(reading), _USUAL_NOISE_G) if believed is None
+             else noise_along(form, start, reading, believed))
+    solution, converged = solve(form, start, reading, sigma)
+    if not converged:
         raise RefusedFitError('the fit does not converge',
                               'check the poses for mistakes, or take more of them')
-    return model_at(found.x)
+    return norm_fit_at(name, solution.free, reading, noise)
+
+
+def norm_fit_at(name: str, free: Floats, reading: Floats, noise: Floats | None) -> Fit:
+    """Say what poses of unknown orientation tell of these (q,) free values; as `fit_norm`."""
+    form = form_of(name)
+    sigma = np.full(len(reading), _USUAL_NOISE_G)
+    believed = None if noise is None else believable(noise)
+    if believed is not None:
+        sigma = noise_along(form, free, reading, believed)
+    end = solution_at(form, free, reading, sigma)
+    spread = covariance_of(end.jacobian, end.weighted, believed is not None)
+    return Fit(form.model(free), form.ties @ spread @ form.ties.T, end.residual, sigma,
+               end.jacobian, believed is not None)
+
+
+def judge(model: Model, reading: Floats, context: Context, noise: Floats | None) -> Fit:
+    """
+    Say what poses of unknown orientation tell of this model.
+
+    Parameters
+    ----------
+    model : Model
+        Any model.
+    reading : (n, 3) array
+        Pose means [g].
+    context : mapping of str to array
+        What the effects need.
+    noise : (n, 3) array or None
+        Standard deviation of the pose means [g].
+
+    """
+    u = sensor_force(model, reading, context)
+    believed = None if noise is None else believable(noise)
+    sigma = np.full(len(u), _USUAL_NOISE_G)
+    if believed is not None:
+        sigma = np.linalg.norm(norm_rows(model, u, context) * believed, axis=1)
+    jacobian = norm_jacobian(model, u, context) / sigma[:, np.newaxis]
+    residual = np.linalg.norm(u, axis=1) - 1.0
+    covariance = covariance_of(jacobian, residual / sigma, believed is not None)
+    return Fit(model, covariance, residual, sigma, jacobian, believed is not None)
 
 
 def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, context: Context,
@@ -266,7 +252,7 @@ def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, 
 
     """
     noise = None if noise is None else believable(noise)
-    sigma = np.ones(reading.size) if noise is None else noise.ravel()
+    sigma = np.full(reading.size, _USUAL_NOISE_G) if noise is None else noise.ravel()
     zero = with_vector(effects, np.zeros(len(parameter_names(effects))))
     basis = parameter_basis(zero, reference, context)
     design = basis.reshape(reading.size, -1) / sigma[:, np.newaxis]
@@ -293,22 +279,16 @@ def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool,
     weighted : (m,) array
         Residuals over their noise.
     noise_known : bool
-        If not, or if the chi² is too large to believe the noise, the residuals scale it.
+        Whether the noise of the residuals was measured.
     dof : int, optional
         Degrees of freedom, where they are not m - q.
 
     Returns
     -------
     (q, q) array
-        NaN where the poses leave nothing to judge an unknown noise by.
+        By the pseudo-inverse: what the residuals do not determine has no part in it.
 
     """
-    from scipy.special import chdtrc
-
     dof = len(weighted) - jacobian.shape[1] if dof is None else dof
-    chi2 = float(weighted @ weighted)
-    scale = 1.0
-    if not noise_known or (dof > 0 and chdtrc(dof, chi2) < _CHI2_SURPRISE):
-        scale = chi2 / dof if dof > 0 else np.nan
     factor = np.linalg.pinv(jacobian)
-    return factor @ factor.T * scale
+    return factor @ factor.T * variance_factor(float(weighted @ weighted), dof, noise_known)

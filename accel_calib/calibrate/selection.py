@@ -30,7 +30,7 @@ import numpy as np
 from .likelihood import Fit
 from ..units import MG
 
-_LEVEL = 0.05
+_LEVEL = 0.03
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,110 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How far the residuals let the measured noise be believed.
+
+The variance of a residual is λ times what the noise of its pose says. Either the noise is right,
+λ = 1, or poses repeat worse than their samples say, by a factor of which nothing is known: log λ
+is evenly spread from 0 to log 10⁴. The residuals weigh the one against the other (Bayes' rule with
+the likelihood λ^(-dof/2) exp(-chi²/2λ)); a value is then spread as a mixture of normal
+distributions, and its stated variance is such that ±1.96 standard deviations hold 95 % of it.
+Where the noise is not measured at all, λ comes from the residuals alone and the mixture is
+Student's t.
+
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from ..table import Floats
+
+_BELIEF = 8.0
+_BELIEF_IN_USUAL = 3.0
+"""What measured noise, and the noise of a common sensor, count as in a test."""
+
+_RIGHT = 0.7
+"""Probability that the measured noise is right, before the residuals are seen."""
+
+_INTERVAL = 0.95
+_NORMAL = 1.959964
+_GRID = 161
+_BEYOND = 1e3
+
+
+def belief_in(noise_known: bool) -> float:
+    """Say how many degrees of freedom the noise counts as (moderated variance, Smyth 2004)."""
+    return _BELIEF if noise_known else _BELIEF_IN_USUAL
+
+
+@cache
+def _grid() -> tuple[Floats, Floats, Floats]:
+    """Give λ (m,), half widths (k,), and the part of N(0, λ) that each width holds, (k, m)."""
+    from scipy.special import ndtr
+
+    scale = np.logspace(0.0, 4.0, _GRID)
+    width = np.geomspace(1.9, 250.0, 201)
+    return scale, width, 2.0 * ndtr(width[:, np.newaxis] / np.sqrt(scale)) - 1.0
+
+
+def variance_factor(chi2: Floats | float, dof: Floats | int, noise_known: bool) -> Floats:
+    """
+    Say by how much to multiply the variance that the noise alone would leave a value.
+
+    Parameters
+    ----------
+    chi2 : (...) array or float
+        Sum of the squared residuals over their noise.
+    dof : (...) array or int
+        Residuals less free values.
+    noise_known : bool
+        Whether the noise was measured; if not, `chi2` is in whatever unit it was taken to be.
+
+    Returns
+    -------
+    (...) array
+        The factor; 1 where nothing is left to judge by.
+
+    """
+    chi2, dof = np.broadcast_arrays(np.asarray(chi2, float), np.asarray(dof, float))
+    factor = _of_residuals(chi2, np.maximum(dof, 1.0))
+    if noise_known:
+        factor = np.where(chi2 > _BEYOND * dof, factor, _of_mixture(chi2, dof))
+    return np.where(dof > 0, factor, 1.0)
+
+
+def _of_residuals(chi2: Floats, dof: Floats) -> Floats:
+    """Give the factor where the residuals alone say what the noise is: Student's t."""
+    from scipy.special import stdtrit
+
+    return chi2 / dof * (stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+
+
+def _of_mixture(chi2: Floats, dof: Floats) -> Floats:
+    """Give the factor where the noise is measured, and may be right."""
+    scale, width, held = _grid()
+    likelihood = (chi2[..., np.newaxis] * (1.0 - 1.0 / scale)
+                  - dof[..., np.newaxis] * np.log(scale)) / 2.0
+    weight = np.exp(likelihood - np.max(likelihood, axis=-1, keepdims=True)) * (1.0 - _RIGHT)
+    weight[..., 0] += _RIGHT * _GRID * np.exp(-np.max(likelihood, axis=-1))
+    part = (weight / np.sum(weight, axis=-1, keepdims=True)) @ held.T
+    above = np.argmax(part >= _INTERVAL, axis=-1)
+    here, before = (np.take_along_axis(part, k[..., np.newaxis], axis=-1)[..., 0]
+                    for k in (above, above - 1))
+    share = (_INTERVAL - before) / (here - before)
+    between = width[above - 1] * (width[above] / width[above - 1]) ** share
+    return (between / _NORMAL) ** 2
