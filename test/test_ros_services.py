@@ -89,6 +89,7 @@ def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
 def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     still = bench.listen(Bool, 'calibrator/still', latched=True)
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(auto_capture=False, sensor='arm', passthrough=True)
     poses = readings([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dwell=3.0)
     bench.feed(poses[:140])
@@ -99,7 +100,10 @@ def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) 
     assert re.match(r'1 poses: .*; turn the sensor so that the .* points up \([-+xyz ]+\)$',
                     answer.message)
     bench.spin(lambda: count(markers) == 1)
-    assert markers[-1].markers[-1].text in answer.message
+    asked = markers[-1].markers[-1].text
+    assert answer.message.endswith(asked)
+    bench.spin(lambda: diagnostics and any(value.key == 'next pose' and value.value == asked
+                                           for value in diagnostics[-1].status[0].values))
     bench.feed(poses[140:165])
     bench.spin(lambda: not still[-1].data)
     answer = bench.call('capture_pose')

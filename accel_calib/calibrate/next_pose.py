@@ -21,8 +21,8 @@ follow, that of one pose spread over the whole sphere: without it the first pose
 as if there were none to come. `benchmarks/next_pose.py` compares it with other orders.
 
 n poses spread well leave |force| uncertain by the noise of a pose times √(p / n), RMS over the
-sphere. A pose more takes 1 / 2n of that away: more poses no longer pay when the best of them would
-take less than `_LEAST_GAIN`.
+sphere. A pose more takes 1 / 2n of that away: more poses no longer pay when the next one would
+take less than `_LEAST_GAIN`, and the dilution is below `_GOOD_DILUTION`.
 
 """
 
@@ -40,13 +40,15 @@ from .geometry import (
     poses_needed,
     relative_weights,
     rows_of,
-    WEAK_DILUTION,
 )
 from ..table import Floats
 from ..units import MG
 
 _LEAST_GAIN = 0.03
 """Share of the expected error that a pose must take away to pay: 17 poses spread well."""
+
+_GOOD_DILUTION = 3.0
+"""Poses are asked for until the dilution has come down to this."""
 
 _TAKEN = np.cos(np.radians(17.0))
 """An attitude this near to a pose has been taken: the next one is 35° away."""
@@ -128,7 +130,7 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     signs = _attitudes()[best]
     up = _unit(signs[np.newaxis])
     after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
-    if error * np.sqrt(poses_needed(name)) < WEAK_DILUTION and after > (1 - _LEAST_GAIN) * error:
+    if after > (1.0 - _LEAST_GAIN) * error and not _stretched(name, information):
         return NextPose(None, _enough(len(directions), error, noise_g), error)
     return NextPose(up[0], f'turn the sensor so that {words_of(signs)} points up '
                     f'({_axes(signs)})', error)
@@ -136,7 +138,7 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
     """
-    Name the poses to add so that a model is carried, one after another.
+    Name the poses to add so that a model is carried well, one after another.
 
     Parameters
     ----------
@@ -151,7 +153,8 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
     """
     weights = relative_weights(noise, len(directions))
     named = []
-    while len(directions) < poses_needed(name) or _stretched(name, directions, weights):
+    while len(directions) < poses_needed(name) or _stretched(
+            name, information_of(name, directions, weights)):
         best = _best(name, directions, information_of(name, directions, weights))
         if best is None:
             break
@@ -162,14 +165,13 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
     return named
 
 
-def _stretched(name: str, directions: Floats, weights: Floats) -> bool:
-    """Tell whether a fit of these poses would still warn."""
-    information = information_of(name, directions, weights)
+def _stretched(name: str, information: Floats) -> bool:
+    """Tell whether a fit of poses with this information would be poor somewhere."""
     if np.linalg.matrix_rank(information, hermitian=True) < len(information):
         return True
     rows = over_the_sphere(name)
     errors = np.einsum('nip,pq,niq->n', rows, np.linalg.inv(information), rows)
-    return bool(np.max(errors) > WEAK_DILUTION ** 2)
+    return bool(np.max(errors) > _GOOD_DILUTION ** 2)
 
 
 def _best(name: str, directions: Floats, information: Floats) -> int | None:

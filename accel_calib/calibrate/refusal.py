@@ -32,9 +32,11 @@ from .geometry import (
     LARGEST_DILUTION,
     NORM_MODELS,
     poses_needed,
+    WEAK_DILUTION,
 )
 from .next_pose import missing_poses
 from ..errors import RefusedFitError
+from ..model import MODELS
 from ..table import Floats
 
 _SAID = 3
@@ -70,8 +72,9 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     if carries(name, directions, noise):
         return
     smaller = [other for other in NORM_MODELS if poses_needed(other) < poses_needed(name)
-               and carries(other, directions, noise)]
-    offer = f', or use model {smaller[-1]}, which these poses carry' if smaller else ''
+               and len(directions) >= poses_needed(other)
+               and dilution(other, directions, noise) <= WEAK_DILUTION]
+    offer = _offer(name, smaller[-1]) if smaller else ''
     few = len(directions) < poses_needed(NORM_MODELS[0])
     open_ = () if few else identifiability(name, directions, noise).undetermined
     raise RefusedFitError(
@@ -107,6 +110,14 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
                 f'with, so that model {chosen} was the largest to choose; take more poses',)
     return (f'the poses do not determine {words_of(open_)}, so that model {chosen} was the '
             f'largest to choose; to see them, {_add(missing)}',)
+
+
+def _offer(name: str, smaller: str) -> str:
+    """Offer a smaller model, with what it leaves out."""
+    without = [effect for effect in MODELS['10' if name == '9' else name]
+               if effect not in MODELS[smaller]]
+    return (f', or use model {smaller}, which these poses carry: it leaves out '
+            f'{_and(without)}')
 
 
 def words_of(open_: Sequence[Combination]) -> str:

@@ -156,7 +156,9 @@ def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
 
 def then(asked: NextPose) -> str:
     """Say what to do next."""
-    return asked.words if asked.direction is not None else f'{asked.words}; call ~/fit'
+    if asked.direction is None:
+        return f'{asked.words}; call ~/fit'
+    return asked.words if np.isinf(asked.error) else f'{asked.words}, or call ~/fit'
 
 
 def warm_up() -> None:

@@ -79,6 +79,8 @@ class Health:
         What the last of them was, or empty.
     threshold : float
         Largest standard deviation of a still axis [m/s², or native].
+    next_pose : str
+        Which pose helps most next, or that more no longer pay.
 
     """
 
@@ -102,6 +104,7 @@ class Health:
     interruptions: int
     last_interruption: str
     threshold: float
+    next_pose: str
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def _calibration(health: Health) -> Finding:
         return Finding('calibration', _ERROR, health.problem)
     if not health.calibration:
         return Finding('calibration', _WARN, f'no calibration yet, {health.poses} poses captured: '
-                                             'turn the sensor, then call ~/fit')
+                                             f'{health.next_pose or "turn the sensor"}')
     return Finding('calibration', _OK, health.calibration)
 
 
@@ -182,6 +185,7 @@ def _figures(health: Health) -> Iterable[tuple[str, str]]:
     yield 'drift since calibration [mg]', _number(health.drift * MG)
     yield 'since last rest [s]', _number(health.rest_ago)
     yield 'poses captured', str(health.poses)
+    yield 'next pose', health.next_pose
     yield 'interruptions of the clock', str(health.interruptions)
     yield 'last interruption', health.last_interruption or 'none'
     yield 'temperature [°C]', _number(health.temperature)

@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Poses, stored and drawn as they come."""
+"""Poses, stored and drawn as they come, with the next one asked for."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .fitting import asked_for, poses_up, warm_up
+from .fitting import asked_for, poses_up, then, warm_up
 from .markers import pose_markers
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class PoseView:
 
     def __init__(self, node: CalibratorNode) -> None:
         self._node = node
+        self.next = ''
 
     def show(self, *, store: bool) -> None:
         """Draw the poses and the next one asked for, and store them where that is asked."""
@@ -67,4 +68,12 @@ class PoseView:
         except OSError as error:
             node.get_logger().error(f'the poses cannot be stored: {error}; mend the permissions, '
                                     'or set calibration_file', throttle_duration_sec=10.0)
+        if asked is not None:
+            self._tell(asked, len(poses))
         node.poses.publish(pose_markers(poses_up(poses, node.units), asked, node.frame_id))
+
+    def _tell(self, asked: NextPose, count: int) -> None:
+        """Say what to do next, in the log where there is no RViz."""
+        before, self.next = self.next, then(asked)
+        if count and self.next != before:
+            self._node.get_logger().info(f'{count} poses; {self.next}')

@@ -89,7 +89,7 @@ class Vitals:
             drift_warn=node.settings.drift_warn / node.settings.gravity,
             poses=len(node.watch.book.poses()), interruptions=len(breaks),
             last_interruption=f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else '',
-            threshold=detector.threshold)
+            threshold=detector.threshold, next_pose=node.commands.view.next)
 
     def _state(self, node: CalibratorNode) -> str:
         if not node.applied.enabled:

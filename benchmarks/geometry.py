@@ -1,0 +1,254 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Poses that cannot carry model 10: are they refused, and does the way out lead out.
+
+12 poses of a sensor with offset, gains and cross-axis gains, noise of a pose mean 0.3 mg an axis,
+in directions that are poor in some way and by some degrees, and in good ones. For each set: is the
+fit refused; by how much is |a| wrong (RMS over fresh directions) where it is not; by how much had
+it been fitted all the same; which smaller model is offered; and how good is the fit once the poses
+that the refusal names have been added, each held 5° off. "5 directions, held 1° off" are poses 1°
+off in each of two axes. Of 12 random directions one set in a hundred leaves a gap of its own.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import re
+import sys
+
+from accel_calib.calibrate import closed_form, fit_poses
+from accel_calib.calibrate.likelihood import fit_norm
+from accel_calib.errors import RefusedFitError
+from accel_calib.model import predict, sensor_force, with_linear_part
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.table import Floats, numbered, Poses
+from accel_calib.units import MG, units_of
+from figures import Line, table
+import numpy as np
+
+G = units_of('g')
+COUNT = 12
+FAR = 10.0
+"""An error of |a| that no one would want: twice that of leaving the cross-axis gains out [mg]."""
+
+Draw = Callable[[np.random.Generator], Floats]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a set: errors in mg, NaN where there is none."""
+
+    refused: bool
+    error: float
+    forced: float
+    offered: str
+    added: int
+    mended: float
+
+
+def held(directions: Floats, degrees: float, rng: np.random.Generator) -> Floats:
+    """Turn each direction by some degrees in each of two axes."""
+    off = rng.normal(size=directions.shape) * np.radians(degrees)
+    turned = directions + off - directions * np.sum(off * directions, axis=1, keepdims=True)
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def some(directions: Floats) -> Floats:
+    """Repeat directions up to 12."""
+    return directions[np.arange(COUNT) % len(directions)]
+
+
+def faces(degrees: float) -> Draw:
+    """Draw the six faces, each twice."""
+    return lambda rng: held(some(np.vstack([np.eye(3), -np.eye(3)])), degrees, rng)
+
+
+def five(degrees: float) -> Draw:
+    """Draw poses about five random directions."""
+    return lambda rng: held(some(random_directions(5, rng)), degrees, rng)
+
+
+def plane(degrees: float) -> Draw:
+    """Draw poses about a random plane."""
+    def draw(rng: np.random.Generator) -> Floats:
+        angle = rng.uniform(0.0, 2.0 * np.pi, COUNT)
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        ring = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) @ axes.T
+        return held(ring, degrees, rng)
+    return draw
+
+
+def cone(degrees: float) -> Draw:
+    """Draw poses evenly in a cone about a random axis."""
+    def draw(rng: np.random.Generator) -> Floats:
+        z = rng.uniform(np.cos(np.radians(degrees)), 1.0, COUNT)
+        angle, radius = rng.uniform(0.0, 2.0 * np.pi, COUNT), np.sqrt(1.0 - z ** 2)
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z]) @ axes.T
+    return draw
+
+
+CASES: dict[str, tuple[Draw, float | None]] = {
+    **{f'5 directions, held {off:g}° off': (five(off), 1.0 if off < 1 else None)
+       for off in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)},
+    **{f'in a {angle:g}° cone': (cone(angle), 1.0 if angle <= 45 else None)
+       for angle in (30.0, 45.0, 60.0, 75.0)},
+    **{f'in a plane, held {off:g}° off': (plane(off), 1.0 if off < 2 else None)
+       for off in (0.0, 1.0, 2.0, 5.0, 10.0)},
+    **{f'six faces twice, held {off:g}° off': (faces(off), 1.0 if off < 0.5 else None)
+       for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
+    'random directions': (lambda rng: random_directions(COUNT, rng), 0.0),
+    'spread, held 10° off': (lambda rng: held(spread_directions(COUNT), 10.0, rng), 0.0)}
+"""How the directions are drawn, and the share of the sets that is to be refused, where known."""
+
+
+def rms(force: Floats) -> float:
+    """Give the RMS error of |force| [mg]."""
+    return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * MG)
+
+
+def forced(poses: Poses, reading: Floats) -> float:
+    """Give the error of a fit that is not refused, without asking whether it should be."""
+    try:
+        start = with_linear_part(*closed_form.fit_10(poses.reading))
+        fit = fit_norm(start, poses.reading, poses.columns, poses.noise)
+        return rms(sensor_force(fit.model, reading, {}))
+    except (RefusedFitError, np.linalg.LinAlgError):
+        return np.inf
+
+
+def fitted(poses: Poses, reading: Floats, model: str) -> float:
+    """Give the error of a fit; NaN where it is refused."""
+    try:
+        return rms(fit_poses(poses, G, model=model).correct(reading))
+    except RefusedFitError:
+        return np.nan
+
+
+def named(advice: str) -> Floats:
+    """Give the directions that words such as (+x -z) name, (n, 3)."""
+    found = []
+    for part in re.findall(r'\([-+xyz ]+\)', advice):
+        signs = {axis: float(f'{sign}1') for sign, axis in re.findall('([+-])([xyz])', part)}
+        found.append([signs.get(axis, 0.0) for axis in 'xyz'])
+    directions = np.array(found).reshape(-1, 3)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def run(draw: Draw, seed: Sequence[int]) -> Outcome:
+    """Draw a set and fit it."""
+    rng = np.random.default_rng(seed)
+    sizes = {'offset': 0.03, 'axis_gain': 0.02, 'cross_axis': 0.01}
+    model = model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
+    reading = predict(model, random_directions(500, rng), {})
+    directions = draw(rng)
+    poses = simulate_poses(model, directions, rng)
+    error = forced(poses, reading)
+    try:
+        return Outcome(False, rms(fit_poses(poses, G, model='10').correct(reading)), error, '', 0,
+                       np.nan)
+    except RefusedFitError as refusal:
+        more = named(refusal.advice)
+        offer = re.search(r'or use model (\d+)', refusal.advice)
+        offered = offer.group(1) if offer else ''
+        again = joined(poses, simulate_poses(model, held(more, 5.0, rng), rng))
+        smaller = fitted(poses, reading, offered) if offered else np.nan
+        return Outcome(True, smaller, error, offered, len(more), fitted(again, reading, '10'))
+
+
+def joined(poses: Poses, more: Poses) -> Poses:
+    """Put poses behind others."""
+    columns = {key: np.concatenate([poses[key], more[key]]) for key in poses.columns}
+    return Poses(columns, numbered(columns))
+
+
+def median(values: Sequence[float]) -> str:
+    """Give the median and the worst as text; empty where there is none."""
+    known = [value for value in values if not np.isnan(value)]
+    if not known:
+        return ''
+    return f'{np.median(known):.3g} ({np.max(known):.3g})'
+
+
+def row(name: str, outcomes: Sequence[Outcome]) -> str:
+    """Make a row of the table by case."""
+    out = [each for each in outcomes if each.refused]
+    kept = [each for each in outcomes if not each.refused]
+    offers = [f'{np.mean([each.offered == name for each in out]):.0%} {name}'
+              for name in ('7', '4') if any(each.offered == name for each in out)]
+    cells = [name, f'{len(out) / len(outcomes):.1%}', median([each.forced for each in out]),
+             median([each.error for each in kept]), ', '.join(offers),
+             median([each.error for each in out]),
+             median([each.added for each in out]), median([each.mended for each in out])]
+    return f'| {" | ".join(cells)} |'
+
+
+def lines_of(name: str, outcomes: Sequence[Outcome], share: float | None) -> list[Line]:
+    """Make the lines of what was asked."""
+    if share is None:
+        return []
+    refused = float(np.mean([each.refused for each in outcomes]))
+    asked, met = ('100 %', refused == 1.0) if share else ('0 %', refused == 0.0)
+    return [Line(f'{name}: refused for model 10', f'{refused:.1%}', asked, len(outcomes), met)]
+
+
+def overall(outcomes: Sequence[Outcome]) -> list[Line]:
+    """Make the lines over all sets."""
+    far = [each for each in outcomes if each.forced > FAR]
+    out = [each for each in outcomes if each.refused]
+    kept = [each.error for each in outcomes if not each.refused]
+    mended = float(np.mean([each.mended <= 0.6 for each in out]))
+    caught = float(np.mean([each.refused for each in far]))
+    return [Line(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
+                 f'{caught:.2%}', '100 %', len(far), caught == 1.0),
+            Line('all sets fitted: error of |a|, median (worst) [mg]', median(kept), '', len(kept),
+                 None),
+            Line('all sets refused: within 0.6 mg once the poses named are added', f'{mended:.1%}',
+                 '', len(out), None)]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--sets', type=int, default=200)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
+    given = parser.parse_args(arguments)
+    lines, everything = [], []
+    heads = ('12 poses', 'refused for 10', 'error had it been fitted, median (worst) [mg]',
+             'error where it was fitted [mg]', 'offered instead', 'error of that [mg]',
+             'poses to add', 'error with them [mg]')
+    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    for name, (draw, share) in CASES.items():
+        outcomes = [run(draw, [given.seed, k]) for k in range(given.sets)]
+        everything += outcomes
+        lines += lines_of(name, outcomes, share)
+        rows.append(row(name, outcomes))
+    text = (f'# Figures of poor geometry\n\n{__doc__.strip()}\n\nMade by `python '
+            f'benchmarks/geometry.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
+            f'\n\n{table(lines + overall(everything))}\n\n' + '\n'.join(rows) + '\n')
+    print(text)
+    if given.markdown:
+        given.markdown.write_text(text, encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

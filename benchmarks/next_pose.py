@@ -1,0 +1,191 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+How many poses it takes to know |a|, by the order in which they are taken.
+
+A sensor with offset, gains and cross-axis gains, noise of a pose mean 0.3 mg an axis, is turned
+pose by pose: as the node asks, in an order that comes to mind (faces, edges, corners), or at
+random. After each pose model 10 is fitted, and the RMS error of |a| measured on fresh directions.
+A person holds an attitude 10° off in each of two axes. The report is the number of poses from
+which on the median over the sets stays below 0.3 mg.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+import sys
+
+from accel_calib.calibrate import directions_of, fit_poses, next_pose
+from accel_calib.calibrate.geometry import noise_along
+from accel_calib.errors import RefusedFitError
+from accel_calib.model import Model, predict
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions
+from accel_calib.table import Floats, Poses
+from accel_calib.units import MG, units_of
+from figures import Line, table
+import numpy as np
+
+G = units_of('g')
+AIM = 0.3
+NOISE, SAMPLES = 0.003, 100
+FEWEST, MOST = 9, 26
+OFF = np.radians(10.0)
+SHOWN = (9, 10, 11, 12, 14, 16, 18, 20, 24)
+
+Order = Callable[[Poses | None, int, np.random.Generator], Floats]
+
+
+def attitudes() -> Floats:
+    """Give the 6 faces, 12 edges and 8 corners, (26, 3)."""
+    signs = [s for s in product((0, 1, -1), repeat=3) if any(s)]
+    found = np.array(sorted(signs, key=lambda each: sum(map(abs, each))), float)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def held(direction: Floats, rng: np.random.Generator) -> Floats:
+    """Give a direction as a person holds it."""
+    off = rng.normal(size=3) * OFF
+    turned = direction + off - direction * (off @ direction)
+    return turned / np.linalg.norm(turned)
+
+
+def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
+    """Give the direction that the node asks for; any, when it says that more do not pay."""
+    if poses is None:
+        found = next_pose(np.zeros((0, 3)))
+    else:
+        directions = directions_of(poses, G)
+        found = next_pose(directions, '10', noise_along(poses.noise, directions))
+    return attitudes()[rng.integers(26)] if found.direction is None else found.direction
+
+
+def in_order(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
+    """Give the faces, then the edges, then the corners."""
+    return attitudes()[count % 26]
+
+
+def at_random(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
+    """Give a direction of the sphere."""
+    return random_directions(1, rng)[0]
+
+
+def of_the_26(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
+    """Give one of the 26 attitudes."""
+    return attitudes()[rng.integers(26)]
+
+
+ORDERS: dict[str, tuple[Order, bool]] = {
+    'as asked, held 10° off': (asked, True),
+    'as asked, held exactly': (asked, False),
+    'faces, edges, corners, held 10° off': (in_order, True),
+    'faces, edges, corners, held exactly': (in_order, False),
+    'random among the 26, held 10° off': (of_the_26, True),
+    'random directions': (at_random, False)}
+
+
+def sensor(rng: np.random.Generator) -> Model:
+    """Draw a sensor."""
+    return model_with({'offset': rng.normal(size=3) * 0.03, 'axis_gain': rng.normal(size=3) * 0.02,
+                       'cross_axis': rng.normal(size=3) * 0.01})
+
+
+def error(model: Model, poses: Poses, fresh: Floats) -> float:
+    """Give the RMS error of |a| on fresh directions [mg]; infinite where the fit is refused."""
+    try:
+        fitted = fit_poses(poses, G, model='10')
+    except RefusedFitError:
+        return np.inf
+    force = fitted.correct(predict(model, fresh, {}))
+    return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * MG)
+
+
+def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], float]:
+    """Turn a sensor; give the errors from `FEWEST` poses on, and when more no longer paid."""
+    rng = np.random.default_rng(seed)
+    model, fresh = sensor(rng), random_directions(500, rng)
+    poses: Poses | None = None
+    errors, enough = [], np.inf
+    for count in range(MOST):
+        direction = order(poses, count, rng)
+        direction = held(direction, rng) if by_hand else direction
+        one = simulate_poses(model, direction[np.newaxis], rng, noise_g=NOISE, samples=SAMPLES)
+        poses = one if poses is None else joined(poses, one)
+        if count + 1 >= FEWEST:
+            errors.append(error(model, poses, fresh))
+            directions = directions_of(poses, G)
+            if next_pose(directions, '10').direction is None:
+                enough = min(enough, count + 1)
+    return errors, enough
+
+
+def joined(poses: Poses, one: Poses) -> Poses:
+    """Put a pose behind the others."""
+    columns = {key: np.concatenate([poses[key], one[key]]) for key in poses.columns}
+    return Poses(columns, np.arange(1, len(poses) + 2))
+
+
+def first_below(medians: Floats) -> int | None:
+    """Give the number of poses from which on the median stays below the aim."""
+    above = np.flatnonzero(~(medians <= AIM))
+    first = 0 if len(above) == 0 else int(above[-1]) + 1
+    return FEWEST + first if first < len(medians) else None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--sets', type=int, default=200)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
+    given = parser.parse_args(arguments)
+    lines, needed = [], {}
+    heads = ['poses', *map(str, SHOWN)]
+    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    for name, (order, by_hand) in ORDERS.items():
+        found = [run(order, by_hand, [given.seed, k]) for k in range(given.sets)]
+        medians = np.median([errors for errors, _ in found], axis=0)
+        needed[name] = first_below(medians)
+        rows.append(f'| {name} | ' + ' | '.join(
+            f'{medians[count - FEWEST]:.3f}' for count in SHOWN) + ' |')
+        lines.append(Line(f'poses to {AIM} mg, {name}', str(needed[name] or f'over {MOST}'), '',
+                          given.sets, None))
+        if order is asked:
+            enough = np.array([count for _, count in found])
+            there = [errors[int(min(count, MOST)) - FEWEST] for errors, count in found]
+            lines.append(Line(f'poses when more no longer pay, {name}',
+                              f'{np.median(enough):.0f} ({np.min(enough):.0f} to '
+                              f'{np.max(enough):.0f}), {np.median(there):.3f} mg', '',
+                              given.sets, None))
+    ours = needed['as asked, held 10° off']
+    for name in ('random directions', 'random among the 26, held 10° off',
+                 'faces, edges, corners, held 10° off'):
+        if ours is not None and needed[name] is not None:
+            lines.append(Line(f'as asked against {name}', f'{needed[name] - ours} poses fewer',
+                              'fewer', given.sets, bool(needed[name] > ours)))
+    text = (f'# Figures of the next pose\n\n{__doc__.strip()}\n\nMade by `python '
+            f'benchmarks/next_pose.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
+            f'\n\n{table(lines)}\n\nMedian error of |a| [mg]:\n\n' + '\n'.join(rows) + '\n')
+    print(text)
+    if given.markdown:
+        given.markdown.write_text(text, encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
