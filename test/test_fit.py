@@ -248,6 +248,63 @@ def test_readings_plainly_in_another_unit_are_refused(scale, units, says):
         fit_poses(poses.with_columns(reading=poses.reading * scale), units_of(units))
 
 
+def placed(seed, degrees, count=12, **settings):
+    """Six faces and more, each turned by so much from where it is said to be."""
+    rng = np.random.default_rng(seed)
+    said = np.vstack([FACES, spread_directions(count - 6)]) if count > 6 else FACES
+    across = np.cross(said, random_directions(count, rng))
+    angle = np.radians(degrees)
+    real = said * np.cos(angle) + np.sin(angle) * across / np.linalg.norm(
+        across, axis=1, keepdims=True)
+    model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
+    return model, simulate_poses(model, real, rng, **settings).with_columns(reference=said)
+
+
+def error_mg(calibration, model):
+    force = calibration.correct(predict(model, spread_directions(300), {}))
+    return np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * 1e3
+
+
+@pytest.mark.parametrize('model', ['auto', '12'])
+def test_badly_placed_orientations_give_way_to_the_norm(model):
+    found, errors, turned = [], [], []
+    for seed in range(20):
+        truth, poses = placed(seed, 2.0)
+        calibration = fit_poses(poses, G, model=model)
+        found.append(calibration.name)
+        errors.append(error_mg(calibration, truth))
+        across = calibration.correct(predict(truth, np.eye(3), {}))
+        turned.append(np.degrees(np.max(np.abs(across - across.T)) / 2))
+    assert found == ['10'] * 20
+    assert 'rests on |force| = 1 g alone' in calibration.warnings[0]
+    assert '1.9° (RMS) off' in calibration.reason
+    assert np.median(errors) < 0.4
+    assert np.median(turned) < 1.0  # the axes follow the orientations, on average
+
+
+def test_one_misplaced_pose_is_named_and_does_not_turn_the_axes():
+    truth, poses = placed(3, 0.0)
+    said = poses['reference'].copy()
+    said[4] = said[[4]] @ rotation_from_rpy(0.2, 0.0, 0.0).T
+    calibration = fit_poses(poses.with_columns(reference=said), G)
+    assert 'the most in row 5' in calibration.reason
+    np.testing.assert_allclose(calibration.correct(predict(truth, np.eye(3), {})), np.eye(3),
+                               atol=4e-3)
+
+
+@pytest.mark.parametrize('noise_g', [0.0003, 0.003, 0.03])
+def test_well_placed_orientations_are_used(noise_g):
+    names = [fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name for seed in range(30)]
+    assert names == ['12'] * 30
+
+
+def test_six_faces_alone_warn_of_their_placement():
+    calibration = fit_poses(placed(1, 2.0, 6)[1], G)
+    assert calibration.name == '12'
+    assert any('off the given orientations' in text for text in calibration.warnings)
+    assert not fit_poses(placed(1, 0.0, 6)[1], G).warnings
+
+
 def test_model_12_without_orientations_is_refused():
     with pytest.raises(RefusedFitError, match='needs known orientations'):
         fit_poses(simulated(15, 20)[1], G, model='12')

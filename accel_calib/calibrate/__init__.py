@@ -15,13 +15,14 @@
 """Poses to calibration: closed forms, maximum likelihood, mounting, and the record of it."""
 
 from .calibration import Calibration, level, Quality, Rejected
-from .fit import check_units, directions_of, fit_poses, METHODS, MODEL_NAMES
+from .fit import check_units, fit_poses, METHODS, MODEL_NAMES
 from .geometry import coverage, Identifiability, identifiability
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
 from .next_pose import next_pose, NextPose
 from .outlook import Outlook, outlook
 from .quality import in_g, Verification, verify
 from .sensing_axes import sensing_axes, SensingAxes
+from .unknown import directions_of
 
 __all__ = [
            'FRAMES',

@@ -61,12 +61,12 @@ def _outlook(found: Outlook) -> dict[str, Any]:
 
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:
-    """Give what the report calls the parameters of models 9 and 12."""
+    """Give what the report calls the parameters of model 9, and of known orientations."""
     if calibration.name == '9':
         axes = sensing_axes(calibration.gain, calibration.offset)
         return {'shifts': axes.shifts, 'scales': axes.scales,
                 'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
-    if calibration.name == '12':
+    if 'reference' in calibration.poses:
         return {'matrix': calibration.gain @ calibration.model.rotation,
                 'shift': calibration.offset}
     return {}

@@ -28,7 +28,7 @@ import math
 from typing import Any
 
 from ..calibrate import FrameName, FRAMES, METHODS, MODEL_NAMES
-from ..calibrate.fit import Method
+from ..calibrate.unknown import Method
 from ..capture import CaptureSettings, Repeated
 from ..capture.settings import REPEATED
 from ..errors import InputError

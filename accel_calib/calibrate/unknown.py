@@ -1,0 +1,236 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses of unknown orientation: which are disturbed, which model, the fit, how good it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import closed_form
+from .calibration import Calibration, Rejected
+from .disturbed import extreme, ROUNDS
+from .geometry import dilution, free_parameters, noise_along, NORM_MODELS, WEAK_DILUTION
+from .likelihood import Fit, fit_norm, judge, norm_fit_at
+from .norm_fit import form_of
+from .quality import in_g, quality_of
+from .refusal import carries, refuse_if_unfit, unseen
+from .selection import choose
+from .sensing_axes import lower_triangular
+from ..table import Floats, Poses
+from ..units import MG, Units
+
+Method = Literal['ml', 'algebraic']
+
+_CLOSED_FORMS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
+    '4': closed_form.fit_4, '7': closed_form.fit_7,
+    '9': closed_form.fit_10, '10': closed_form.fit_10}
+
+
+def directions_of(poses: Poses, units: Units) -> Floats:
+    """
+    Say where up is in each pose, as far as it is known before a fit.
+
+    Parameters
+    ----------
+    poses : Poses
+        In the unit of the readings.
+    units : Units
+        That unit; native readings mean nothing but from the centre of their sphere.
+
+    Returns
+    -------
+    (n, 3) array
+        Unit vectors in the axes of the sensor, from the centre of the readings where that is
+        plain.
+
+    """
+    raw = _unit(poses.reading)
+    if units.name != 'native' and dilution('4', raw) > WEAK_DILUTION:
+        return raw
+    return _unit(poses.reading - closed_form.fit_4(poses.reading)[1])
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Give (n, 3) vectors at length 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+@dataclass(frozen=True)
+class NormFit:
+    """
+    What poses of unknown orientation come to.
+
+    Parameters
+    ----------
+    name : str
+        The model.
+    reason : str
+        Why this one.
+    fit : Fit
+        To the poses that are kept.
+    kept : (k,) array of int
+        Indices of these poses.
+    warnings : tuple of str
+        What a user should know.
+
+    """
+
+    name: str
+    reason: str
+    fit: Fit
+    kept: NDArray[np.intp]
+    warnings: tuple[str, ...]
+
+
+def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
+    """Fit poses of which only |force| = 1 g is known; arguments and errors as `fit_poses`."""
+    units = own_scale(poses, units)
+    found = solve_unknown(in_g(poses, units), directions_of(poses, units), model, method)
+    return calibration_of(found, poses, units, method)
+
+
+def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -> Calibration:
+    """Make the record of a fit to these poses."""
+    poses_g, fit = in_g(poses, units), found.fit
+    rejected = _rejections(poses_g, fit, np.setdiff1d(np.arange(len(poses)), found.kept))
+    kept = found.kept
+    quality = quality_of(fit, poses_g.take(kept), units, directions_of(poses, units)[kept])
+    return Calibration(found.name, method, fit.model, units, '', 'ros', '', fit.covariance,
+                       quality, poses, rejected, found.reason, found.warnings)
+
+
+def own_scale(poses: Poses, units: Units) -> Units:
+    """Give native units the scale that the poses show, and others as they are."""
+    if units.name != 'native':
+        return units
+    if len(poses) < free_parameters('4'):
+        refuse_if_unfit('4', np.zeros((len(poses), 3)))
+    return Units('native', float(closed_form.fit_4(poses.reading)[0][0, 0]))
+
+
+def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method) -> NormFit:
+    """
+    Fit poses in g by |force| = 1 g.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        In g.
+    directions : (n, 3) array
+        About where up is in each, unit vectors.
+    model : {'auto', '4', '7', '9', '10'}
+        The model, or the smallest that the poses call for.
+    method : {'ml', 'algebraic'}
+        As `fit_poses`.
+
+    Returns
+    -------
+    NormFit
+        The fit, and to which poses.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses cannot carry the model.
+
+    """
+    noise, least = noise_along(poses_g.noise, directions), model
+    kept, reason = np.arange(len(poses_g)), f'model {model} was asked for'
+    warnings: tuple[str, ...] = ()
+    if model == 'auto':
+        least = NORM_MODELS[0]
+    refuse_if_unfit(least, directions, noise)
+    if method == 'ml':
+        largest = _carried(directions, noise)[-1] if model == 'auto' else model
+        kept = _undisturbed(poses_g, largest)
+    left, directions, noise = poses_g.take(kept), directions[kept], noise[kept]
+    if len(kept) < len(poses_g):
+        refuse_if_unfit(least, directions, noise)
+    if model == 'auto':
+        carried = _carried(directions, noise)
+        fits = {name: _fit_rows(left, name, method) for name in carried}
+        choice = choose(fits)
+        model, reason = choice.name, choice.reason
+        warnings = unseen(carried[-1], directions, noise)
+        fit = fits[model]
+    else:
+        fit = _fit_rows(left, model, method)
+    return NormFit(model, reason, fit, kept,
+                   warnings_of(fit, dilution(model, directions, noise)) + warnings)
+
+
+def _carried(directions: Floats, noise: Floats) -> list[str]:
+    """Name the models that the poses carry, the smallest always."""
+    return [NORM_MODELS[0], *(name for name in NORM_MODELS[1:]
+                              if carries(name, directions, noise))]
+
+
+def _undisturbed(poses_g: Poses, name: str) -> NDArray[np.intp]:
+    """Give the indices of the poses that are not disturbed, as this model sees them."""
+    kept = np.arange(len(poses_g))
+    for _ in range(ROUNDS):
+        fit = _fit_rows(poses_g.take(kept), name, 'ml')
+        out = extreme(fit.weighted[np.newaxis], fit.jacobian[np.newaxis],
+                      np.ones((1, len(kept)), bool), fit.noise_known, len(poses_g))[0]
+        if not np.any(out):
+            break
+        kept = kept[~out]
+    return kept
+
+
+def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
+    """Fit a model for unknown orientation to poses in g."""
+    mat_w, vec_v = _CLOSED_FORMS[name](poses_g.reading)
+    if name == '9':
+        mat_w = lower_triangular(mat_w)
+    if method == 'ml':
+        return fit_norm(name, mat_w, vec_v, poses_g.reading, poses_g.noise)
+    if name == '9':  # the cost of the report is the likelihood without weights
+        mat_w, vec_v = fit_norm(name, mat_w, vec_v, poses_g.reading, None).model.linear_part
+    free = form_of(name).free(mat_w, vec_v)
+    return norm_fit_at(name, free, poses_g.reading, poses_g.noise)
+
+
+def _rejections(poses_g: Poses, fit: Fit, out: Floats) -> tuple[Rejected, ...]:
+    """Say of each pose left out how far it is from 1 g in the fit of the others."""
+    if len(out) == 0:
+        return ()
+    away = judge(fit.model, poses_g.reading, poses_g.columns, None).residual
+    return tuple(Rejected(int(poses_g.row[k]), f'disturbed: |force| is {away[k] * MG:+.2f} mg off '
+                          'what the other poses say') for k in out)
+
+
+def warnings_of(fit: Fit, stretched: float) -> tuple[str, ...]:
+    """Say what a user should know of a fit."""
+    warnings = []
+    if fit.dof == 0:
+        warnings.append('there are just as many poses as free parameters: nothing is left to '
+                        'check the fit with; take more poses')
+    if stretched > WEAK_DILUTION:
+        warnings.append(f'the poses leave a gap on the sphere: there the error is up to '
+                        f'{stretched:.0f} times that of a pose; take the next pose asked for')
+    if not fit.noise_known:
+        warnings.append('std and count of the poses are not given: the uncertainty comes from '
+                        'the residuals alone')
+    elif fit.dof > 0 and fit.chi2 / fit.dof > 4.0:
+        warnings.append(f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of '
+                        'the pose means: poses repeat worse than their samples say, or the model '
+                        'lacks an effect')
+    return tuple(warnings)
