@@ -18,10 +18,10 @@ Poses of known orientation: model 12, unless |force| = 1 g shows that they were 
 An orientation is known only as well as the sensor was placed. A placement error of 2° turns the
 force by 35 mg but does not change its length, so that the norm alone does not see it. Where the
 poses carry model 10, its forces are turned onto the known ones (orthogonal Procrustes problem,
-Schönemann 1966, each pose weighted by the inverse of its distance, so that one misplaced pose does
-not turn the others); what is left is all tangential. If an F test says that it is more than the
-noise and the uncertainty of the fit leave, the fit rests on |force| = 1 g alone and the known
-orientations give only the rotation of the axes, ΔR.
+Schönemann 1966, with Huber's weights, so that one misplaced pose does not turn the others); what
+is left is all tangential. If an F test says that it is more than the noise and the uncertainty of
+the fit leave, the fit rests on |force| = 1 g alone and the known orientations give only the
+rotation of the axes, ΔR.
 
 """
 
@@ -58,7 +58,7 @@ _PLAIN_CHI2 = 4.0
 """Residuals of known orientations that are worth a warning."""
 
 _ROUNDS = 20
-_SMALL_ANGLE = 1e-3
+_SMALL_ANGLE = 1e-6
 
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
@@ -148,7 +148,7 @@ def _turned_onto(unit: Floats, known: Floats) -> Floats:
         left, _, right = np.linalg.svd((unit * weight[:, np.newaxis]).T @ known)
         rotation: Floats = left @ right
         away = np.linalg.norm(unit - known @ rotation.T, axis=1)
-        weight = 1.0 / np.maximum(away, _SMALL_ANGLE)
+        weight = 1.0 / np.maximum(away, max(float(np.median(away)), _SMALL_ANGLE))
     return rotation
 
 
