@@ -35,7 +35,7 @@ import sys
 from accel_calib.calibrate import closed_form, fit_poses
 from accel_calib.calibrate.likelihood import fit_norm
 from accel_calib.errors import RefusedFitError
-from accel_calib.model import predict, sensor_force, with_linear_part
+from accel_calib.model import predict, sensor_force
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.table import Floats, numbered, Poses
@@ -45,6 +45,7 @@ import numpy as np
 
 G = units_of('g')
 COUNT = 12
+MODELS = ('4', '7', '9', '10', '12')
 FAR = 10.0
 """An error of |a| that no one would want: twice that of leaving the cross-axis gains out [mg]."""
 
@@ -56,6 +57,7 @@ class Outcome:
     """What came of a set: errors in mg, NaN where there is none."""
 
     refused: bool
+    carried: tuple[bool, ...]
     error: float
     forced: float
     offered: str
@@ -127,8 +129,8 @@ def rms(force: Floats) -> float:
 def forced(poses: Poses, reading: Floats) -> float:
     """Give the error of a fit that is not refused, without asking whether it should be."""
     try:
-        start = with_linear_part(*closed_form.fit_10(poses.reading))
-        fit = fit_norm(start, poses.reading, poses.columns, poses.noise)
+        start = closed_form.fit_10(poses.reading)
+        fit = fit_norm('10', *start, poses.reading, poses.noise)
         return rms(sensor_force(fit.model, reading, {}))
     except (RefusedFitError, np.linalg.LinAlgError):
         return np.inf
@@ -161,16 +163,20 @@ def run(draw: Draw, seed: Sequence[int]) -> Outcome:
     directions = draw(rng)
     poses = simulate_poses(model, directions, rng)
     error = forced(poses, reading)
+    known = poses.with_columns(reference=directions)
+    carried = tuple(not np.isnan(fitted(known if name == '12' else poses, reading, name))
+                    for name in MODELS)
     try:
-        return Outcome(False, rms(fit_poses(poses, G, model='10').correct(reading)), error, '', 0,
-                       np.nan)
+        found = rms(fit_poses(poses, G, model='10').correct(reading))
+        return Outcome(False, carried, found, error, '', 0, np.nan)
     except RefusedFitError as refusal:
         more = named(refusal.advice)
         offer = re.search(r'or use model (\d+)', refusal.advice)
         offered = offer.group(1) if offer else ''
         again = joined(poses, simulate_poses(model, held(more, 5.0, rng), rng))
         smaller = fitted(poses, reading, offered) if offered else np.nan
-        return Outcome(True, smaller, error, offered, len(more), fitted(again, reading, '10'))
+        return Outcome(True, carried, smaller, error, offered, len(more),
+                       fitted(again, reading, '10'))
 
 
 def joined(poses: Poses, more: Poses) -> Poses:
@@ -236,14 +242,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
              'error where it was fitted [mg]', 'offered instead', 'error of that [mg]',
              'poses to add', 'error with them [mg]')
     rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    models = [f'| refused for model | {" | ".join(MODELS)} |', '|---' * 6 + '|']
     for name, (draw, share) in CASES.items():
         outcomes = [run(draw, [given.seed, k]) for k in range(given.sets)]
         everything += outcomes
         lines += lines_of(name, outcomes, share)
         rows.append(row(name, outcomes))
+        shares = 1.0 - np.mean([each.carried for each in outcomes], axis=0)
+        models.append(f'| {name} | {" | ".join(f"{each:.1%}" for each in shares)} |')
     text = (f'# Figures of poor geometry\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/geometry.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
-            f'\n\n{table(lines + overall(everything))}\n\n' + '\n'.join(rows) + '\n')
+            f'\n\n{table(lines + overall(everything))}\n\n' + '\n'.join(rows)
+            + '\n\n' + '\n'.join(models) + '\n')
     print(text)
     if given.markdown:
         given.markdown.write_text(text, encoding='utf-8')

@@ -31,7 +31,7 @@ from pathlib import Path
 import sys
 
 from accel_calib.calibrate import directions_of, fit_poses, next_pose
-from accel_calib.calibrate.geometry import noise_along
+from accel_calib.calibrate.geometry import pose_noise
 from accel_calib.errors import RefusedFitError
 from accel_calib.model import Model, predict
 from accel_calib.simulate import model_with, simulate_poses
@@ -71,7 +71,7 @@ def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
         found = next_pose(np.zeros((0, 3)))
     else:
         directions = directions_of(poses, G)
-        found = next_pose(directions, '10', noise_along(poses.noise, directions))
+        found = next_pose(directions, '10', pose_noise(poses.noise, directions))
     return attitudes()[rng.integers(26)] if found.direction is None else found.direction
 
 

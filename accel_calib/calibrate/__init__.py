@@ -16,7 +16,8 @@
 
 from .calibration import Calibration, level, Quality, Rejected
 from .fit import check_units, fit_poses, METHODS, MODEL_NAMES
-from .geometry import coverage, Identifiability, identifiability
+from .geometry import coverage
+from .identifiability import Identifiability, identifiability
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
 from .next_pose import next_pose, NextPose
 from .outlook import Outlook, outlook

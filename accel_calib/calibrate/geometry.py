@@ -26,16 +26,13 @@ and the corrected |force| (of known orientation: the force) in a direction d is 
     √(Φ(d) M⁻¹ Φ(d)ᵀ)
 
 times the noise of a pose. The largest such root over the sphere, the dilution, says how far the
-poses are stretched: about 1 for 12 poses spread evenly. From the singular values of the rows come
-the combinations of parameters in the order in which the poses determine them; those that would
-push the dilution beyond a limit are left open.
+poses are stretched: about 1 for 12 poses spread evenly. What they leave open is in
+`accel_calib.calibrate.identifiability`.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -60,74 +57,7 @@ NORM_MODELS = ('4', '7', '10')
 
 _NEAR = np.cos(np.radians(45.0))
 _SAME = np.cos(np.radians(5.0))
-_SINGULAR, _SMALL = 1e-7, 1e-3
-_OPEN_PART = 0.1
-"""Part of a parameter in what is left open from which it is not determined."""
-
-_SAID_PART = 0.3
-"""Part of the largest weight in a combination that is told in words."""
-
-
-@dataclass(frozen=True)
-class Combination:
-    """
-    A combination of parameters that poses leave open.
-
-    Parameters
-    ----------
-    weights : mapping of str to float
-        By name of the parameter, the largest first; their squares add up to 1.
-    deviation : float
-        Its standard deviation over the noise of a pose; infinite where nothing tells it.
-
-    """
-
-    weights: Mapping[str, float]
-    deviation: float
-
-    @property
-    def words(self) -> str:
-        """Say it for a person, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
-        least = _SAID_PART * max(map(abs, self.weights.values()))
-        said = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
-        if len(said) == 1:
-            return said[0][0]
-        first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
-                          for name, weight in said)
-        return ' '.join([first.removeprefix('+ '), *others])
-
-
-@dataclass(frozen=True)
-class Identifiability:
-    """
-    What poses determine of a model.
-
-    Parameters
-    ----------
-    model : str
-        The model.
-    deviations : mapping of str to float
-        Of each parameter, standard deviation over the noise of a pose; infinite where nothing
-        tells it.
-    undetermined : tuple of Combination
-        What the poses leave open, so that without it they would carry the model.
-    dilution, mean_dilution : float
-        Error of |force| over that of a pose: the largest and the RMS over the sphere.
-
-    """
-
-    model: str
-    deviations: Mapping[str, float]
-    undetermined: tuple[Combination, ...]
-    dilution: float
-    mean_dilution: float
-
-    @property
-    def open_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the poses do not determine."""
-        part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in self.undetermined)
-                for name in self.deviations}
-        return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
+_SINGULAR, _NOTHING = 1e-7, 1e-14
 
 
 def parameters_of(name: str) -> tuple[str, ...]:
@@ -143,7 +73,7 @@ def rows_of(name: str, directions: Floats) -> Floats:
     return basis if name == '12' else np.einsum('ni,nip->np', directions, basis)[:, np.newaxis]
 
 
-def noise_along(noise: Floats | None, directions: Floats) -> Floats:
+def pose_noise(noise: Floats | None, directions: Floats) -> Floats:
     """Give the (n,) noise of |reading| from that of (n, 3) pose means; ones if it is unknown."""
     believed = None if noise is None or not len(noise) else believable(noise)
     if believed is None:
@@ -183,20 +113,10 @@ def poses_needed(name: str) -> int:
     return 4 if name == '12' else free_parameters(name)
 
 
-def _spectrum(name: str, directions: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Give the p singular values of the weighted rows, descending, and their (p, p) rows."""
-    rows = rows_of(name, directions) * np.sqrt(weights)[:, np.newaxis, np.newaxis]
-    triangle = np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode='r')
-    square = np.zeros((rows.shape[2], rows.shape[2]))
-    square[:len(triangle)] = triangle
-    _, scales, axes = np.linalg.svd(square)
-    return np.where(scales > _SINGULAR * max(scales[0], 1.0), scales, 0.0), axes
-
-
-def identifiability(name: str, directions: Floats, noise: Floats | None = None
-                    ) -> Identifiability:
+def spectrum(name: str, directions: Floats, noise: Floats | None = None
+             ) -> tuple[Floats, Floats, Floats]:
     """
-    Work out what poses determine.
+    Part a model into combinations of parameters, in the order in which poses determine them.
 
     Parameters
     ----------
@@ -209,49 +129,37 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None
 
     Returns
     -------
-    Identifiability
-        From the directions alone, before any fit.
+    (p,) array
+        Standard deviation of each combination over the noise of a pose, the smallest first;
+        infinite where nothing tells it.
+    (p, p) array
+        The combinations, rows of length 1.
+    (p, m) array
+        Error of |force| in m directions over that of a pose, squared, that the combinations up to
+        this one make.
 
     """
-    scales, axes = _spectrum(name, directions, relative_weights(noise, len(directions)))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        spread = (over_the_sphere(name) @ axes.T / scales) ** 2
-        parts = (axes.T / scales) ** 2
-    errors = np.cumsum(np.nan_to_num(np.sum(spread, axis=1), nan=0.0, posinf=np.inf), axis=1)
-    deviations = np.sqrt(np.sum(np.where(np.abs(axes.T) < _SINGULAR, 0.0, parts), axis=1))
-    worst = np.where(scales > 0.0, np.sqrt(np.max(errors, axis=0)), np.inf)
-    mean = float(np.sqrt(np.mean(errors[:, -1]))) if scales[-1] > 0.0 else np.inf
-    names = parameters_of(name)
-    open_ = _combinations(names, axes[worst > LARGEST_DILUTION], scales[worst > LARGEST_DILUTION])
-    return Identifiability(name, dict(zip(names, map(float, deviations), strict=True)), open_,
-                           float(worst[-1]), mean)
+    weights = relative_weights(noise, len(directions))
+    rows = rows_of(name, directions) * np.sqrt(weights)[:, np.newaxis, np.newaxis]
+    triangle = np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode='r')
+    square = np.zeros((rows.shape[2], rows.shape[2]))
+    square[:len(triangle)] = triangle
+    _, scales, axes = np.linalg.svd(square)
+    told = scales > _SINGULAR * max(scales[0], 1.0)
+    deviations = np.where(told, 1.0 / np.where(told, scales, 1.0), np.inf)
+    seen = np.sum((over_the_sphere(name) @ axes.T) ** 2, axis=1)
+    return deviations, axes, np.cumsum(times(seen, deviations ** 2), axis=1).T
 
 
-def _combinations(names: tuple[str, ...], axes: Floats, scales: Floats
-                  ) -> tuple[Combination, ...]:
-    """Say by few parameters each what the space of these (k, p) combinations is."""
-    from scipy.linalg import qr
-
-    if not len(axes):
-        return ()
-    pivots = qr(axes, mode='r', pivoting=True)[1][:len(axes)]
-    mixed = np.linalg.inv(axes[:, pivots])  # each combination has one pivot of its own
-    mixed = mixed / np.linalg.norm(mixed @ axes, axis=1, keepdims=True)
-    weights = mixed @ axes
-    with np.errstate(divide='ignore', invalid='ignore'):
-        shares = np.where(np.abs(mixed) < _SINGULAR, 0.0, np.abs(mixed) / scales)
-    found = []
-    for row, deviation in zip(weights, np.linalg.norm(shares, axis=1), strict=True):
-        order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
-        sign = np.sign(row[order[0]])
-        found.append(Combination({names[k]: float(sign * row[k]) for k in order},
-                                 float(deviation)))
-    return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
+def times(share: Floats, deviations: Floats) -> Floats:
+    """Give the product, 0 where the share is 0 of what is infinite."""
+    none = np.abs(share) < _NOTHING
+    return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
 
 
 def dilution(name: str, directions: Floats, noise: Floats | None = None) -> float:
     """
-    Say how far the poses are stretched by a model; arguments as `identifiability`.
+    Say how far the poses are stretched by a model; arguments as `spectrum`.
 
     Returns
     -------
@@ -260,7 +168,7 @@ def dilution(name: str, directions: Floats, noise: Floats | None = None) -> floa
         leave a parameter open.
 
     """
-    return identifiability(name, directions, noise).dilution
+    return float(np.sqrt(np.max(spectrum(name, directions, noise)[2][-1])))
 
 
 def coverage(directions: Floats) -> float:

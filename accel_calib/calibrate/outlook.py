@@ -20,7 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .calibration import Calibration
-from .geometry import Identifiability, identifiability, noise_along
+from .geometry import pose_noise
+from .identifiability import Identifiability, identifiability
 from .next_pose import next_pose, NextPose
 from ..sphere import spread_directions
 from ..table import Floats
@@ -66,9 +67,11 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     mat_w, vec_v = calibration.model.linear_part
     force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
-    noise = noise_along(poses.noise, directions)
+    noise = pose_noise(poses.noise, directions)
     uncertainty = _uncertainty(calibration)
-    planned = asked if asked != 'auto' else '12' if calibration.name == '12' else '10'
+    planned = asked
+    if asked in ('auto', '12'):  # where the orientations turned out wrong, 12 became a norm model
+        planned = '12' if calibration.name == '12' else '10'
     fitted = identifiability(calibration.name, directions, noise).mean_dilution
     known = None
     if np.isfinite(uncertainty) and np.isfinite(fitted):

@@ -25,15 +25,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from .geometry import (
-    Combination,
     dilution,
     distinct,
-    identifiability,
     LARGEST_DILUTION,
     NORM_MODELS,
     poses_needed,
     WEAK_DILUTION,
 )
+from .identifiability import Combination, identifiability
 from .next_pose import missing_poses
 from ..errors import RefusedFitError
 from ..model import MODELS
@@ -104,12 +103,9 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
     if chosen not in NORM_MODELS[:-1]:
         return ()
     open_ = identifiability(largest, directions, noise).undetermined
-    missing = missing_poses(largest, directions, noise)
-    if not open_ or not missing:
-        return (f'with {len(directions)} poses nothing would be left to check model {largest} '
-                f'with, so that model {chosen} was the largest to choose; take more poses',)
     return (f'the poses do not determine {words_of(open_)}, so that model {chosen} was the '
-            f'largest to choose; to see them, {_add(missing)}',)
+            f'largest to choose; to see them, '
+            f'{_add(missing_poses(largest, directions, noise))}',)
 
 
 def _offer(name: str, smaller: str) -> str:

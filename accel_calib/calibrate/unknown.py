@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from . import closed_form
 from .calibration import Calibration, Rejected
 from .disturbed import extreme, ROUNDS
-from .geometry import dilution, free_parameters, noise_along, NORM_MODELS, WEAK_DILUTION
+from .geometry import dilution, free_parameters, NORM_MODELS, pose_noise, WEAK_DILUTION
 from .likelihood import Fit, fit_norm, judge, norm_fit_at
 from .norm_fit import form_of
 from .quality import in_g, quality_of
@@ -151,7 +151,7 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
         If the poses cannot carry the model.
 
     """
-    noise, least = noise_along(poses_g.noise, directions), model
+    noise, least = pose_noise(poses_g.noise, directions), model
     kept, reason = np.arange(len(poses_g)), f'model {model} was asked for'
     warnings: tuple[str, ...] = ()
     if model == 'auto':

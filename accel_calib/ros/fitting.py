@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..calibrate import directions_of, fit_poses, level, next_pose
-from ..calibrate.geometry import noise_along
+from ..calibrate.geometry import pose_noise
 from ..calibrate.mounting import flat_direction
 from ..errors import RefusedFitError
 from ..refine import refine
@@ -150,7 +150,7 @@ def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
     up = poses_up(poses, units)
     known = poses.noise is not None and len(up) > 0
     return next_pose(up, '10' if model == 'auto' else model,
-                     units.to_g(noise_along(poses.noise, up)) if known else None,
+                     units.to_g(pose_noise(poses.noise, up)) if known else None,
                      in_g=units.name != 'native')
 
 

@@ -1,0 +1,142 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Which parameters poses determine, how well, and which combinations they leave open.
+
+From the singular values of the rows of `accel_calib.calibrate.geometry` come the combinations of
+parameters in the order in which the poses determine them. Those that would push the dilution
+beyond what a fit is refused for are left open; they are told by as few parameters as will do.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .geometry import LARGEST_DILUTION, parameters_of, spectrum, times
+from ..table import Floats
+
+_OPEN_PART = 0.1
+"""Part of a parameter in what is left open from which it is not determined."""
+
+_SAID_PART = 0.3
+"""Part of the largest weight in a combination that is told in words."""
+
+_SMALL = 1e-3
+"""Weights in a combination that are left out."""
+
+
+@dataclass(frozen=True)
+class Combination:
+    """
+    A combination of parameters that poses leave open.
+
+    Parameters
+    ----------
+    weights : mapping of str to float
+        By name of the parameter, the largest first; their squares add up to 1.
+    deviation : float
+        Its standard deviation over the noise of a pose; infinite where nothing tells it.
+
+    """
+
+    weights: Mapping[str, float]
+    deviation: float
+
+    @property
+    def words(self) -> str:
+        """Say it for a person, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
+        least = _SAID_PART * max(map(abs, self.weights.values()))
+        said = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
+        if len(said) == 1:
+            return said[0][0]
+        first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
+                          for name, weight in said)
+        return ' '.join([first.removeprefix('+ '), *others])
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """
+    What poses determine of a model.
+
+    Parameters
+    ----------
+    model : str
+        The model.
+    deviations : mapping of str to float
+        Of each parameter, standard deviation over the noise of a pose; infinite where nothing
+        tells it.
+    undetermined : tuple of Combination
+        What the poses leave open, so that without it they would carry the model.
+    dilution, mean_dilution : float
+        Error of |force| over that of a pose: the largest and the RMS over the sphere.
+
+    """
+
+    model: str
+    deviations: Mapping[str, float]
+    undetermined: tuple[Combination, ...]
+    dilution: float
+    mean_dilution: float
+
+    @property
+    def open_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the poses do not determine."""
+        part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in self.undetermined)
+                for name in self.deviations}
+        return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
+
+
+def identifiability(name: str, directions: Floats, noise: Floats | None = None
+                    ) -> Identifiability:
+    """
+    Work out what poses determine; arguments as `accel_calib.calibrate.geometry.spectrum`.
+
+    Returns
+    -------
+    Identifiability
+        From the directions alone, before any fit.
+
+    """
+    deviations, axes, errors = spectrum(name, directions, noise)
+    names = parameters_of(name)
+    each = np.sqrt(np.sum(times(axes.T ** 2, deviations ** 2), axis=1))
+    open_ = np.sqrt(np.max(errors, axis=1)) > LARGEST_DILUTION
+    return Identifiability(name, dict(zip(names, map(float, each), strict=True)),
+                           _combinations(names, axes[open_], deviations[open_]),
+                           float(np.sqrt(np.max(errors[-1]))), float(np.sqrt(np.mean(errors[-1]))))
+
+
+def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
+                  ) -> tuple[Combination, ...]:
+    """Say by few parameters each what the space of these (k, p) combinations is."""
+    from scipy.linalg import qr
+
+    if not len(axes):
+        return ()
+    pivots = qr(axes, mode='r', pivoting=True)[1][:len(axes)]
+    mixed = np.linalg.inv(axes[:, pivots])  # each combination has one pivot of its own
+    mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+    uncertain = np.sqrt(np.sum(times(mixed ** 2, deviations ** 2), axis=1))
+    found = []
+    for row, deviation in zip(mixed @ axes, uncertain, strict=True):
+        order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
+        sign = np.sign(row[order[0]])
+        found.append(Combination({names[k]: float(sign * row[k]) for k in order},
+                                 float(deviation)))
+    return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
