@@ -29,11 +29,12 @@ The nodes: convert, call, publish.
 `fitting`             poses to calibration, and words about it (no ROS)
 `storage`             where calibration and poses are kept (no ROS)
 `commands`            what services do; `answers` and `worker` how they answer
+`apart`               a process for what computes (no ROS)
 `vitals`, `health`    what is counted, and how it is judged
 `markers`             poses on the unit sphere; `pose_view` when they change
 ====================  ============================================================
 
 The calibrator's callbacks run in one thread, and only they change its state. What takes longer
-(fits, files) goes to `worker` and comes back as a callback.
+(fits, files) goes to `worker`, and computing from there to `apart`, and comes back as a callback.
 
 """

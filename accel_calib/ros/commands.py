@@ -130,7 +130,8 @@ class Commands:
         context = node.message_context
 
         def job() -> tuple[Calibration, OSError | None]:
-            calibration = fitted(poses, units, settings, sensor, before, context)
+            calibration = node.worker.apart.call(fitted, poses, units, settings, sensor, before,
+                                                 context)
             return calibration, _stored(store, calibration)
 
         def finish(found: tuple[Calibration, OSError | None]) -> str:
@@ -147,7 +148,7 @@ class Commands:
         units, sensor = node.units, node.sensor
 
         def job() -> tuple[Refinement, OSError | None]:
-            refinement = refined(poses, units, sensor, before)
+            refinement = node.worker.apart.call(refined, poses, units, sensor, before)
             return refinement, _stored(store, refinement.calibration)
 
         def finish(found: tuple[Refinement, OSError | None]) -> str:

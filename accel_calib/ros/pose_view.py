@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .fitting import asked_for, poses_up, then, warm_up
+from .fitting import asked_for, poses_up, then
 from .markers import pose_markers
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ class PoseView:
         def job() -> NextPose:
             if where is not None:
                 where.save_poses(poses)
-            if len(poses):
-                warm_up()
-            return asked_for(poses, units, model)
+            if not len(poses):
+                return asked_for(poses, units, model)
+            return node.worker.apart.call(asked_for, poses, units, model)
 
         node.worker.run(job, lambda done: self._draw(done, poses))
 

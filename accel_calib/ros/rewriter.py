@@ -116,8 +116,9 @@ class Rewriter:
             self._see_force(spread)
         if self._own is not None:
             spread = NINE.pack(*map(add, self._own, self._uncertainty(force, context)))
-        front = self._front(data) if self._turns or self._name else data[:self._force]
-        return front + THREE.pack(*force) + spread
+        if not self._name and not self._turns:
+            return data[:self._force] + THREE.pack(*force) + spread
+        return self._front(data) + THREE.pack(*force) + spread
 
     def _context(self, data: bytes, temperature: float) -> PlainContext:
         """Give what `context.context_of_message` gives, in plain floats."""

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
 import struct
 from typing import Any, TYPE_CHECKING
@@ -57,35 +58,43 @@ class Layout:
     ----------
     name : bytes
         Length and letters of frame_id, as they are in the message.
+    name_end : int
+        Where frame_id ends.
     begin : int
         Where the 37 doubles begin.
+    size : int
+        Length of a message.
 
     """
 
     name: bytes
+    name_end: int
     begin: int
-
-    @property
-    def size(self) -> int:
-        """Give the length of a message."""
-        return self.begin + _FIELDS_SIZE
-
-    @property
-    def name_end(self) -> int:
-        """Give where frame_id ends."""
-        return NAME_AT + len(self.name)
+    size: int
 
     @property
     def frame_id(self) -> str:
         """Give frame_id."""
         return self.name[4:-1].decode(errors='replace')
 
+    @cached_property
+    def kind(self) -> np.dtype[np.void]:
+        """Give the message as a type of numpy."""
+        return np.dtype({'names': ['sec', 'nanosec', 'fields'],
+                         'formats': ['<i4', '<u4', f'<{imu.FIELDS}f8'],
+                         'offsets': [4, 8, self.begin], 'itemsize': self.size})
+
+
+def _layout_named(name: bytes) -> Layout:
+    begin = 4 + -(-(NAME_AT - 4 + len(name)) // 8) * 8
+    return Layout(name, NAME_AT + len(name), begin, begin + _FIELDS_SIZE)
+
 
 def layout_with(frame_id: str) -> Layout:
     """Give the layout of messages with this frame_id."""
     letters = frame_id.encode() + b'\x00'
     name = len(letters).to_bytes(4, 'little') + letters
-    return Layout(name, 4 + -(-(8 + len(name)) // 8) * 8)
+    return _layout_named(name)
 
 
 def layout_of(data: bytes) -> Layout | None:
@@ -94,7 +103,7 @@ def layout_of(data: bytes) -> Layout | None:
         return None
     length = int.from_bytes(data[NAME_AT:NAME_AT + 4], 'little')
     name = data[NAME_AT:NAME_AT + 4 + length]
-    layout = Layout(name, 4 + -(-(8 + len(name)) // 8) * 8)
+    layout = _layout_named(name)
     whole = len(data) == layout.size and length > 0 and len(name) == 4 + length
     return layout if whole and name[-1] == 0 else None
 
@@ -118,10 +127,7 @@ def rows_of(messages: Sequence[bytes], layout: Layout, temperature: float) -> Fl
         Time [s], reading, rate (NaN: none), temperature, supply voltage (NaN).
 
     """
-    kind = np.dtype({'names': ['sec', 'nanosec', 'fields'],
-                     'formats': ['<i4', '<u4', f'<{imu.FIELDS}f8'],
-                     'offsets': [4, 8, layout.begin], 'itemsize': layout.size})
-    found = np.frombuffer(b''.join(messages), kind)
+    found = np.frombuffer(b''.join(messages), layout.kind)
     fields = found['fields']
     rows = np.empty((len(messages), 9))
     rows[:, 0] = found['sec'] + found['nanosec'] * 1e-9

@@ -60,14 +60,14 @@ if TYPE_CHECKING:
     from ..effects import Context
     from ..table import Floats
 
-_TOGETHER = 0.02
+_TOGETHER = 0.05
 """So long messages wait to be taken in by the watch [s]; listeners are counted as often."""
 
 _SAY_AGAIN = 10.0
 """A line about the stream is logged at most once in this time [s]."""
 
 _NO_RATE = (math.nan, math.nan, math.nan)
-_NO_LAYOUT = Layout(b'', -1)
+_NO_LAYOUT = Layout(b'', 0, 0, -1)
 
 
 class Stream:
@@ -109,6 +109,14 @@ class Stream:
 
     def on_serialized(self, data: bytes) -> None:
         """Take a serialized Imu."""
+        try:
+            self._take(data)
+        except RuntimeError:
+            if self._node.context.ok():
+                raise  # otherwise it was publishing while a signal came
+
+    def _take(self, data: bytes) -> None:
+        """Correct and publish a message, and have it wait for the watch."""
         now = monotonic()
         due = now >= self._due
         if due:

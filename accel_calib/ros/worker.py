@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The one thread for all that takes longer than a message: fits and files.
+The one thread for all that takes longer than a message: files, and waiting for `apart`.
 
 A job runs in that thread, in the order given, and what it found comes back as a callback in the
 thread of the executor, so that only callbacks change the state of the node. A service whose
@@ -30,6 +30,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from traceback import format_exc
 from typing import Any, TYPE_CHECKING, TypeVar
+
+from .apart import Apart
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -54,12 +56,18 @@ class Promise:
 
 
 class Worker:
-    """A thread beside the executor of a node."""
+    """
+    A thread beside the executor of a node.
+
+    What computes is for ``apart.call`` in a job.
+
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._pool = ThreadPoolExecutor(1, 'accel_calib')
         self._done: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self.apart = Apart()
 
     def run(self, job: Callable[[], Found], then: Callable[[Future[Found]], None]) -> None:
         """
@@ -90,7 +98,8 @@ class Worker:
             self._node.get_logger().error(f'a fault in accel_calib:\n{format_exc()}')
 
     def close(self) -> None:
-        """Finish the jobs that were given, so that nothing stays unwritten."""
+        """Give up what is being computed, and finish what is being written."""
+        self.apart.close()
         self._pool.shutdown(wait=True)
 
 

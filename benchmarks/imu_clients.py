@@ -1,0 +1,173 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The processes around the node: a driver, a user, and bare relays to compare with.
+
+A driver stamps each message with the monotonic clock and notes the stamps; a user notes stamp and
+arrival. Both write what they noted as arrays when they are told to end, by the end of standard
+input. All are as cheap as rclpy allows: serialized messages under EventsExecutor. Qualities of
+service are those of the node, so that nothing but the work differs.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from array import array
+import itertools
+from pathlib import Path
+import struct
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
+from sensor_msgs.msg import Imu, Temperature
+
+SENSOR = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+USER = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
+
+STILL, TURNING, GRAVITY = 4.0, 1.0, 9.80665
+VARIANTS = 512
+NANO = 1_000_000_000
+
+
+def messages(turning: bool, rng: np.random.Generator) -> list[bytearray]:
+    """Make messages of a sensor at rest in some attitude, or on its way to another."""
+    direction = rng.normal(size=3)
+    direction *= GRAVITY / np.linalg.norm(direction)
+    noise, gyro = (3.0, 1.0) if turning else (0.02, 0.002)
+    made = []
+    for _ in range(VARIANTS):
+        message = Imu()
+        message.header.frame_id = 'imu_link'
+        message.orientation_covariance[0] = -1.0
+        message.angular_velocity_covariance = (np.eye(3) * gyro**2).ravel()
+        message.linear_acceleration_covariance = (np.eye(3) * 0.02**2).ravel()
+        reading, rate = direction + rng.normal(size=3) * noise, rng.normal(size=3) * gyro
+        for axis, force, omega in zip('xyz', reading, rate):
+            setattr(message.linear_acceleration, axis, float(force))
+            setattr(message.angular_velocity, axis, float(omega))
+        made.append(bytearray(serialize_message(message)))
+    return made
+
+
+def ended() -> Any:
+    """Give a function that tells whether standard input has come to its end."""
+    over = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+    return over.is_set
+
+
+def drive(rate: float, file: Path) -> None:
+    """Publish so many messages a second, or without a pause for 0."""
+    node = Node('driver')
+    imu = node.create_publisher(Imu, 'imu/data_raw', STREAM)
+    temperature = node.create_publisher(Temperature, 'temperature', STREAM)
+    rng = np.random.default_rng(1)
+    stretches = [(messages(turning, rng), TURNING if turning else STILL)
+                 for _ in range(12) for turning in (False, True)]
+    stamp = struct.Struct('<iI').pack_into
+    over, sent = ended(), array('q')
+    warm_every = max(1, int((rate or 1e4) / 10.0))
+    period, due, now = NANO / (rate or np.inf), time.monotonic_ns(), 0
+    for made, seconds in itertools.cycle(stretches):
+        until = time.monotonic_ns() + seconds * NANO
+        while now < until and not over():
+            due += period
+            wait = due - time.monotonic_ns() if rate else 0.0
+            if wait > 0.0:
+                time.sleep(wait / NANO)
+            now = time.monotonic_ns()
+            data = made[len(sent) % VARIANTS]
+            stamp(data, 4, now // NANO, now % NANO)
+            imu.publish(bytes(data))
+            sent.append(now)
+            if len(sent) == 1:
+                print(now, flush=True)
+            if len(sent) % warm_every == 0:
+                temperature.publish(Temperature(temperature=25.0 + rng.uniform(-5.0, 5.0)))
+        if over():
+            break
+    np.save(file, np.array(sent))
+
+
+def listen(file: Path) -> None:
+    """Note stamp and arrival of what comes out."""
+    node = Node('user')
+    heard: list[bytes] = []
+    came = array('q')
+
+    def on_imu(data: bytes) -> None:
+        came.append(time.monotonic_ns())
+        heard.append(data[4:12])
+
+    node.create_subscription(Imu, 'imu/data_calibrated', on_imu, USER, raw=True)
+    executor, over, told = EventsExecutor(), ended(), False
+    executor.add_node(node)
+    while not over():
+        executor.spin_until_future_complete(Future(), timeout_sec=0.05)
+        if heard and not told:
+            print(came[0], flush=True)
+            told = True
+    stamps = np.frombuffer(b''.join(heard), '<i4,<u4')
+    np.save(file, np.column_stack([stamps['f0'].astype(np.int64) * NANO + stamps['f1'],
+                                   np.array(came[:len(heard)])]))
+    executor.shutdown()
+
+
+def relay(kind: str) -> None:
+    """Publish what comes, changing nothing; or take it and do nothing."""
+    node = Node('relay')
+    out = node.create_publisher(Imu, 'imu/data_calibrated', STREAM)
+    callback = out.publish if kind != 'sink' else lambda data: None
+    executor = SingleThreadedExecutor() if kind == 'typed' else EventsExecutor()
+    node.create_subscription(Imu, 'imu/data_raw', callback, SENSOR, raw=kind != 'typed')
+    executor.add_node(node)
+    over = ended()
+    while not over():
+        executor.spin_until_future_complete(Future(), timeout_sec=0.25)
+    executor.shutdown()
+
+
+def main() -> int:
+    """Be what the first argument says."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('what', choices=['drive', 'listen', 'serialized', 'typed', 'sink'])
+    parser.add_argument('--rate', type=float, default=1000.0)
+    parser.add_argument('--file', type=Path)
+    given = parser.parse_args()
+    rclpy.init(args=[])
+    if given.what == 'drive':
+        drive(given.rate, given.file)
+    elif given.what == 'listen':
+        listen(given.file)
+    else:
+        relay(given.what)
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
