@@ -171,8 +171,7 @@ def test_a_message_with_nan_is_refused(recording, tmp_path):
     reading[40, 1] = np.nan
     path = write_bag(tmp_path / 'nan', 'mcap',
                      recording.take(slice(0, 60)).with_columns(reading=reading))
-    with pytest.raises(InputError, match='1 of 60 Imu messages hold NaN or infinity, the first '
-                                         'is message 41'):
+    with pytest.raises(InputError, match='Imu message 41 holds NaN or infinity'):
         read_recording(path)
 
 

@@ -30,7 +30,7 @@ the weighted mean.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,6 +64,8 @@ class Captured:
         Time from the first to the last stamp of the recording, breaks left out [s].
     interruptions : tuple of Interruption
         Breaks in the stamps.
+    recorded : int
+        All samples of the recording.
 
     """
 
@@ -72,17 +74,19 @@ class Captured:
     threshold: float
     seconds: float
     interruptions: tuple[Interruption, ...]
+    recorded: int
 
 
-def capture(recording: Recording, units: Units, settings: CaptureSettings = CaptureSettings()
-            ) -> Captured:
+def capture(recording: Recording | Iterable[Recording], units: Units,
+            settings: CaptureSettings = CaptureSettings()) -> Captured:
     """
     Find the still poses of a recording.
 
     Parameters
     ----------
-    recording : Recording
-        The samples; ``rate``, ``temperature`` and ``supply_voltage`` are used where present.
+    recording : Recording, or an iterable of them
+        The samples, whole or in blocks; ``rate``, ``temperature`` and ``supply_voltage`` are used
+        where present.
     units : Units
         Unit of the readings.
     settings : CaptureSettings
@@ -100,16 +104,21 @@ def capture(recording: Recording, units: Units, settings: CaptureSettings = Capt
 
     """
     detector = StillDetector(settings, units)
-    for start in range(0, len(recording), _BLOCK):
-        detector.push_block(_block(recording, start, start + _BLOCK))
+    spans: list[tuple[float, float]] = []
+    recorded = 0
+    for part in [recording] if isinstance(recording, Recording) else recording:
+        for start in range(0, len(part), _BLOCK):
+            samples = _block(part, start, start + _BLOCK)
+            detector.push_block(samples)
+            spans.append((float(samples[0, 0]), float(samples[-1, 0])))
+            recorded += len(samples)
     detector.close()
     dwells = select(detector.dwells(), settings, units)
     interruptions = detector.interruptions
-    time = recording['time']
-    seconds = float(time[-1] - time[0]) if len(time) else 0.0
+    seconds = spans[-1][1] - spans[0][0] if spans else 0.0
     return Captured(poses_from(dwells, settings), sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
-                    interruptions)
+                    interruptions, recorded)
 
 
 def _block(recording: Recording, start: int, stop: int) -> Floats:

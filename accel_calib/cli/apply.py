@@ -20,6 +20,7 @@ import argparse
 from pathlib import Path
 
 from . import options
+from .progress import progress
 from ..calibrate import Calibration, check_units
 from ..errors import InputError
 from ..files import correct_bag, is_bag, read_calibration, read_samples, write_table
@@ -44,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     """Correct and say how many samples there were."""
     calibration = read_calibration(args.calibration)
     if is_bag(args.recording):
-        count = correct_bag(args.recording, calibration, args.output, args.topic)
+        with progress('messages') as told:
+            count = correct_bag(args.recording, calibration, args.output, args.topic, told)
     else:
         count = _correct_table(args.recording, calibration, args.output)
     options.say(args).print(f'{count} samples corrected, stored in {args.output}', markup=False)

@@ -17,14 +17,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from . import options
+from .progress import Progress, progress
 from ..calibrate import check_units
 from ..capture import capture, CaptureSettings
 from ..capture.settings import REPEATED
 from ..errors import InputError
-from ..files import read_recording, write_table
+from ..files import open_recording, Stream, write_table
+from ..table import Recording
 from ..units import Units, units_of
 
 _EXAMPLE = 'accel-calib capture recording.mcap -o poses.csv'
@@ -62,18 +65,16 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Capture, write the poses, and say how many there are."""
-    source = read_recording(args.recording, args.topic)
-    units = units_of(source.units or args.units, args.gravity)
-    check_units(source.recording, units)
-    captured = capture(source.recording, units, _settings(args, units))
+    with open_recording(args.recording, args.topic) as stream, progress('samples') as told:
+        units = units_of(stream.units or args.units, args.gravity)
+        captured = capture(_blocks(stream, units, told), units, _settings(args, units))
     if len(captured.poses) == 0:
-        raise InputError(f'{args.recording} has no still stretch in '
-                         f'{len(source.recording)} samples',
+        raise InputError(f'{args.recording} has no still stretch in {captured.recorded} samples',
                          'hold the sensor still in each pose for some seconds, or give '
                          '--still-std-max and --min-dwell')
     write_table(args.output, captured.poses)
     options.write_json(args.json, {
-        'poses': len(captured.poses), 'samples': len(source.recording),
+        'poses': len(captured.poses), 'samples': captured.recorded,
         'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
         'interruptions': [item._asdict() for item in captured.interruptions]})
@@ -84,6 +85,17 @@ def run(args: argparse.Namespace) -> int:
         console.print(f'note: at {item.time:.3f} s the stamps have a {item.kind} of '
                       f'{item.seconds:.3g} s', markup=False)
     return 0
+
+
+def _blocks(stream: Stream, units: Units, told: Progress) -> Iterator[Recording]:
+    """Hand on the blocks, check the unit by the first, and tell how far it is."""
+    done = 0
+    for block in stream.blocks:
+        if not done:
+            check_units(block, units)
+        yield block
+        done += len(block)
+        told(done, stream.samples)
 
 
 def _settings(args: argparse.Namespace, units: Units) -> CaptureSettings:

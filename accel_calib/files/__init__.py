@@ -23,9 +23,9 @@ from .calibration_yaml import (
     read_calibration,
     write_calibration,
 )
-from .recording import read_recording, Source
+from .recording import open_recording, read_recording, Source, Stream
 from .table_csv import read_poses, read_samples, write_table
 
-__all__ = ['Source', 'check_sensor', 'correct_bag', 'format_calibration', 'is_bag',
-           'parse_calibration', 'read_calibration', 'read_poses', 'read_recording', 'read_samples',
-           'write_calibration', 'write_table']
+__all__ = ['Source', 'Stream', 'check_sensor', 'correct_bag', 'format_calibration', 'is_bag',
+           'open_recording', 'parse_calibration', 'read_calibration', 'read_poses',
+           'read_recording', 'read_samples', 'write_calibration', 'write_table']

@@ -13,10 +13,11 @@
 # limitations under the License.
 
 """
-Recordings as bags: rosbag2 (folder, mcap, db3) and ROS 1, through `rosbags`, without ROS.
+Bags of every kind: rosbag2 (folder, mcap, db3) and ROS 1, without ROS.
 
-An Imu is taken from its serialized bytes: header stamp at the start, and behind the header the 37
-doubles of `accel_calib.imu`. So millions of messages are read and corrected as arrays.
+`rosbags` opens a bag and says what is in it. The messages of a topic then come in blocks, as they
+are serialized: by chunks from MCAP files, by rows from SQLite files, and one by one through
+`rosbags` from ROS 1 bags, compressed rosbag2 and MCAP files of unusual make.
 
 """
 
@@ -24,16 +25,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+import sqlite3
 import struct
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
-import numpy as np
+import yaml
 
+from . import db3, mcap
+from .serialized import joined, Messages
 from ..errors import InputError
-from ..imu import ACCELERATION, ANGULAR_VELOCITY, FIELDS
-from ..table import Floats, numbered, Recording
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -42,31 +44,8 @@ if TYPE_CHECKING:
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 SUFFIXES = ('.bag', '.mcap', '.db3')
-
-_TAIL = FIELDS * 8
-_TEMPERATURE_TAIL = 16  # temperature and its variance
-_NANO = 1e-9
-
-
-@dataclass(frozen=True)
-class BagRecording:
-    """
-    An Imu topic of a bag.
-
-    Parameters
-    ----------
-    recording : Recording
-        Samples in m/s² and rad/s, with temperature where the bag has it.
-    topic : str
-        Name of the Imu topic.
-    frame_id : str
-        Of its messages.
-
-    """
-
-    recording: Recording
-    topic: str
-    frame_id: str
+BLOCK = 16384
+"""Messages that go together where they come one by one."""
 
 
 def is_bag(path: Path) -> bool:
@@ -82,28 +61,38 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
     Raises
     ------
     InputError
-        If it is not a whole bag.
+        If it is not a whole bag, also where that shows only when its messages are read.
     FileNotFoundError
         If it is missing.
 
     """
+    from rosbags import rosbag1, rosbag2
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import get_typestore, Stores
 
     if not path.exists():
         raise FileNotFoundError(2, 'No such file or directory', str(path))
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            yield reader
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader.open()
     except (AnyReaderError, FileNotFoundError, AssertionError, struct.error) as err:
-        raise InputError(f'{path} is not a whole bag ({err})',
-                         'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may mend '
-                         'it') from err
+        raise _not_whole(path, err) from err
+    try:
+        yield reader
+    except (AnyReaderError, rosbag1.ReaderError, rosbag2.ReaderError, sqlite3.Error) as err:
+        raise _not_whole(path, err) from err
+    finally:
+        reader.close()
 
 
-def imu_connections(reader: AnyReader, path: Path, topic: str = '') -> list[Connection]:
+def _not_whole(path: Path, err: Exception) -> InputError:
+    return InputError(f'{path} is not a whole bag ({err})',
+                      'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may mend it')
+
+
+def imu_topic(reader: AnyReader, path: Path, topic: str = '') -> str:
     """
-    Find the connections of the one Imu topic of an open bag, or of the one asked for.
+    Find the one Imu topic of an open bag, or the one asked for.
 
     Raises
     ------
@@ -122,95 +111,39 @@ def imu_connections(reader: AnyReader, path: Path, topic: str = '') -> list[Conn
     if not topic and len(topics) > 1:
         raise InputError(f'{path} has {len(topics)} Imu topics: {", ".join(topics)}',
                          'choose one with --topic')
-    return [c for c in reader.connections if c.topic == (topic or topics[0]) and c.msgtype == IMU]
+    return topic or topics[0]
 
 
-def read_bag(path: Path, topic: str = '') -> BagRecording:
-    """
-    Read the samples of an Imu topic.
-
-    Parameters
-    ----------
-    path : Path
-        A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
-    topic : str
-        Which, where there are several.
-
-    Raises
-    ------
-    InputError
-        If it is not a bag or has no Imu.
-    OSError
-        If it cannot be read.
-
-    """
-    with open_bag(path) as reader:
-        connections = imu_connections(reader, path, topic)
-        stamps: list[float] = []
-        tails: list[bytes] = []
-        first: Any = None
-        for connection, _, raw in reader.messages(connections):
-            first = first or reader.deserialize(raw, connection.msgtype)
-            stamps.append(stamp_of(raw, ros2=reader.is2))
-            tails.append(tail_of(raw, path, ros2=reader.is2))
-        if first is None:
-            raise InputError(f'{path} has no message on {connections[0].topic}',
-                             'record while the sensor publishes')
-        fields = np.frombuffer(b''.join(tails), '<f8').reshape(-1, FIELDS)
-        columns = {'time': np.array(stamps), 'reading': fields[:, ACCELERATION],
-                   'rate': fields[:, ANGULAR_VELOCITY]}
-        temperature = temperature_at(reader, columns['time'])
-        if temperature is not None:
-            columns['temperature'] = temperature
-    _check_finite(path, columns['reading'])
-    return BagRecording(Recording(columns, numbered(columns)), connections[0].topic,
-                        first.header.frame_id)
+def connections_of(reader: AnyReader, topic: str, msgtype: str = IMU) -> list[Connection]:
+    """Give the connections of a topic; a bag may have several."""
+    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
 
 
-def _check_finite(path: Path, reading: Floats) -> None:
-    """Refuse messages whose acceleration is not a number."""
-    faulty = np.flatnonzero(~np.all(np.isfinite(reading), axis=1))
-    if len(faulty):
-        raise InputError(f'{path}: {len(faulty)} of {len(reading)} Imu messages hold NaN or '
-                         f'infinity, the first is message {faulty[0] + 1}',
-                         'mend the driver, or record again')
+def count_of(reader: AnyReader, topic: str, msgtype: str = IMU) -> int:
+    """Give the number of messages of a topic, by the index of the bag."""
+    return sum(c.msgcount for c in connections_of(reader, topic, msgtype))
 
 
-def stamp_of(raw: bytes | memoryview, *, ros2: bool) -> float:
-    """Read the header stamp [s] of a serialized message."""
-    if not ros2:
-        seconds, nanoseconds = struct.unpack_from('<II', raw, 4)
-    else:
-        order = '<' if raw[1] & 1 else '>'
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', raw, 4)
-    return float(seconds + nanoseconds * _NANO)
+def storage_files(path: Path) -> list[Path]:
+    """Give the files of a rosbag2 that hold its messages as they are; none of another bag."""
+    if not path.is_dir():
+        return [path] if path.suffix in ('.mcap', '.db3') else []
+    text = (path / 'metadata.yaml').read_text(encoding='utf-8')
+    about = yaml.safe_load(text)['rosbag2_bagfile_information']
+    if (about.get('compression_mode') or 'none').lower() != 'none':
+        return []
+    return [path / Path(name).name for name in about['relative_file_paths']]
 
 
-def tail_of(raw: bytes | memoryview, path: Path, *, ros2: bool) -> bytes:
-    """
-    Give the 37 doubles of a serialized Imu, as bytes.
-
-    Raises
-    ------
-    InputError
-        If the message is too short or not little endian.
-
-    """
-    if len(raw) < _TAIL + 12 or (ros2 and not raw[1] & 1):
-        raise InputError(f'{path} holds an Imu message of {len(raw)} bytes that is not '
-                         'little-endian CDR', 'record it again')
-    return bytes(raw[-_TAIL:])
-
-
-def temperature_at(reader: AnyReader, time: Floats) -> Floats | None:
-    """Give the temperature [°C] at these times, where the bag has a Temperature topic."""
-    connections = [c for c in reader.connections if c.msgtype == TEMPERATURE]
-    stamps: list[float] = []
-    values: list[float] = []
-    for _, _, raw in reader.messages(connections) if connections else ():
-        stamps.append(stamp_of(raw, ros2=reader.is2))
-        values.append(struct.unpack_from('<d', raw, len(raw) - _TEMPERATURE_TAIL)[0])
-    if not values:
-        return None
-    order = np.argsort(stamps, kind='stable')
-    return np.interp(time, np.array(stamps)[order], np.array(values)[order])
+def messages_of(reader: AnyReader, path: Path, topic: str, msgtype: str = IMU
+                ) -> Iterator[Messages]:
+    """Give the messages of a topic in the order in which they were received, in blocks."""
+    sources = [(mcap if file.suffix == '.mcap' else db3).topic_messages(file, topic, msgtype)
+               for file in storage_files(path)]
+    if sources and None not in sources:
+        for source in sources:
+            yield from source or ()
+        return
+    messages = reader.messages(connections_of(reader, topic, msgtype))
+    while block := [raw for _, _, raw in islice(messages, BLOCK)]:
+        yield joined(block, ros2=reader.is2)

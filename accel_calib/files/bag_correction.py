@@ -15,7 +15,9 @@
 """
 Correcting a bag: a copy in which the Imu topic is calibrated and all else is as it was.
 
-Messages are copied in their serialized form, in blocks; of an Imu the last 296 bytes change.
+Of a rosbag2 the files are rewritten in their own format: other topics, names, definitions,
+compression of chunks, and ``metadata.yaml`` stay byte for byte. A ROS 1 bag, and a rosbag2 whose
+messages or files are compressed, go message by message through `rosbags`.
 
 """
 
@@ -27,25 +29,35 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-import numpy as np
-
-from .bag import imu_connections, open_bag, stamp_of, tail_of, temperature_at
+from . import db3, mcap_rewrite
+from .bag import BLOCK, connections_of, count_of, IMU, imu_topic, open_bag, storage_files
+from .bag_metadata import write_metadata
+from .bag_samples import first_frame_id, temperature_track, Track
 from .calibration_yaml import check_sensor
+from .serialized import (
+    doubles_at,
+    frame_id_of,
+    joined,
+    layout_of,
+    Messages,
+    put_doubles,
+    stamps_of,
+)
 from ..calibrate import Calibration
 from ..errors import InputError
 from ..imu import corrected, FIELDS
-from ..table import Floats
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
 
-_BLOCK = 16384
-_Message = tuple[Any, int, bytes]
+Progress = Callable[[int, int], object]
+"""Is told how many messages are done, and of how many."""
 
 
-def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '') -> int:
+def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
+                progress: Progress = lambda done, count: None) -> int:
     """
     Write a corrected copy of a bag.
 
@@ -56,9 +68,13 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     calibration : Calibration
         In m/s².
     out : Path
-        A new rosbag2 folder, or a new ``.bag`` for ROS 1; must not be there yet.
+        What to write; must not be there yet. A folder becomes a folder and a ROS 1 bag a ROS 1
+        bag; a single file of rosbag2 becomes a file where `out` has its suffix, otherwise a
+        folder.
     topic : str
         Imu topic, where the bag has several.
+    progress : callable
+        Told of the messages, block by block.
 
     Returns
     -------
@@ -84,19 +100,78 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     _remove(partial)
     try:
         with open_bag(path) as reader:
-            imu = {id(c) for c in imu_connections(reader, path, topic)}
-            with _writer(reader, path, partial) as writer:
-                count = _copy(reader, writer, imu, calibration, path)
+            name = imu_topic(reader, path, topic)
+            check_sensor(calibration, first_frame_id(reader, path, name))
+            change = _Correction(calibration, f'{path}, {name}', temperature_track(reader, path),
+                                 count_of(reader, name), progress)
+            partial.parent.mkdir(parents=True, exist_ok=True)
+            if _can_rewrite(path, name):
+                _rewrite(reader, path, partial, out, name, change)
+            else:
+                with _writer(reader, path, partial) as writer:
+                    _copy(reader, writer, name, change)
         partial.rename(out)
     finally:
         _remove(partial)
-    return count
+    return change.done
 
 
 def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)
     path.unlink(missing_ok=True)
+
+
+class _Correction:
+    """Correct messages in their buffer, and count them."""
+
+    def __init__(self, calibration: Calibration, name: str, track: Track | None, count: int,
+                 progress: Progress) -> None:
+        needed = 'temperature' in calibration.model.needs
+        self._calibration = calibration
+        self._name = name
+        self._track = track if needed else None
+        self._count = count
+        self._progress = progress
+        self.done = 0
+
+    def __call__(self, messages: Messages) -> None:
+        """Correct these messages."""
+        layout = layout_of(messages, FIELDS, self._name, self.done)
+        check_sensor(self._calibration, frame_id_of(messages, layout))
+        context = {}
+        if self._track is not None:
+            context['temperature'] = self._track.at(stamps_of(messages, layout))
+        fields = doubles_at(messages, layout, slice(0, FIELDS))
+        put_doubles(messages, layout, corrected(self._calibration, fields, context))
+        self.done += len(messages)
+        self._progress(self.done, self._count)
+
+
+def _can_rewrite(path: Path, topic: str) -> bool:
+    files = storage_files(path)
+    return bool(files) and all(
+        file.suffix == '.db3' or mcap_rewrite.can_rewrite(file, topic, IMU) for file in files)
+
+
+def _rewrite(reader: AnyReader, path: Path, partial: Path, out: Path, topic: str,
+             change: _Correction) -> None:
+    """Rewrite the files of a rosbag2 one by one; others in its folder are copied."""
+    single = not path.is_dir()
+    if single and out.suffix == path.suffix:
+        targets = [partial]
+    elif single:
+        partial.mkdir()
+        targets = [partial / f'{out.name}{path.suffix}']
+        write_metadata(reader, targets[0])
+    else:
+        files = storage_files(path)
+        names = [file.name for file in files]
+        shutil.copytree(path, partial, ignore=lambda *_: names)
+        targets = [partial / name for name in names]
+    for file, target in zip(storage_files(path), targets, strict=True):
+        module = db3 if file.suffix == '.db3' else mcap_rewrite
+        module.rewrite(file, target, topic, IMU, change)
 
 
 def _writer(reader: AnyReader, path: Path, out: Path) -> Writer1 | Writer2:
@@ -108,26 +183,25 @@ def _writer(reader: AnyReader, path: Path, out: Path) -> Writer1 | Writer2:
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-    mcap = path.suffix == '.mcap' or any(path.glob('*.mcap'))
+    mcap = path.suffix == '.mcap' or any(path.glob('*.mcap*'))
     return Rosbag2Writer(out, version=9, storage_plugin=StoragePlugin.MCAP if mcap
                          else StoragePlugin.SQLITE3)
 
 
-def _copy(reader: AnyReader, writer: Writer1 | Writer2, imu: set[int], calibration: Calibration,
-          path: Path) -> int:
-    """Copy all messages, those of the Imu corrected; return how many these are."""
+def _copy(reader: AnyReader, writer: Writer1 | Writer2, topic: str, change: _Correction) -> None:
+    """Copy all messages, those of the Imu corrected."""
     add = _adder(reader, writer)
     outputs = {id(connection): add(connection) for connection in reader.connections}
-    count = 0
-    messages: Iterator[_Message] = reader.messages()
-    while block := list(islice(messages, _BLOCK)):
+    imu = {id(connection) for connection in connections_of(reader, topic)}
+    messages: Iterator[tuple[Any, int, bytes]] = reader.messages()
+    while block := list(islice(messages, BLOCK)):
         which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-        count += len(which)
-        changed = dict(zip(which, _corrected(reader, [block[k] for k in which], calibration, path),
-                           strict=True))
+        new = joined([block[k][2] for k in which], ros2=reader.is2)
+        if which:
+            change(new)
+        changed = dict(zip(which, new.each(), strict=True))
         for k, (connection, stamp, raw) in enumerate(block):
             writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
-    return count
 
 
 def _adder(reader: AnyReader, writer: Any) -> Callable[[Any], Any]:
@@ -145,23 +219,3 @@ def _adder(reader: AnyReader, writer: Any) -> Callable[[Any], Any]:
             offered_qos_profiles=connection.ext.offered_qos_profiles)
 
     return add2 if reader.is2 else add1
-
-
-def _corrected(reader: AnyReader, messages: list[_Message], calibration: Calibration,
-               path: Path) -> list[bytes]:
-    """Correct the serialized Imu messages of a block."""
-    if not messages:
-        return []
-    raws = [raw for _, _, raw in messages]
-    first: Any = reader.deserialize(raws[0], messages[0][0].msgtype)
-    check_sensor(calibration, first.header.frame_id)
-    tails = b''.join(tail_of(raw, path, ros2=reader.is2) for raw in raws)
-    fields: Floats = np.frombuffer(tails, '<f8').reshape(-1, FIELDS)
-    context = {}
-    if 'temperature' in calibration.model.needs:
-        times = np.array([stamp_of(raw, ros2=reader.is2) for raw in raws])
-        temperature = temperature_at(reader, times)
-        context = {} if temperature is None else {'temperature': temperature}
-    result = corrected(calibration, fields, context).astype('<f8')
-    size = FIELDS * 8
-    return [raw[:-size] + row.tobytes() for raw, row in zip(raws, result, strict=True)]

@@ -12,14 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recordings of any kind, by their name: CSV tables and bags."""
+"""Recordings of any kind, by their name: CSV tables and bags; block by block, or whole."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from .bag import is_bag, read_bag
+from .bag import count_of, imu_topic, is_bag, open_bag
+from .bag_samples import first_frame_id, imu_blocks, together
 from .table_csv import read_samples
 from ..table import Recording
 from ..units import UnitName
@@ -46,9 +49,32 @@ class Source:
     sensor: str
 
 
-def read_recording(path: Path, topic: str = '') -> Source:
+@dataclass(frozen=True)
+class Stream:
     """
-    Read a recording: a CSV table, a rosbag2 (folder, mcap, db3) or a ROS 1 bag.
+    An open recording, to be read block by block.
+
+    Parameters
+    ----------
+    blocks : iterator of Recording
+        The samples, in order; however many there are, they take the memory of a block.
+    samples : int
+        How many to expect, by the index of the file.
+    units, sensor
+        As of `Source`.
+
+    """
+
+    blocks: Iterator[Recording]
+    samples: int
+    units: UnitName | None
+    sensor: str
+
+
+@contextmanager
+def open_recording(path: Path, topic: str = '') -> Iterator[Stream]:
+    """
+    Open a recording: a CSV table, a rosbag2 (folder, mcap, db3) or a ROS 1 bag.
 
     Parameters
     ----------
@@ -60,12 +86,22 @@ def read_recording(path: Path, topic: str = '') -> Source:
     Raises
     ------
     InputError
-        If it is not what its name says, or holds no samples.
+        If it is not what its name says, or holds no samples; also while it is read.
     OSError
         If it cannot be read.
 
     """
-    if is_bag(path):
-        bag = read_bag(path, topic)
-        return Source(bag.recording, 'm/s2', bag.frame_id)
-    return Source(read_samples(path), None, '')
+    if not is_bag(path):
+        table = read_samples(path)
+        yield Stream(iter((table,)), len(table), None, '')
+        return
+    with open_bag(path) as reader:
+        name = imu_topic(reader, path, topic)
+        frame_id = first_frame_id(reader, path, name)
+        yield Stream(imu_blocks(reader, path, name), count_of(reader, name), 'm/s2', frame_id)
+
+
+def read_recording(path: Path, topic: str = '') -> Source:
+    """Read a recording whole; takes and raises what `open_recording` does."""
+    with open_recording(path, topic) as stream:
+        return Source(together(list(stream.blocks)), stream.units, stream.sensor)

@@ -1,0 +1,128 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The samples of an Imu topic of a bag, block by block, with the temperature beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .bag import messages_of, TEMPERATURE
+from .serialized import doubles_at, frame_id_of, layout_of, stamps_of
+from ..errors import InputError
+from ..imu import ACCELERATION, ANGULAR_VELOCITY, FIELDS
+from ..table import Floats, Recording
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_ROWS = 65536  # of a block, about
+_TEMPERATURE_FIELDS = 2  # temperature and its variance
+
+
+@dataclass(frozen=True)
+class Track:
+    """Temperatures [°C] at times [s], which rise."""
+
+    time: Floats
+    temperature: Floats
+
+    def at(self, time: Floats) -> Floats:
+        """Give the temperature at these times, (n,)."""
+        return np.interp(time, self.time, self.temperature)
+
+
+def imu_blocks(reader: AnyReader, path: Path, topic: str) -> Iterator[Recording]:
+    """
+    Read the samples of an Imu topic in blocks.
+
+    Raises
+    ------
+    InputError
+        If a message is damaged or holds NaN.
+
+    """
+    track = temperature_track(reader, path)
+    parts: list[Recording] = []
+    before = 0
+    for messages in messages_of(reader, path, topic):
+        layout = layout_of(messages, FIELDS, f'{path}, {topic}', before)
+        columns = {'time': stamps_of(messages, layout),
+                   'reading': doubles_at(messages, layout, ACCELERATION),
+                   'rate': doubles_at(messages, layout, ANGULAR_VELOCITY)}
+        if track is not None:
+            columns['temperature'] = track.at(columns['time'])
+        _check_finite(path, columns['reading'], before)
+        parts.append(Recording(columns, np.arange(before, before + len(messages)) + 1))
+        before += len(messages)
+        if sum(map(len, parts)) >= _ROWS:
+            yield together(parts)
+            parts = []
+    if parts:
+        yield together(parts)
+
+
+def together(parts: Sequence[Recording]) -> Recording:
+    """Put recordings, one at least, behind each other."""
+    if len(parts) == 1:
+        return parts[0]
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
+    return Recording(columns, np.concatenate([part.row for part in parts]))
+
+
+def _check_finite(path: Path, reading: Floats, before: int) -> None:
+    """Refuse messages whose acceleration is not a number."""
+    faulty = np.flatnonzero(~np.all(np.isfinite(reading), axis=1))
+    if len(faulty):
+        raise InputError(f'{path}: Imu message {before + faulty[0] + 1} holds NaN or infinity',
+                         'mend the driver, or record again')
+
+
+def first_frame_id(reader: AnyReader, path: Path, topic: str) -> str:
+    """
+    Give the frame_id of the first message of an Imu topic.
+
+    Raises
+    ------
+    InputError
+        If there is no message, or it is damaged.
+
+    """
+    block = next(messages_of(reader, path, topic), None)
+    if block is None:
+        raise InputError(f'{path} has no message on {topic}', 'record while the sensor publishes')
+    first = block.take(slice(1))
+    return frame_id_of(first, layout_of(first, FIELDS, f'{path}, {topic}'))
+
+
+def temperature_track(reader: AnyReader, path: Path) -> Track | None:
+    """Read all Temperature topics of a bag, where it has any."""
+    times: list[Floats] = []
+    values: list[Floats] = []
+    for topic in sorted({c.topic for c in reader.connections if c.msgtype == TEMPERATURE}):
+        before = 0
+        for messages in messages_of(reader, path, topic, TEMPERATURE):
+            layout = layout_of(messages, _TEMPERATURE_FIELDS, f'{path}, {topic}', before)
+            times.append(stamps_of(messages, layout))
+            values.append(doubles_at(messages, layout, slice(0, 1))[:, 0])
+            before += len(messages)
+    if not times:
+        return None
+    order = np.argsort(np.concatenate(times), kind='stable')
+    return Track(np.concatenate(times)[order], np.concatenate(values)[order])

@@ -1,0 +1,373 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages taken and changed as arrays are those that `rosbags` deserializes, in every storage."""
+
+from contextlib import closing
+from dataclasses import replace
+from functools import cache
+import sqlite3
+import struct
+import zlib
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.capture import capture
+from accel_calib.errors import InputError
+from accel_calib.files import bag_samples, correct_bag, open_recording, read_recording
+from accel_calib.files.mcap import messages_in
+from accel_calib.simulate import simulate_poses, simulate_recording
+from accel_calib.sphere import rotation_from_rpy, spread_directions
+from accel_calib.units import units_of
+from mcap_file import McapFile, record, STORE
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from shared import sensor
+import yaml
+
+IMU, TEMPERATURE, STRING = (f'{name[0]}_msgs/msg/{name[1]}' for name in (
+    ('sensor', 'Imu'), ('sensor', 'Temperature'), ('std', 'String')))
+TOPICS = [('/imu/a', IMU), ('/imu/b', IMU), ('/temperature', TEMPERATURE), ('/words', STRING)]
+MAKES = ['mcap', 'lz4', 'zstd', 'no chunks', 'no summary', 'sqlite3', 'sqlite3 messages',
+         'mcap by rosbags', 'zstd by rosbags', 'mcap file', 'split']
+UNITS = units_of('m/s2')
+COUNT = 200
+
+
+def header(stamp, frame_id):
+    types = STORE.types
+    return types['std_msgs/msg/Header'](frame_id=frame_id, stamp=types[
+        'builtin_interfaces/msg/Time'](sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9))
+
+
+def imu(rng, stamp, frame_id, little_endian=True):
+    types = STORE.types
+    numbers = rng.normal(size=37)
+    vector = types['geometry_msgs/msg/Vector3']
+    value = types[IMU](
+        header(stamp, frame_id), types['geometry_msgs/msg/Quaternion'](*numbers[:4].tolist()),
+        numbers[4:13], vector(*numbers[13:16].tolist()), numbers[16:25],
+        vector(*(9.0 + numbers[25:28]).tolist()), np.zeros(9))
+    return bytes(STORE.serialize_cdr(value, IMU, little_endian=little_endian))
+
+
+@cache
+def messages(seed, *, shuffled=False, frame_ids=('imu',), little_endian=True):
+    """Give (channel, log time, bytes); some a little out of order, as writers of logs are."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for k in range(COUNT):
+        stamp = 10 ** 9 * 1_700_000_000 + 10 ** 7 * k
+        for channel in (0, 1):
+            name = frame_ids[k % len(frame_ids)]
+            made.append((channel, stamp + channel, imu(rng, stamp, name, little_endian)))
+        if k % 7 == 3:
+            warm = STORE.types[TEMPERATURE](header(stamp, 'imu'), 20.0 + 0.01 * k, 0.0)
+            made.append((2, stamp + 2, bytes(STORE.serialize_cdr(
+                warm, TEMPERATURE, little_endian=little_endian))))
+        if k % 11 == 5:
+            word = STORE.types[STRING]('x' * (k % 23))
+            made.append((3, stamp + 3, bytes(STORE.serialize_cdr(word, STRING))))
+    if shuffled:
+        order = np.argsort(np.arange(len(made)) + rng.uniform(0, 40, len(made)))
+        made = [made[k] for k in order]
+    return tuple(made)
+
+
+def write_by_rosbags(path, made, plugin, mode=CompressionMode.NONE):
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        known = [writer.add_connection(name, kind, typestore=STORE) for name, kind in TOPICS]
+        for channel, time, data in made:
+            writer.write(known[channel], time, data)
+    return path
+
+
+def split(path, made):
+    """Write a bag of two files, the second without words."""
+    first, second = made[:len(made) // 2], [each for each in made[len(made) // 2:] if each[0] < 3]
+    write_by_rosbags(path, first, StoragePlugin.MCAP)
+    McapFile(TOPICS[:3], 'zstd').write(path / 'second.mcap', second)
+    about = yaml.safe_load((path / 'metadata.yaml').read_text())
+    about['rosbag2_bagfile_information']['relative_file_paths'].append('second.mcap')
+    (path / 'metadata.yaml').write_text(yaml.safe_dump(about))
+    return path
+
+
+def write(folder, make, made):
+    """Write a bag of some make."""
+    by_rosbags = {'sqlite3': (StoragePlugin.SQLITE3,), 'mcap by rosbags': (StoragePlugin.MCAP,),
+                  'zstd by rosbags': (StoragePlugin.MCAP, CompressionMode.STORAGE),
+                  'sqlite3 messages': (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+                  'mcap file': (StoragePlugin.MCAP, CompressionMode.FILE)}
+    if make == 'split':
+        return split(folder / 'bag', made)
+    if make in by_rosbags:
+        return write_by_rosbags(folder / 'bag', made, *by_rosbags[make])
+    file = McapFile(TOPICS, make if make in ('lz4', 'zstd') else '',
+                    in_chunks=make != 'no chunks', summary=make != 'no summary')
+    return file.write(folder / 'bag.mcap', made)
+
+
+def deserialized(path, topic='/imu/a'):
+    """Give stamp, rate and acceleration of each message, one by one through `rosbags`."""
+    rows = []
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages(
+                [c for c in reader.connections if c.topic == topic]):
+            message = reader.deserialize(raw, connection.msgtype)
+            stamp, rate, force = (message.header.stamp, message.angular_velocity,
+                                  message.linear_acceleration)
+            rows.append([stamp.sec + 1e-9 * stamp.nanosec, rate.x, rate.y, rate.z, force.x,
+                         force.y, force.z])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize('make', MAKES)
+@pytest.mark.parametrize('topic', ['/imu/a', '/imu/b'])
+def test_samples_are_those_that_rosbags_deserializes(make, topic, tmp_path):
+    shuffled = make not in ('no chunks', 'no summary', 'split')  # rosbags refuses these
+    path = write(tmp_path, make, messages(1, shuffled=shuffled, frame_ids=(
+        '', 'imu', 'imu_link', 'a_much_longer_name_of_a_frame')))
+    found = read_recording(path, topic).recording
+    expected = deserialized(path, topic)
+    assert len(expected) == COUNT
+    np.testing.assert_array_equal(found['time'], expected[:, 0])
+    np.testing.assert_array_equal(found['rate'], expected[:, 1:4])
+    np.testing.assert_array_equal(found.reading, expected[:, 4:])
+    assert list(found.row) == list(range(1, COUNT + 1))
+    warm = 20.0 + np.clip((expected[:, 0] - 1.7e9), 0.03, 1.99)
+    np.testing.assert_allclose(found['temperature'], warm, atol=1e-6)
+
+
+@pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
+def test_big_endian_messages_are_read_and_corrected(make, tmp_path, calibration):
+    path = write(tmp_path, make, messages(2, little_endian=False))
+    found = read_recording(path, '/imu/a').recording
+    expected = deserialized(path)
+    np.testing.assert_array_equal(np.column_stack([found['time'], found['rate'], found.reading]),
+                                  expected)
+    correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    np.testing.assert_allclose(deserialized(tmp_path / 'out')[:, 4:],
+                               calibration.correct(expected[:, 4:]), atol=1e-12)
+
+
+@pytest.fixture(scope='module')
+def calibration():
+    rng, directions = np.random.default_rng(3), spread_directions(16)
+    poses = simulate_poses(sensor(rng), directions, rng)
+    reading, std = UNITS.from_g(poses.reading), UNITS.from_g(poses['std'])
+    return fit_poses(poses.with_columns(reading=reading, std=std), UNITS)
+
+
+@pytest.mark.parametrize('turned', [False, True])
+@pytest.mark.parametrize('make', MAKES)
+def test_a_corrected_bag_holds_all_else_as_it_was(make, turned, calibration, tmp_path):
+    if turned:
+        model = replace(calibration.model, rotation=rotation_from_rpy(0.2, -0.4, 1.0))
+        calibration = replace(calibration, model=model)
+    shuffled = make not in ('no chunks', 'no summary', 'split')
+    path = write(tmp_path, make, messages(4, shuffled=shuffled, frame_ids=('imu', 'imu_link')))
+    told = []
+    count = correct_bag(path, calibration, tmp_path / 'out', '/imu/a',
+                        lambda done, of: told.append((done, of)))
+    assert count == COUNT
+    assert told[-1] == (COUNT, COUNT) or make == 'split'  # whose metadata count the first file
+    with AnyReader([path]) as before, AnyReader([tmp_path / 'out']) as after:
+        pairs = zip(before.messages(), after.messages(), strict=True)
+        for (c0, t0, raw0), (c1, t1, raw1) in pairs:
+            assert (c0.topic, c0.msgtype, c0.msgdef.data, c0.ext, t0) == (
+                c1.topic, c1.msgtype, c1.msgdef.data, c1.ext, t1)
+            if c0.topic != '/imu/a':
+                assert bytes(raw0) == bytes(raw1)
+                continue
+            old, new = (reader.deserialize(raw, IMU) for reader, raw in ((before, raw0),
+                                                                         (after, raw1)))
+            assert str((old.header, old.orientation)) == str((new.header, new.orientation))
+            rotation = calibration.model.rotation
+            for name, expected in (
+                    ('linear_acceleration', lambda x: calibration.correct(x[np.newaxis])[0]),
+                    ('angular_velocity', lambda x, rotation=rotation: x @ rotation)):
+                x0, x1 = (np.array([getattr(getattr(each, name), axis) for axis in 'xyz'])
+                          for each in (old, new))
+                np.testing.assert_allclose(x1, expected(x0), atol=1e-12)
+            np.testing.assert_array_equal(old.linear_acceleration_covariance,
+                                          new.linear_acceleration_covariance)
+    assert sorted(item.name for item in tmp_path.iterdir()) == sorted([path.name, 'out'])
+
+
+@pytest.mark.parametrize('make', ['mcap', 'lz4', 'zstd', 'mcap by rosbags', 'zstd by rosbags'])
+def test_a_corrected_mcap_tells_of_the_same_records_in_their_new_places(make, calibration,
+                                                                        tmp_path):
+    path = write(tmp_path, make, messages(5))
+    path = next(path.glob('*.mcap')) if path.is_dir() else path
+    out = tmp_path / 'out.mcap'
+    correct_bag(path, calibration, out, '/imu/a')
+    before, after = records_in(path.read_bytes()), records_in(out.read_bytes())
+    assert [code for code, _, _ in before] == [code for code, _, _ in after]
+    moved = {0: 0, **{old: new for (_, old, _), (_, new, _) in zip(before, after)}}
+    chunks = {place: content for code, place, content in after if code == 6}
+    for (code, _, old), (_, _, new) in zip(before, after, strict=True):
+        places = places_told(code, old)
+        assert [word(new, k) for k in places] == [moved[word(old, k)] for k in places]
+        if code == 8:
+            chunk = chunks[word(new, 16)]
+            name = int.from_bytes(chunk[28:32], 'little')
+            assert (word(new, 24), word(new, len(new) - 16)) == (len(chunk) + 9,
+                                                                 len(chunk) - 40 - name)
+        elif not places and code not in (6, 15):
+            assert old == new
+    data = out.read_bytes()
+    if any(before[-1][2][16:]):
+        assert zlib.crc32(data[word(after[-1][2], 0):-12]) == int.from_bytes(data[-12:-8],
+                                                                             'little')
+
+
+def places_told(code, content):
+    """Give where a record tells the place of another."""
+    if code == 8:
+        return [16, *range(38, 36 + int.from_bytes(content[32:36], 'little'), 10)]
+    return {10: [0], 13: [0], 14: [1], 2: [0, 8]}.get(code, [])
+
+
+def word(data, at):
+    return int.from_bytes(data[at:at + 8], 'little')
+
+
+def records_in(data):
+    """Give (code, place, content) of each record."""
+    found, place = [], 8
+    while place < len(data) - 8:
+        code, size = struct.unpack_from('<BQ', data, place)
+        found.append((code, place, data[place + 9:place + 9 + size]))
+        place += 9 + size
+    return found
+
+
+def test_a_folder_keeps_its_metadata_and_what_else_is_in_it(calibration, tmp_path):
+    path = write(tmp_path, 'split', messages(6))
+    (path / 'notes.txt').write_text('by hand')
+    correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    for name in ('metadata.yaml', 'notes.txt'):
+        assert (path / name).read_bytes() == (tmp_path / 'out' / name).read_bytes()
+    assert {item.name for item in path.iterdir()} == {
+        item.name for item in (tmp_path / 'out').iterdir()}
+
+
+@pytest.mark.parametrize('plugin', StoragePlugin)
+def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
+        plugin, calibration, tmp_path):
+    path = write_by_rosbags(tmp_path / 'bag', messages(7), plugin)
+    file = next(item for item in path.iterdir() if item.suffix != '.yaml')
+    correct_bag(file, calibration, tmp_path / f'out{file.suffix}', '/imu/a')
+    assert (tmp_path / f'out{file.suffix}').is_file()
+    correct_bag(file, calibration, tmp_path / 'out', '/imu/a')
+    expected, found = (yaml.safe_load((folder / 'metadata.yaml').read_text())[
+        'rosbag2_bagfile_information'] for folder in (path, tmp_path / 'out'))
+    for about in (expected, found):
+        assert about['relative_file_paths'] == [about['files'][0].pop('path')]
+        del about['relative_file_paths'], about['ros_distro']
+    assert found == expected
+    np.testing.assert_array_equal(deserialized(tmp_path / 'out'),
+                                  deserialized(tmp_path / f'out{file.suffix}'))
+
+
+def test_a_corrected_database_differs_in_the_messages_alone(calibration, tmp_path):
+    path = write(tmp_path, 'sqlite3', messages(8))
+    correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    dumps = []
+    for folder in (path, tmp_path / 'out'):
+        with closing(sqlite3.connect(next(folder.glob('*.db3')))) as database:
+            database.execute("UPDATE messages SET data = '' WHERE topic_id = 1")
+            dumps.append(list(database.iterdump()))
+    assert dumps[0] == dumps[1]
+
+
+@pytest.mark.parametrize('make', ['mcap', 'sqlite3', 'no chunks'])
+@pytest.mark.parametrize('spoil', [
+    lambda raw: b'', lambda raw: raw[:100], lambda raw: raw[:-8], lambda raw: raw + bytes(8),
+    lambda raw: raw[:12] + b'\xff' * 4 + raw[16:], lambda raw: b'\x00\x03' + raw[2:]],
+    ids=['empty', 'short', 'a double less', 'a double more', 'long frame_id', 'parameter list'])
+def test_a_broken_message_is_told_in_one_line(make, spoil, calibration, tmp_path):
+    made = list(messages(9))
+    which = [k for k, (channel, _, _) in enumerate(made) if channel == 0][100]
+    broken = spoil(made[which][2])
+    made[which] = (0, made[which][1], broken)
+    path = write(tmp_path, make, made)
+    says = f'/imu/a: message 101, of {len(broken)} bytes, is not whole'
+    with pytest.raises(InputError, match=says) as refusal:
+        read_recording(path, '/imu/a')
+    assert '\n' not in str(refusal.value)
+    with pytest.raises(InputError, match=says):
+        correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+    assert len(read_recording(path, '/imu/b').recording) == COUNT
+
+
+@pytest.mark.parametrize('make', ['mcap', 'lz4', 'zstd', 'no summary'])
+@pytest.mark.parametrize('share', [0.2, 0.5, 0.8])
+def test_a_damaged_chunk_is_told_in_one_line(make, share, calibration, tmp_path):
+    path = write(tmp_path, make, messages(10))
+    data = bytearray(path.read_bytes())
+    _, place, content = [each for each in records_in(data) if each[0] == 6][-1]
+    start = place + 9 + int(share * len(content))
+    data[start:start + 64] = b'\xa5' * 64
+    path.write_bytes(data)
+    with pytest.raises(InputError, match='is not a whole bag') as refusal:
+        read_recording(path, '/imu/a')
+    assert '\n' not in str(refusal.value)
+    with pytest.raises(InputError, match='is not a whole bag'):
+        correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize('cut', [1, 5, 20, 40])
+def test_records_that_are_cut_short_are_refused(cut):
+    whole = record(5, bytes(30)) + record(5, bytes(22))
+    messages_in(np.frombuffer(whole, np.uint8), [0])
+    for data in (whole[:-cut], whole + record(5, bytes(21)), whole + b'\x05' * cut):
+        with pytest.raises(ValueError, match='cut short'):
+            messages_in(np.frombuffer(data, np.uint8), [0])
+
+
+def test_a_topic_without_messages_is_told_in_one_line(tmp_path, calibration):
+    for make in ('mcap', 'sqlite3'):
+        path = write(tmp_path, make, [each for each in messages(11) if each[0]])
+        with pytest.raises(InputError, match='has no message on /imu/a'):
+            read_recording(path, '/imu/a')
+        with pytest.raises(InputError, match='has no message on /imu/a'):
+            correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+
+
+def test_blocks_give_the_poses_of_the_whole(tmp_path, monkeypatch):
+    rng = np.random.default_rng(12)
+    recording = simulate_recording(sensor(rng), spread_directions(8), rng, dwell=2.0, turn=0.5)
+    made = []
+    for k, (time, reading) in enumerate(zip(recording['time'], UNITS.from_g(recording.reading))):
+        raw = bytearray(imu(rng, 10 ** 12 + round(1e9 * time), 'imu'))
+        raw[-96:-72] = reading.tobytes()
+        raw[-192:-168] = recording['rate'][k].tobytes()
+        made.append((0, 10 ** 12 + round(1e9 * time), bytes(raw)))
+    path = McapFile(TOPICS, 'lz4').write(tmp_path / 'bag.mcap', made)
+    whole = capture(read_recording(path, '/imu/a').recording, UNITS)
+    monkeypatch.setattr(bag_samples, '_ROWS', 50)
+    with open_recording(path, '/imu/a') as stream:
+        assert stream.samples == len(recording)
+        found = capture(stream.blocks, UNITS)
+    assert len(whole.poses) == 8
+    assert (found.recorded, found.seconds) == (len(recording), whole.seconds)
+    for key in whole.poses.columns:
+        np.testing.assert_allclose(found.poses[key], whole.poses[key], rtol=1e-12)
