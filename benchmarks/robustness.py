@@ -1,0 +1,277 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Can a fit be trusted: disturbed poses, bad placement, stated uncertainty, choice of the model.
+
+Poses are spread over the sphere with 8° of jitter unless said; noise of a pose mean 0.3 mg by
+axis, its standard deviation measured from 100 samples. Errors are RMS of |a| on fresh directions,
+the median over the sets. Poor geometry has a page of its own, [geometry](geometry.md).
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+import multiprocessing
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
+
+from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
+from accel_calib.calibrate.norm_fit import form_of, solution_at  # noqa: E402
+from accel_calib.errors import AccelCalibError  # noqa: E402
+from accel_calib.sphere import random_directions  # noqa: E402
+from accel_calib.table import Floats  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, table  # noqa: E402
+import numpy as np  # noqa: E402
+from robust_sets import (  # noqa: E402
+    Case,
+    draw,
+    error_mg,
+    knock,
+    misplaced,
+    NOISE,
+    without_noise,
+)
+
+G = units_of('g')
+_SHOWS_MG = 2.0
+Job = tuple[Any, ...]
+
+
+def fitted(case: Case, model: str = 'auto') -> Calibration | None:
+    """Fit a set; None where it is refused."""
+    try:
+        return fit_poses(case.poses, G, model=model)
+    except AccelCalibError:
+        return None
+
+
+def error_of(calibration: Calibration | None, case: Case, rng: np.random.Generator) -> float:
+    """Give the error of a fit [mg]; infinite where it was refused."""
+    return np.inf if calibration is None else error_mg(calibration, case.sensor, rng)
+
+
+def of_knocks(job: Job) -> tuple[float, bool, bool, float]:
+    """Say of a set with knocked poses: error, named well, clean ones lost, error without them."""
+    count, knocked, measured, seed = job
+    rng = np.random.default_rng([seed, count, knocked])
+    clean = draw(rng, count)
+    case = knock(clean, rng, knocked) if knocked else clean
+    kept = np.flatnonzero(case.shows_mg == 0.0)
+    best = fitted(Case(case.sensor, case.poses.take(kept), case.force[kept], case.shows_mg[kept]),
+                  '10')
+    case = case if measured else without_noise(case)
+    found = fitted(case, '10')
+    named = set() if found is None else {rejected.row - 1 for rejected in found.rejected}
+    plain = set(np.flatnonzero(case.shows_mg >= _SHOWS_MG))
+    lost = bool(named & set(kept))
+    return (error_of(found, case, rng), plain <= named and not lost and found is not None, lost,
+            error_of(best, case, rng))
+
+
+def of_bound(job: Job) -> tuple[Floats, Floats]:
+    """Give the errors of the ten parameters over their Cramér-Rao bounds, and over the stated."""
+    count, seed = job
+    rng = np.random.default_rng([seed, count])
+    case = draw(rng, count)
+    found = fitted(case, '10')
+    assert found is not None
+    form = form_of('10')
+    truth = form.free(case.sensor.gain, case.sensor.offset)
+    a_size = np.full(count, NOISE)
+    jacobian = solution_at(form, truth, case.sensor.reading(case.force), a_size).jacobian
+    bound = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    away = found.model.vector - truth
+    return away / bound, away / np.sqrt(np.diag(found.covariance))
+
+
+def of_placement(job: Job) -> tuple[float, bool]:
+    """Say of badly placed orientations: error, and whether it was detected and said."""
+    count, degrees, seed = job
+    rng = np.random.default_rng([seed, count])
+    case = misplaced(rng, count, degrees)
+    found = fitted(case)
+    return error_of(found, case, rng), (found is not None and found.name != '12'
+                                        and '|force| = 1 g alone' in found.reason)
+
+
+def of_intervals(job: Job) -> tuple[Floats, Floats]:
+    """Say which parameters and corrected readings of a set are inside their 95 % intervals."""
+    kind, model, count, noise, seed = job
+    rng = np.random.default_rng([seed, count, int(model)])
+    each = NOISE * np.exp(rng.normal(size=count)) if noise == 'differs' else NOISE
+    case = draw(rng, count, kind, noise=each,
+                stated=1.0 / 3.0 if noise == 'understated' else 1.0)
+    if model == '12':
+        case = Case(case.sensor, case.poses.with_columns(reference=case.force), case.force,
+                    case.shows_mg)
+    found = fitted(without_noise(case) if noise == 'not given' else case, model)
+    if found is None:
+        return np.zeros(0), np.zeros(0)
+    gain = case.sensor.gain
+    if model == '9':
+        gain = np.linalg.cholesky(gain @ gain.T)
+    values = form_of(model).ties @ form_of(model).free(gain, case.sensor.offset) \
+        if model != '12' else _twelve(case)
+    deviation = np.sqrt(np.diag(found.covariance))
+    force = random_directions(20, rng)
+    got = found.correct(case.sensor.reading(force))
+    true = force @ np.linalg.solve(gain, case.sensor.gain).T
+    spread = np.sqrt(np.diagonal(found.force_covariance(got), axis1=1, axis2=2))
+    inside = np.abs(found.model.vector - values) <= 1.96 * deviation + 1e-12
+    return inside.astype(float), (np.abs(got - true) <= 1.96 * spread).ravel().astype(float)
+
+
+def _twelve(case: Case) -> Floats:
+    """Give the true values of model 12: offset, gains, cross-axis, misalignment."""
+    gain = case.sensor.gain
+    symmetric, skew = (gain + gain.T) / 2.0, (gain - gain.T) / 2.0
+    return np.concatenate([case.sensor.offset, np.diag(gain) - 1.0,
+                           symmetric[[0, 0, 1], [1, 2, 2]], skew[[2, 0, 1], [1, 2, 0]]])
+
+
+def of_choice(job: Job) -> dict[str, float]:
+    """Give the errors of auto and of each fixed model."""
+    kind, count, seed = job
+    rng = np.random.default_rng([seed, count, int(kind)])
+    case = draw(rng, count, kind)
+    fresh = rng.integers(2 ** 32)
+    return {model: error_of(fitted(case, model), case, np.random.default_rng(fresh))
+            for model in ('auto', '4', '7', '10')}
+
+
+Run = Callable[[Callable[[Job], Any], Sequence[Job]], list[Any]]
+
+
+def knocks(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure clean and knocked sets."""
+    asked = {(12, 0): 0.27, (36, 0): 0.148, (1000, 0): 0.029, (12, 1): 0.33, (36, 3): 0.165}
+    for (count, knocked), most in asked.items():
+        for measured in (True, False):
+            jobs = [(count, knocked, measured, seed + k) for k in range(sets)]
+            error, named, lost, best = map(np.array, zip(*run(of_knocks, jobs)))
+            what = f'{count} poses, ' + (f'{knocked} knocked by 50 mg' if knocked else 'clean')
+            what += '' if measured else ', noise not given'
+            middle = float(np.median(error))
+            yield Line(f'{what}: error [mg] (of a fit to the right rows)',
+                       f'{middle:.3f} ({np.median(best):.3f})', f'≤ {most}', sets, middle <= most)
+            if knocked:
+                yield _share(f'{what}: all that show by 2 mg named, and no clean one', named, 0.95)
+            else:
+                yield _share(f'{what}: no pose thrown out', ~lost, 0.98)
+
+
+def bounds(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure parameters against the Cramér-Rao bound."""
+    for count in (12, 36, 1000):
+        over, stated = zip(*run(of_bound, [(count, seed + k) for k in range(5 * sets)]))
+        ratio = float(np.sqrt(np.mean(np.square(over))))
+        yield Line(f'{count} poses: RMS error of the parameters over the Cramér-Rao bound',
+                   f'{ratio:.3f}', '≤ 1.05', 5 * sets, ratio <= 1.05)
+        ratio = float(np.sqrt(np.mean(np.square(stated))))
+        yield Line(f'{count} poses: the same over the stated deviation', f'{ratio:.3f}', '',
+                   5 * sets, None)
+
+
+def placements(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure badly placed orientations."""
+    for count in (12, 18, 36):
+        error, told = map(np.array, zip(*run(of_placement, [(count, 2.0, seed + k)
+                                                            for k in range(sets)])))
+        middle = float(np.median(error))
+        what = f'six faces and {count - 6} more placed'
+        yield _share(f'{what} 2° off: detected, and said', told, 1.0)
+        yield Line(f'{what} 2° off: error [mg]', f'{middle:.3f}', '≤ 0.4', sets, middle <= 0.4)
+        told = np.array([told for _, told in run(of_placement, [(count, 0.0, seed + k)
+                                                                for k in range(sets)])])
+        yield _share(f'{what} well: the orientations are used', ~told, 0.99)
+
+
+def intervals(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure how often 95 % intervals hold the truth."""
+    rows = [(kind, model, count, 'measured') for kind, model in
+            (('4', '4'), ('7', '7'), ('10', '9'), ('10', '10'), ('12', '12'))
+            for count in (12, 36)]
+    rows += [('10', '10', count, noise) for count in (12, 36, 100)
+             for noise in ('differs', 'not given', 'understated')]
+    words = {'measured': '', 'differs': ', noise that differs by pose (e-fold)',
+             'not given': ', noise not given',
+             'understated': ', noise stated a third of what it is'}
+    for kind, model, count, noise in rows:
+        jobs = [(kind, model, count, noise, seed + k) for k in range(10 * sets)]
+        values, readings = zip(*run(of_intervals, jobs))
+        each = 100.0 * np.mean([part for part in values if len(part)], axis=0)
+        corrected = 100.0 * np.mean([part for part in readings if len(part)])
+        met = bool(np.all((each >= 93.0) & (each <= 97.0)) and 93.0 <= corrected <= 97.0)
+        yield Line(f'model {model}, {count} poses{words[noise]}: 95 % intervals hold',
+                   f'parameters {np.min(each):.1f} to {np.max(each):.1f} %, corrected readings '
+                   f'{corrected:.1f} %', '93 to 97 %', 10 * sets, met)
+
+
+def choices(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure auto against the best fixed model."""
+    for kind in ('4', '7', '10'):
+        for count in (6, 8, 9, 10, 12, 18, 24, 36, 60):
+            found = run(of_choice, [(kind, count, seed + k) for k in range(2 * sets)])
+            median = {name: float(np.median([one[name] for one in found])) for name in found[0]}
+            best = min(('4', '7', '10'), key=lambda name: median[name])
+            ratio = median['auto'] / median[best]
+            yield Line(f'a {kind}-parameter sensor, {count} poses: error of auto over that of the '
+                       f'best fixed model', f'{ratio:.3f} ({median["auto"]:.3f} mg; model {best})',
+                       '≤ 1.05', 2 * sets, ratio <= 1.05)
+
+
+def _share(what: str, good: Floats, least: float) -> Line:
+    part = float(np.mean(good))
+    return Line(what, f'{100.0 * part:.1f} %', f'≥ {100.0 * least:g} %', len(good), part >= least)
+
+
+ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals': intervals,
+        'choices': choices}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--sets', type=int, default=200)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--jobs', type=int, default=2, help='processes')
+    parser.add_argument('--only', choices=ROWS, action='append')
+    parser.add_argument('--markdown', type=Path, help='write the table to this file')
+    given = parser.parse_args(arguments)
+    lines = []
+    with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
+        def run(one: Callable[[Job], Any], jobs: Sequence[Job]) -> list[Any]:
+            return pool.map(one, jobs, chunksize=10)
+        for name in given.only or ROWS:
+            lines += ROWS[name](run, given.sets, 100_000 * given.seed)
+            print(name, file=sys.stderr, flush=True)
+    text = (f'# Figures of trust\n\n{__doc__.strip()}\n\nMade by `python benchmarks/robustness.py '
+            f'--sets {given.sets} --seed {given.seed} --markdown FILE`.\n\n{table(lines)}\n')
+    print(text)
+    if given.markdown:
+        given.markdown.write_text(text, encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
