@@ -60,15 +60,19 @@ _SAME = np.cos(np.radians(5.0))
 _SINGULAR, _NOTHING = 1e-7, 1e-14
 
 
+def effects_of(name: str) -> tuple[str, ...]:
+    """Name the effects of a model; 9 is 10 in other axes."""
+    return MODELS['10' if name == '9' else name]
+
+
 def parameters_of(name: str) -> tuple[str, ...]:
-    """Name the parameters of a model; 9 is 10 in other axes."""
-    return parameter_names(MODELS['10' if name == '9' else name])
+    """Name the parameters of a model."""
+    return parameter_names(effects_of(name))
 
 
 def rows_of(name: str, directions: Floats) -> Floats:
     """Give Φ for each of these (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0))
-             for effect in MODELS['10' if name == '9' else name]]
+    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0)) for effect in effects_of(name)]
     basis = np.concatenate(parts, axis=2)
     return basis if name == '12' else np.einsum('ni,nip->np', directions, basis)[:, np.newaxis]
 
