@@ -86,6 +86,19 @@ def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
     assert then(few) == text.text == few.words
 
 
+def test_set_level_tells_of_a_flat_pose_on_another_face(bench: Any, readings: Readings,
+                                                       stored: Stored) -> None:
+    still = bench.listen(Bool, 'calibrator/still', latched=True)
+    bench.calibrator(calibration_file=str(stored()), sensor='arm', passthrough=True)
+    bench.feed(readings([[0, 0, 1], [0, 0, -1]], dwell=3.0)[:-5])
+    bench.spin(lambda: still and still[-1].data)
+    answer = bench.call('set_level')
+    assert answer.success, answer.message
+    assert 'this pose is flat now' in answer.message
+    assert 'the flat pose reads -1.00 g on z' in answer.message
+    assert 'mounted upside down, or z (or every axis) has the wrong sign' in answer.message
+
+
 def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     still = bench.listen(Bool, 'calibrator/still', latched=True)

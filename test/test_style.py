@@ -35,7 +35,6 @@ LAYERS = (
     ('refine',),
     ('imu', 'plain_effects'),
     ('plain',),
-    ('plain_spread',),
     ('files',),
     ('report',),
     ('ros',),

@@ -15,7 +15,8 @@
 """Poses to calibration: closed forms, maximum likelihood, mounting, and the record of it."""
 
 from .calibration import Calibration, level, Quality, Rejected
-from .fit import check_units, fit_poses, METHODS, MODEL_NAMES
+from .comparison import compare, Comparison, LEVEL
+from .fit import fit_poses, METHODS, MODEL_NAMES
 from .geometry import coverage
 from .identifiability import Identifiability, identifiability
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
@@ -23,13 +24,18 @@ from .next_pose import next_pose, NextPose
 from .outlook import Outlook, outlook
 from .quality import in_g, Verification, verify
 from .sensing_axes import sensing_axes, SensingAxes
+from .unit_check import check_units
 from .unknown import directions_of
+from .wiring import FLAT
 
 __all__ = [
+           'FLAT',
            'FRAMES',
+           'LEVEL',
            'METHODS',
            'MODEL_NAMES',
            'Calibration',
+           'Comparison',
            'FrameName',
            'Identifiability',
            'NextPose',
@@ -39,6 +45,7 @@ __all__ = [
            'SensingAxes',
            'Verification',
            'check_units',
+           'compare',
            'coverage',
            'directions_of',
            'fit_poses',

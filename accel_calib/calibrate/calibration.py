@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .mounting import FrameName, mounting
+from .wiring import FLAT, flat_warnings
 from ..effects import Context, EFFECTS
 from ..model import (
     correct,
@@ -243,10 +244,12 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     Returns
     -------
     Calibration
-        The same with ΔR of that pose.
+        The same with ΔR of that pose, and a warning where it looks like a fault of the wiring.
 
     """
     reading_g = calibration.units.to_g(np.asarray(reading, float))[np.newaxis]
     flat = sensor_force(calibration.model, reading_g, context or {})[0]
     rotation = mounting(flat, frame)
-    return replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
+    others = [warning for warning in calibration.warnings if not warning.startswith(FLAT)]
+    return replace(calibration, model=Model(calibration.model.values, rotation), frame=frame,
+                   warnings=(*others, *flat_warnings(rotation, frame)))

@@ -25,19 +25,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from .calibration import Calibration
 from .known import fit_known
+from .unit_check import check_units
 from .unknown import fit_unknown, Method
-from ..errors import InputError
-from ..table import Poses, Table
+from .wiring import wiring_warnings
+from ..table import Poses
 from ..units import Units
 
 METHODS = ('ml', 'algebraic')
 MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
-
-_LIKELY_G = (0.5, 2.0)
 
 
 def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method = 'ml',
@@ -81,26 +78,5 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
         calibration = fit_known(poses, units, method)
     else:
         calibration = fit_unknown(poses, units, model, method)
-    return replace(calibration, sensor=sensor, date=date)
-
-
-def check_units(poses: Table, units: Units) -> None:
-    """
-    Make sure that still readings are about 1 g long.
-
-    Raises
-    ------
-    InputError
-        Says which unit they look like.
-
-    """
-    if units.name == 'native' or len(poses) == 0:
-        return
-    length = float(np.median(np.linalg.norm(poses.reading, axis=1)))
-    if _LIKELY_G[0] <= length / units.per_g <= _LIKELY_G[1]:
-        return
-    likely = [name for name, per_g in (('m/s2', 9.80665), ('g', 1.0))
-              if _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]]
-    raise InputError(f'the readings are about {length:.4g} long, expected about '
-                     f'{units.per_g:.4g} at rest in {units.name}',
-                     f'give the units of the readings: {likely[0] if likely else "native"}')
+    return replace(calibration, sensor=sensor, date=date,
+                   warnings=(*wiring_warnings(calibration), *calibration.warnings))

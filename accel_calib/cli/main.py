@@ -38,6 +38,7 @@ COMMANDS = {
     'capture': 'find the still stretches of a recording and write the pose table',
     'fit': 'fit a calibration to still poses',
     'verify': 'say how well a calibration does on poses it has not seen',
+    'compare': 'say whether calibrations of one sensor agree within their uncertainties',
     'refine': 'find where simulation and measurement disagree, name the missing effect and add it',
     'apply': 'correct a recording with a calibration',
     'simulate': 'simulate poses or a recording of a sensor with known effects',

@@ -37,10 +37,10 @@ from .search import Found, search, WANDER
 from .state import plus, State
 from .where import where
 from ..calibrate import Calibration
-from ..calibrate.fit import check_units
 from ..calibrate.geometry import coverage
 from ..calibrate.likelihood import judge
 from ..calibrate.quality import in_g, quality_of
+from ..calibrate.unit_check import check_units
 from ..effects import EFFECTS
 from ..errors import RefusedFitError
 from ..model import Model

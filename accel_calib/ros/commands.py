@@ -31,7 +31,7 @@ from .context import context_of_rest
 from .fitting import asked_for, fitted, refined, story, summary, then
 from .health import self_test_of
 from .pose_view import PoseView
-from ..calibrate import level
+from ..calibrate import FLAT, level
 from ..errors import InputError, StoredCalibrationError
 from ..files import check_sensor
 
@@ -178,7 +178,8 @@ class Commands:
 
         def finish(not_stored: OSError | None) -> str:
             self._use(levelled, not_stored)
-            return f'this pose is flat now; stored in {store.calibration}'
+            doubts = [words for words in levelled.warnings if words.startswith(FLAT)]
+            return '; '.join([f'this pose is flat now; stored in {store.calibration}', *doubts])
 
         return self._answers.later(lambda: _stored(store, levelled), finish)
 

@@ -1,0 +1,141 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What runs of one sensor have in common, and what of it stands in the way of comparing them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from .calibration import Calibration
+from ..effects import Context
+from ..errors import InputError
+from ..table import Floats
+
+_COMMON = ('temperature', 'supply_voltage')
+"""What may be set alike for all runs; the rest is each run's own."""
+
+_WARMER = 5.0
+"""Temperatures of two runs further apart than this are worth a word [°C]."""
+
+
+def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
+    """
+    Make sure that calibrations can be compared.
+
+    Raises
+    ------
+    InputError
+        Says what keeps them from being compared.
+
+    """
+    if len(calibrations) < 2:
+        raise InputError('there is nothing to compare a single calibration with',
+                         'give two or more of the same sensor')
+    sensors = list(dict.fromkeys(run.sensor for run in calibrations if run.sensor))
+    if len(sensors) > 1:
+        raise InputError(f'the calibrations are of the sensors {" and ".join(sensors)}, expected '
+                         'one sensor', 'give calibrations of one sensor; if it was only renamed, '
+                         'write one name into sensor: of the files')
+    native = [run.units.name == 'native' for run in calibrations]
+    if any(native) and not all(native):
+        other = next(run.units.name for run in calibrations if run.units.name != 'native')
+        raise InputError(f'run {native.index(True) + 1} is in native units, another in {other}, '
+                         'and nothing says how many native units make one of it',
+                         'fit all of them from readings in one unit')
+    for k, run in enumerate(calibrations, 1):
+        if not np.all(np.isfinite(run.covariance)):
+            raise InputError(f'run {k} does not say how sure it is: it has as many poses as free '
+                             'parameters', 'fit it again with more poses')
+
+
+def contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
+    """Give the context in which each run is looked at, one row each."""
+    common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
+                                      if key in run.poses])])
+              for key in _COMMON if any(key in run.poses for run in calibrations)}
+    return tuple({**_own_context(run), **common} for run in calibrations)
+
+
+def _own_context(run: Calibration) -> Context:
+    """Give the middle of a run: not turning, and reached from nowhere."""
+    context: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'approach': np.zeros((1, 3))}
+    if 'time' in run.poses:
+        context['time'] = np.array([np.median(run.poses['time'])])
+    if 'std' in run.poses:
+        context['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
+    return context
+
+
+def notes_of(calibrations: Sequence[Calibration], names: tuple[str, ...], stated: Floats,
+             noisier: Sequence[int]) -> tuple[str, ...]:
+    """
+    Say what else to know of a comparison.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        The runs.
+    names : tuple of str
+        Of the t common parameters.
+    stated : (n, t) array
+        Their standard deviations; 0 where the model of a run leaves one out.
+    noisier : sequence of int
+        Runs whose poses repeat worse than those of the others.
+
+    """
+    return (*_shared(calibrations), *_left_out(names, stated), *_temperatures(calibrations),
+            *(f'the poses of run {k + 1} repeat significantly worse than those of the others: it '
+              'counts for less' for k in noisier))
+
+
+def _shared(calibrations: Sequence[Calibration]) -> list[str]:
+    """Name runs that were fitted to the same poses."""
+    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(9).tolist()}
+            for run in calibrations]
+    notes = []
+    for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
+        common, least = len(first & second), min(len(first), len(second))
+        if common:
+            what = 'the same poses' if common == least else f'{common} poses'
+            notes.append(f'runs {i} and {j} share {what}: they are not independent, and that they '
+                         'agree says little')
+    return notes
+
+
+def _left_out(names: tuple[str, ...], stated: Floats) -> list[str]:
+    """Name what some models leave out and others find."""
+    notes: dict[tuple[int, ...], list[str]] = {}
+    for name, column in zip(names, stated.T, strict=True):
+        without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
+        if 0 < len(without) < len(column):
+            notes.setdefault(without, []).append(name)
+    return [f'{", ".join(found)}: left out by the model of run{"s" * (len(runs) > 1)} '
+            f'{", ".join(map(str, runs))}, so that there it counts as known to be zero; for a '
+            'comparison of like with like, fit all runs with one model'
+            for runs, found in notes.items() if found]
+
+
+def _temperatures(calibrations: Sequence[Calibration]) -> list[str]:
+    """Say so where runs were taken at other temperatures, and some do not correct for that."""
+    known = [float(np.median(run.poses['temperature'])) for run in calibrations
+             if 'temperature' in run.poses]
+    if len(known) < 2 or max(known) - min(known) < _WARMER or all(
+            'temperature' in run.model.needs for run in calibrations):
+        return []
+    return [f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all runs '
+            'correct for temperature: it may be what differs']

@@ -1,0 +1,120 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``accel-calib compare``: whether calibrations of one sensor agree."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from . import options
+from ..calibrate import compare, Comparison, LEVEL
+from ..errors import AccelCalibError
+from ..files import read_calibration
+from ..units import MG
+
+_EXAMPLE = ('accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
+            'exit status:\n'
+            '  0: they agree, 1: they do not, 2: they cannot be compared')
+
+DISAGREE = 1
+
+
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
+    made.add_argument('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
+                      help='two or more stored calibrations of one sensor')
+    options.add_json(made)
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare and say what came out."""
+    try:
+        calibrations = [read_calibration(path) for path in args.calibrations]
+        comparison = compare(calibrations)
+    except AccelCalibError as err:
+        options.write_json(args.json, {'error': err.message, 'advice': err.advice})
+        raise
+    models = [calibration.name for calibration in calibrations]
+    options.write_json(args.json, _result(args.calibrations, models, comparison))
+    _show(args, models, comparison)
+    return 0 if comparison.agree else DISAGREE
+
+
+def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dict[str, Any]:
+    """Give the result in the names of the documentation."""
+    outlier = comparison.outlier
+    return {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
+            'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
+                     zip(paths, models, comparison.runs, strict=True)]}
+
+
+def _show(args: argparse.Namespace, models: list[str], comparison: Comparison) -> None:
+    """Tell a person what came out."""
+    console = options.say(args)
+    console.print(_runs_table(args.calibrations, models, comparison))
+    console.print(_parameters_table(comparison))
+    for note in comparison.notes:
+        console.print(f'note: {note}', markup=False)
+    if comparison.tilt_deg is not None:
+        console.print(f'the levelled ones differ by up to {comparison.tilt_deg:.3g}° in what is '
+                      'up; that has no part in the answer')
+    console.print(_answer(comparison), markup=False)
+
+
+def _answer(comparison: Comparison) -> str:
+    """Say in a line whether they agree."""
+    sure = f'p = {comparison.p_value:.2g}; below {LEVEL:g} they do not'
+    if comparison.agree:
+        return f'The calibrations agree within their uncertainties ({sure}).'
+    if comparison.outlier is None:
+        more = '' if len(comparison.runs) > 2 else '; a third run would tell which is off'
+        return f'The calibrations do not agree ({sure}){more}.'
+    return (f'The calibrations do not agree ({sure}): run {comparison.outlier + 1} differs, the '
+            'others agree.')
+
+
+def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) -> Any:
+    """Give each run against the others."""
+    from rich.table import Table
+
+    table = Table(title='Corrected |a| against the mean of the others, over all directions')
+    table.add_column('run')
+    for name in ('model', 'RMS, mg', 'expected, mg', 'largest, mg', 'p'):
+        table.add_column(name, justify='right')
+    for number, (path, model, run) in enumerate(zip(paths, models, comparison.runs,
+                                                    strict=True), 1):
+        table.add_row(f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
+                      f'{run.largest_mg:.3g}', f'{run.p_value:.2g}')
+    return table
+
+
+def _parameters_table(comparison: Comparison) -> Any:
+    """Give the spread of each parameter."""
+    from rich.table import Table
+
+    table = Table(title='Spread of the parameters over the runs')
+    table.add_column('')
+    for name in ('mean, mg', 'spread, mg', 'stated, mg', 'ratio'):
+        table.add_column(name, justify='right')
+    for one in comparison.parameters:
+        stated = float((one.stated_sd ** 2).mean() ** 0.5) * MG
+        table.add_row(one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
+                      f'{stated:.3g}', '' if one.ratio is None else f'{one.ratio:.2f}')
+    return table

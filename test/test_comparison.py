@@ -1,0 +1,282 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Repeat runs: calibrations of one sensor agree, and those of a sensor that changed do not."""
+
+from dataclasses import replace
+import json
+
+from accel_calib.calibrate import compare, fit_poses, level
+from accel_calib.calibrate.rotation_free import NAMES, rotation_free
+from accel_calib.cli.main import main
+from accel_calib.errors import InputError
+from accel_calib.files import write_calibration
+from accel_calib.model import Model, sensor_force
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.units import Units, units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+G = units_of('g')
+
+
+def poses_of(model, rng, count=12, **settings):
+    directions = spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
+    return simulate_poses(model, directions, rng, **settings)
+
+
+def without_noise(poses):
+    columns = {key: value for key, value in poses.columns.items() if key not in ('std', 'count')}
+    return type(poses)(columns, poses.row)
+
+
+def runs_of(model, rng, count, poses=12, name='10', **settings):
+    return [fit_poses(poses_of(model, rng, poses, **settings), G, model=name)
+            for _ in range(count)]
+
+
+def with_offset(model, axis, change):
+    offset = model.values['offset'].copy()
+    offset[axis] += change
+    return model_with({**model.values, 'offset': offset})
+
+
+@pytest.mark.parametrize(('count', 'sets'), [(2, 60), (5, 20)])
+@pytest.mark.parametrize('measured', [True, False])
+def test_runs_of_one_sensor_agree(count, sets, measured):
+    alarms = 0
+    for seed in range(sets):
+        rng = np.random.default_rng(seed)
+        model = sensor(rng)
+        tables = [poses_of(model, rng) for _ in range(count)]
+        tables = tables if measured else [without_noise(poses) for poses in tables]
+        alarms += not compare([fit_poses(poses, G, model='10') for poses in tables]).agree
+    assert alarms <= 0.1 * sets
+
+
+def test_twenty_runs_spread_as_they_state():
+    rng = np.random.default_rng(1001)
+    found = compare(runs_of(sensor(rng), rng, 20, 24))
+    assert found.agree
+    assert found.dof == 19 * 9
+    assert found.chi2 == pytest.approx(found.dof, rel=0.4)
+    assert tuple(one.name for one in found.parameters) == NAMES
+    assert np.mean([one.ratio for one in found.parameters]) == pytest.approx(1.0, abs=0.2)
+    assert np.mean([run.rms_mg / run.expected_mg for run in found.runs]) == pytest.approx(
+        1.0, abs=0.2)
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_a_milli_g_in_one_run_is_found_and_the_run_named(axis):
+    rng = np.random.default_rng(axis)
+    model = sensor(rng)
+    runs = runs_of(model, rng, 5, 20)
+    runs[3] = runs_of(with_offset(model, axis, 1e-3), rng, 1, 20)[0]
+    found = compare(runs)
+    assert not found.agree
+    assert found.outlier == 3
+    assert min(found.runs, key=lambda run: run.p_value) is found.runs[3]
+    assert abs(found.runs[3].direction[axis]) > 0.8
+    assert found.runs[3].largest_mg == pytest.approx(1.0, abs=0.6)
+
+
+def test_of_two_neither_is_named():
+    rng = np.random.default_rng(7)
+    model = sensor(rng)
+    found = compare(runs_of(model, rng, 1, 24)
+                    + runs_of(with_offset(model, 0, 2e-3), rng, 1, 24))
+    assert not found.agree
+    assert found.outlier is None
+
+
+def test_rotation_free_parameters_are_those_of_any_axes():
+    rng = np.random.default_rng(3)
+    poses = poses_of(sensor(rng), rng, 20)
+    nine, ten = (fit_poses(poses, G, model=name) for name in ('9', '10'))
+    turned = level(nine, poses.reading[4], 'ros')
+    told = [rotation_free(run, {}, 1.0) for run in (nine, ten, turned)]
+    for other in told[1:]:
+        np.testing.assert_allclose(other.values, told[0].values, atol=1e-7)
+    spread = [one.slope @ run.covariance @ one.slope.T
+              for one, run in zip(told, (nine, ten), strict=False)]
+    np.testing.assert_allclose(spread[0], spread[1], rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(spread[1])[:3]), ten.offset_sd, rtol=1e-6)
+
+
+def test_slope_of_the_rotation_free_parameters_is_their_derivative():
+    rng = np.random.default_rng(4)
+    directions = spread_directions(12)
+    poses = simulate_poses(sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment'),
+                           directions, rng, context={'reference': directions})
+    run = fit_poses(poses, G)
+    told = rotation_free(run, {}, 1.0)
+    for k, column in enumerate(told.slope.T):
+        values = run.model.vector.copy()
+        values[k] += 1e-6
+        sizes = np.cumsum([len(part) for part in run.model.values.values()])[:-1]
+        moved = replace(run, model=Model(dict(zip(run.model.effects, np.split(values, sizes),
+                                                  strict=True))))
+        change = (rotation_free(moved, {}, 1.0).values - told.values) / 1e-6
+        np.testing.assert_allclose(change, column, atol=1e-5)
+
+
+@pytest.mark.parametrize(('first', 'second'), [('9', '10'), ('12', '10'), ('12', '9')])
+def test_models_with_other_axes_agree(first, second):
+    alarms = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
+        runs = []
+        for name in (first, second):
+            directions = random_directions(20, rng)
+            context = {'reference': directions} if name == '12' else {}
+            poses = simulate_poses(model, directions, rng, context=context)
+            runs.append(fit_poses(poses, G, model=name))
+        found = compare(runs)
+        alarms += not found.agree
+        assert found.dof == 9
+    assert alarms <= 1
+
+
+def test_a_model_that_leaves_out_what_is_there_does_not_agree_and_it_is_said():
+    rng = np.random.default_rng(5)
+    model = sensor(rng)
+    runs = runs_of(model, rng, 1, name='7') + runs_of(model, rng, 2)
+    found = compare(runs)
+    assert not found.agree
+    assert found.outlier == 0
+    assert any('gain.xy, gain.xz, gain.yz: left out by the model of run 1' in note
+               for note in found.notes)
+
+
+def test_smaller_models_agree_where_they_are_right():
+    rng = np.random.default_rng(6)
+    model = sensor(rng, 'offset', 'gain')
+    found = compare([run for name in ('4', '7', '10') for run in runs_of(model, rng, 1, 24, name)])
+    assert found.agree
+    assert found.dof == 4 + 6 + 9 - 4
+
+
+def test_metres_and_g_are_converted():
+    rng = np.random.default_rng(8)
+    model = sensor(rng)
+    first, second = poses_of(model, rng, 20), poses_of(model, rng, 20)
+    units = units_of('m/s2')
+    second = second.with_columns(reading=units.from_g(second.reading),
+                                 std=units.from_g(second['std']))
+    found = compare([fit_poses(first, G), fit_poses(second, units)])
+    assert found.agree
+    assert found.parameters[0].values[1] == pytest.approx(model.values['offset'][0], abs=1e-3)
+
+
+def test_native_runs_agree_though_each_has_a_scale_of_its_own():
+    rng = np.random.default_rng(1009)
+    model, counts = sensor(rng), Units('native', 4060.0)
+
+    def run(change=0.0):
+        poses = poses_of(with_offset(model, 1, change), rng, 20)
+        poses = poses.with_columns(reading=counts.from_g(poses.reading) + 33000.0,
+                                   std=counts.from_g(poses['std']))
+        return fit_poses(poses, units_of('native'), model='10')
+
+    runs = [run() for _ in range(3)]
+    assert len({one.units.per_g for one in runs}) == 3
+    assert compare(runs).agree
+    assert compare([*runs, run(2e-3)]).outlier == 3
+
+
+def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
+    rng = np.random.default_rng(10)
+    effects = {**sensor(rng).values, 'offset_temperature': np.array([5e-4, -4e-4, 3e-4])}
+    model = model_with(effects)
+
+    def run(middle):
+        warm = {'temperature': rng.uniform(middle - 10.0, middle + 10.0, 30)}
+        poses = poses_of(model, rng, 30, context=warm)
+        plain = fit_poses(poses, G, model='10')
+        from accel_calib.calibrate.likelihood import judge
+        fit = judge(model, poses.reading, poses.columns, poses.noise)
+        moved = sensor_force(model, poses.reading, poses.columns)
+        step = np.linalg.lstsq(-fit.jacobian, (np.linalg.norm(moved, axis=1) - 1.0) / fit.sigma,
+                               rcond=None)[0]
+        values = dict(zip(model.values, np.split(model.vector + step, [3, 6, 9]), strict=True))
+        return plain, replace(plain, model=Model(values), covariance=fit.covariance)
+
+    cold, warm = run(15.0), run(35.0)
+    assert compare([cold[1], warm[1]]).agree
+    found = compare([cold[0], warm[0]])
+    assert not found.agree
+    assert any('taken at 1' in note and 'temperature' in note for note in found.notes)
+
+
+def test_shared_poses_are_told():
+    rng = np.random.default_rng(11)
+    model = sensor(rng)
+    poses = [poses_of(model, rng, 14) for _ in range(2)]
+    runs = [fit_poses(table, G, model=name) for table, name in
+            ((poses[0], '10'), (poses[0], '7'), (poses[1], '10'))]
+    notes = compare(runs).notes
+    assert [note for note in notes if 'share' in note] == [
+        'runs 1 and 2 share the same poses: they are not independent, and that they agree says '
+        'little']
+
+
+def test_levelled_runs_are_compared_in_what_is_up():
+    rng = np.random.default_rng(12)
+    model = sensor(rng)
+    runs = runs_of(model, rng, 2, 20)
+    assert compare(runs).tilt_deg is None
+    flat = [np.array([0.0, 0.0, 1.0]), np.array([0.0, np.sin(np.radians(2.0)), 1.0])]
+    levelled = [level(run, run.predict(up[np.newaxis])[0], 'ros')
+                for run, up in zip(runs, flat, strict=True)]
+    assert compare(levelled).tilt_deg == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'sensor': 'other'}, 'of the sensors imu and other'),
+    ({'units': Units('native', 400.0)}, 'run 2 is in native units, another in g'),
+    ({'covariance': np.full((9, 9), np.nan)}, 'run 2 does not say how sure it is')])
+def test_what_cannot_be_compared_is_refused(change, message):
+    rng = np.random.default_rng(13)
+    run = replace(runs_of(sensor(rng), rng, 1)[0], sensor='imu')
+    with pytest.raises(InputError, match=message):
+        compare([run, replace(run, **change)])
+    with pytest.raises(InputError, match='nothing to compare'):
+        compare([run])
+
+
+def test_the_command_answers_by_its_exit_status(tmp_path, capsys):
+    rng = np.random.default_rng(14)
+    model = sensor(rng)
+    runs = [*runs_of(model, rng, 3, 20), *runs_of(with_offset(model, 0, 3e-3), rng, 1, 20)]
+    paths = [tmp_path / f'{k}.yaml' for k in range(4)]
+    for path, run in zip(paths, runs, strict=True):
+        write_calibration(path, run)
+
+    def told(*which):
+        status = main(['compare', *(str(paths[k]) for k in which), '--json', '-'])
+        return status, json.loads(capsys.readouterr().out)
+
+    status, result = told(0, 1, 2)
+    assert (status, result['agree'], result['outlier']) == (0, True, None)
+    status, result = told(0, 3, 1, 2)
+    assert (status, result['agree'], result['outlier']) == (1, False, 2)
+    assert result['runs'][1]['file'] == str(paths[3])
+    assert set(result) == {'agree', 'p_value', 'chi2', 'dof', 'outlier', 'runs', 'parameters',
+                           'tilt_deg', 'notes'}
+    status, result = told(0)
+    assert status == 2
+    assert set(result) == {'error', 'advice'}
