@@ -34,13 +34,14 @@ unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 endif
 
-.PHONY: help demo test lint clean
+.PHONY: help demo test lint bench clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo   the main job, without hardware'
 	@echo 'make test   the tests; PYTEST_ARGS="-k name" for some of them'
 	@echo 'make lint   linter and type check'
+	@echo 'make bench  measures speed, beside what it is compared to, and writes it to the docs'
 	@echo 'make clean  removes .venv and what was built'
 
 demo: $(VENV)/package
@@ -55,6 +56,11 @@ lint: $(VENV)/extra-dev
 	@$(BIN)/flake8 $(PYTHON_SOURCES)
 	@$(BIN)/pydocstyle --property-decorators= $(PYTHON_SOURCES)
 	@$(BIN)/mypy
+
+# For an idle machine: what else it does would be measured too.
+bench: $(VENV)/extra-test $(VENV)/package
+	@for name in imu_path recordings fits; do \
+		$(BIN)/python benchmarks/$$name.py --markdown docs/figures/$$name.md || exit 1; done
 
 clean:
 	@rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache

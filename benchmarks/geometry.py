@@ -224,8 +224,8 @@ def overall(outcomes: Sequence[Outcome]) -> list[Line]:
     caught = float(np.mean([each.refused for each in far]))
     return [Line(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
                  f'{caught:.2%}', '100 %', len(far), caught == 1.0),
-            Line('all sets fitted: error of |a|, median (worst) [mg]', median(kept), '', len(kept),
-                 None),
+            Line('all sets fitted: error of the norm, median (worst) [mg]', median(kept), '',
+                 len(kept), None),
             Line('all sets refused: within 0.6 mg once the poses named are added', f'{mended:.1%}',
                  '', len(out), None)]
 

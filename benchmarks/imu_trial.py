@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import itertools
 import os
 from pathlib import Path
@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 CLIENTS = ROOT / 'benchmarks' / 'imu_clients.py'
+Stamps = NDArray[np.int64]
+
 SETTLE = 2.0
 """After the first message came through, before anything is measured [s]."""
-
-Stamps = NDArray[np.int64]
 
 _DOMAINS = itertools.cycle(range(1, 102))
 
@@ -48,25 +48,51 @@ class Trial:
 
     Parameters
     ----------
-    cpu_us : float
-        CPU time of the process between driver and user, a message that it was given [µs].
-    latency_us : (n,) array
-        From the driver's stamp to the user [µs].
-    sent, lost : int
-        Messages of the driver, and of these not seen by the user.
-    rate : float
-        Messages a second that reached the user.
+    cpu : float
+        CPU time of the process between driver and user [s].
     start : float
-        From the start of the process to the first message that came through it [s].
+        From the start of that process to the first message that came through it [s].
+    first, last : int
+        Begin and end [ns].
+    sent : (n,) array
+        Stamps of the messages of the driver [ns].
+    heard : (m, 2) array
+        Stamp and arrival of the messages that the user heard [ns].
 
     """
 
-    cpu_us: float
-    latency_us: NDArray[np.float64]
-    sent: int
-    lost: int
-    rate: float
+    cpu: float
     start: float
+    first: int
+    last: int
+    sent: Stamps
+    heard: Stamps
+
+    def between(self, first: int, last: int) -> Trial:
+        """Give the messages of a shorter stretch."""
+        sent, heard = self.sent, self.heard
+        return replace(self, first=first, last=last, sent=sent[(sent >= first) & (sent < last)],
+                       heard=heard[(heard[:, 0] >= first) & (heard[:, 0] < last)])
+
+    @property
+    def latency_us(self) -> NDArray[np.float64]:
+        """Give the time of each message from driver to user [µs]."""
+        return (self.heard[:, 1] - self.heard[:, 0]) * 1e-3
+
+    @property
+    def lost(self) -> int:
+        """Give how many messages did not come through."""
+        return len(self.sent) - len(np.unique(self.heard[:, 0]))
+
+    @property
+    def rate(self) -> float:
+        """Give how many messages came through in a second."""
+        return len(self.heard) / (self.last - self.first) * 1e9
+
+    @property
+    def cpu_us(self) -> float:
+        """Give the CPU time a message that came through, or was sent where nobody listened."""
+        return self.cpu * 1e6 / (len(self.heard) or len(self.sent))
 
 
 def cpu_seconds(pid: int) -> float:
@@ -111,11 +137,10 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         Whether there is a user.
 
     """
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': str(next(_DOMAINS)),
-                   'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT),
+                      ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     with tempfile.TemporaryDirectory() as folder:
-        environment |= {'ROS_LOG_DIR': folder, 'ROS_HOME': folder}
-        os.environ['ROS_DOMAIN_ID'] = environment['ROS_DOMAIN_ID']
+        environment = {**os.environ, 'ROS_LOG_DIR': folder, 'ROS_HOME': folder}
         sent_file, heard_file = Path(folder) / 'sent.npy', Path(folder) / 'heard.npy'
         listen = ([str(CLIENTS), 'listen', '--file', str(heard_file)] if listened
                   else ['-c', 'input()'])
@@ -132,17 +157,7 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
                 time.sleep(0.3)
         sent = np.load(sent_file)
         heard = np.load(heard_file) if listened else np.empty((0, 2), np.int64)
-    return _between(first, last, sent, heard, cpu, start)
-
-
-def _between(first: int, last: int, sent: Stamps, heard: Stamps, cpu: float, start: float
-             ) -> Trial:
-    """Give what there was between two times [ns]."""
-    sent = sent[(sent >= first) & (sent < last)]
-    came = int(np.sum((heard[:, 1] >= first) & (heard[:, 1] < last)))
-    heard = heard[(heard[:, 0] >= first) & (heard[:, 0] < last)]
-    return Trial(cpu * 1e6 / (came or len(sent)), (heard[:, 1] - heard[:, 0]) * 1e-3, len(sent),
-                 len(sent) - len(np.unique(heard[:, 0])), came / ((last - first) * 1e-9), start)
+    return Trial(cpu, start, first, last, sent, heard).between(first, last)
 
 
 def relay(kind: str) -> list[str]:
@@ -150,7 +165,8 @@ def relay(kind: str) -> list[str]:
     return [str(CLIENTS), kind]
 
 
-def node(calibration: Path) -> list[str]:
+def node(calibration: Path, *parameters: str) -> list[str]:
     """Give the command of the node with a stored calibration."""
+    given = [part for parameter in parameters for part in ('-p', parameter)]
     return ['-m', 'accel_calib.ros.calibrator', '--ros-args', '--log-level', 'error', '-p',
-            f'calibration_file:={calibration}']
+            f'calibration_file:={calibration}', *given]

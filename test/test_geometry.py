@@ -17,11 +17,14 @@ import re
 
 from accel_calib.calibrate import fit_poses, identifiability, next_pose
 from accel_calib.calibrate.geometry import dilution, poses_needed, rows_of
+from accel_calib.calibrate.identifiability import error_left_in
 from accel_calib.calibrate.next_pose import missing_poses
 from accel_calib.calibrate.refusal import carries, refuse_if_unfit
 from accel_calib.errors import RefusedFitError
-from accel_calib.simulate import simulate_poses
+from accel_calib.model import predict
+from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.table import Poses
 from accel_calib.units import Units, units_of
 import numpy as np
 import pytest
@@ -180,9 +183,29 @@ def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, ope
     poses = simulate_poses(sensor(rng), directions, rng, context=known)
     with pytest.raises(RefusedFitError, match=f'left open: {re.escape(open_)}') as refusal:
         fit_poses(poses, G, model=model)
-    assert refusal.value.advice.endswith(
-        f'or use {offer}, which these poses carry: it leaves out cross_axis' if offer
-        else 'hold it still and go on')
+    if offer:
+        assert re.search(rf'or use {offer}, which these poses carry: it leaves out cross_axis, '
+                         r'which in a common sensor makes \|a\| wrong by 1\d mg$',
+                         refusal.value.advice)
+    else:
+        assert refusal.value.advice.endswith('hold it still and go on')
+
+
+@pytest.mark.parametrize('directions', [FACES, spread_directions(12),
+                                        cone(90.0, np.random.default_rng(10))])
+@pytest.mark.parametrize('smaller', ['4', '7'])
+def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, directions):
+    rng, errors = np.random.default_rng(11), []
+    fresh = random_directions(300, rng)
+    for _ in range(150):
+        model = model_with({'axis_gain': rng.normal(size=3) * (0.003 if smaller == '4' else 0.0),
+                            'cross_axis': rng.normal(size=3) * 0.002})
+        poses = simulate_poses(model, directions, rng, noise_g=1e-7)
+        fit = fit_poses(Poses({'reading': poses.reading}, poses.row), G, model=smaller,
+                        method='algebraic')
+        errors.append(np.linalg.norm(fit.correct(predict(model, fresh, {})), axis=1) - 1.0)
+    expected = error_left_in(smaller, '10', directions) / 10.0
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
 
 
 def test_known_faces_carry_model_12():

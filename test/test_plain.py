@@ -20,8 +20,9 @@ from accel_calib.calibrate import fit_poses
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
 from accel_calib.model import Model
-from accel_calib.plain import plain_correct, plain_spread
+from accel_calib.plain import plain_correct
 from accel_calib.plain_effects import plain_effect
+from accel_calib.plain_spread import plain_spread
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
 from accel_calib.units import units_of

@@ -17,15 +17,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from accel_calib.capture import CaptureSettings, Dwell
+from accel_calib.calibrate import level
+from accel_calib.capture import CaptureSettings, Dwell, poses_from
 from accel_calib.errors import StoredCalibrationError
 from accel_calib.files import read_calibration
-from accel_calib.ros.applied import Applied
+from accel_calib.ros.applied import Applied, rest_after
 from accel_calib.ros.fitting import asked_for, fitted
-from accel_calib.ros.pose_book import dwells_of, PoseBook
+from accel_calib.ros.pose_book import dwells_of, PoseBook, with_temperature
 from accel_calib.ros.settings import CalibratorSettings
 from accel_calib.ros.storage import load, safe_name, Store, store_of
 from accel_calib.ros.watch import Watch
@@ -218,15 +220,107 @@ def test_a_next_pose_is_asked_for_whatever_there_is(unit: Any, count: int) -> No
 def test_drift_is_that_of_the_rests_since_the_calibration(stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     applied = Applied(GRAVITY)
-    assert np.isnan(applied.drift)
+    assert applied.standing is None
     applied.adopt(calibration)
     for k, direction in enumerate(spread_directions(5)):
         reading = calibration.predict((direction * GRAVITY * 1.01)[None])[0]
         rest = dwell(10.0 * k, reading / GRAVITY)
-        applied.rested(rest)
-        applied.ended(rest)
+        applied.rested(rest, 0.001)
+        applied.ended(rest, 0.001)
     assert applied.residual == pytest.approx(0.01, abs=1e-6)
-    assert applied.drift == pytest.approx(0.01, abs=1e-6)
+    assert applied.standing.drift == pytest.approx(0.01, abs=1e-6)
     applied.adopt(calibration)
-    assert np.isnan(applied.drift)
+    assert applied.standing.count == 0
     assert applied.residual == pytest.approx(0.01, abs=1e-6)
+
+
+def test_departure_is_told_while_the_third_rest_goes_on_and_survives_a_new_level(
+        stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    applied = Applied(GRAVITY)
+    applied.adopt(calibration)
+
+    def rest(time: float, off: float) -> Dwell:
+        reading = calibration.predict(np.array([[0.0, 0.0, (1.0 + off) * GRAVITY]]))[0]
+        return dwell(time, reading / GRAVITY)
+
+    for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
+        applied.rested(rest(time, off), 0.001)
+        applied.ended(rest(time, off), 0.001)
+        assert applied.standing is not None
+        assert applied.standing.departure is None
+    applied.rested(rest(50.0, 0.005), 0.001)
+    assert applied.standing.departure is not None
+    applied.rested(rest(50.0, 0.0), 0.001)
+    assert applied.standing.departure is None
+    applied.ended(rest(50.0, 0.005), 0.001)
+    assert applied.standing.departure is not None
+    assert applied.standing.count == 6
+    flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
+    applied.adopt(level(calibration, flat, 'ros'))
+    assert applied.standing.departure is not None
+    applied.adopt(None)
+    assert applied.standing is None
+
+
+def test_rest_that_is_told_of_late_does_not_hide_the_one_that_goes_on(
+        stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    applied = Applied(GRAVITY)
+    applied.adopt(calibration)
+    early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
+    applied.rested(early, 0.001)
+    applied.rested(late, 0.001)
+    applied.ended(early, 0.001)
+    assert applied.standing is not None
+    assert applied.standing.count == 2
+    applied.ended(late, 0.001)
+    assert applied.standing.count == 2
+
+
+def test_part_of_a_rest_is_what_came_after_the_other_part() -> None:
+    rng = np.random.default_rng(1)
+    first, second = rng.normal(size=(200, 3)), rng.normal(size=(100, 3))
+    part = Dwell(0.0, 2.0, 1.0, first.mean(axis=0), np.ones(3), 100.0, 200,
+                 {'temperature': 20.0}, 1)
+    both = np.vstack([first, second])
+    whole = Dwell(0.0, 3.0, 1.5, both.mean(axis=0), 2.0 * np.ones(3), 90.0, 300,
+                  {'temperature': 22.0}, 1)
+    rest = rest_after(part, whole)
+    np.testing.assert_allclose(rest.mean, second.mean(axis=0))
+    assert (rest.start, rest.end, rest.samples) == (2.0, 3.0, 100)
+    assert rest.count == pytest.approx(50.0)
+    np.testing.assert_array_equal(rest.std, np.ones(3))
+    assert rest.time == pytest.approx(2.5)
+    assert rest.context['temperature'] == pytest.approx(26.0)
+
+
+def test_robot_that_stands_for_hours_is_watched_all_the_while(stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    applied, watch = Applied(GRAVITY), Watch(CaptureSettings(), UNITS)
+    applied.adopt(calibration)
+    rng = np.random.default_rng(1)
+    counts, left_at = [], 0.0
+    base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
+    for k in range(4 * 5000):  # at 4 Hz; the offset begins to move after 2500 s
+        time = k / 4.0
+        shift = GRAVITY * 0.000003 * max(0.0, time - 2500.0)
+        reading = base + 0.01 * rng.normal(size=3) + [0.0, 0.0, shift]
+        change = watch.push(time, tuple(reading), None, {}, False)
+        if change is not None and change.rest is not None:
+            applied.rested(change.rest, 0.001)
+        if applied.standing is not None and applied.standing.departure is not None:
+            left_at = left_at or time
+        counts.append(0 if applied.standing is None else applied.standing.count)
+    assert max(counts) > 12
+    assert 2500.0 < left_at < 4500.0
+
+
+def test_pose_from_before_the_first_temperature_takes_that_of_the_next() -> None:
+    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    book.end(dwell(0.0, [0, 0, 1]))
+    for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
+        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + time}))
+    np.testing.assert_allclose(book.poses()['temperature'], [45.0, 40.0])
+    early = replace(dwell(-500.0, [0, 1, 0]), context={})
+    assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))

@@ -35,6 +35,7 @@ LAYERS = (
     ('refine',),
     ('imu', 'plain_effects'),
     ('plain',),
+    ('plain_spread',),
     ('files',),
     ('report',),
     ('ros',),

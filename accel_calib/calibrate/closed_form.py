@@ -30,7 +30,11 @@ Poses of known orientation obey reading = X force + y, linear in X and y (ESGI'9
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefusedFitError
 from ..table import Floats
@@ -38,7 +42,53 @@ from ..table import Floats
 _FACE_COSINE = np.cos(np.radians(20.0))
 """A reading within 20° of an axis of the sensor is one of the six faces."""
 
+_RIDGE = 1e-12
+"""Keeps poses in a plane from dividing by zero: they put the centre into the plane."""
+
+_IDENTITY = np.eye(3)
 _TURN_MORE = 'take poses with each side of the sensor up and down, and some edges'
+
+
+@dataclass(frozen=True)
+class _Form:
+    """
+    The quadratic monomials r_i r_j of a quadric.
+
+    Parameters
+    ----------
+    first, second : (k,) array of int
+        i and j; those with i = j first.
+
+    """
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+
+    @cached_property
+    def twice(self) -> Floats:
+        """(k,) array, how often each stands in rᵀ A r."""
+        return np.where(self.first == self.second, 1.0, 2.0)
+
+    @cached_property
+    def linear(self) -> Floats:
+        """(3, 3 k) array, what moving the origin by c takes from each in proportion to r."""
+        taken = np.zeros((3, 3, len(self.twice)))
+        for k, (i, j) in enumerate(zip(self.first, self.second)):
+            taken[i, j, k] += self.twice[k]
+            taken[j, i, k] += self.twice[k]
+        return taken.reshape(3, -1)
+
+    @cached_property
+    def scatter(self) -> Floats:
+        """(k, 9) array, from the coefficients to the entries of A."""
+        entries = np.zeros((len(self.twice), 3, 3))
+        each = np.arange(len(self.twice))
+        entries[each, self.first, self.second] = entries[each, self.second, self.first] = 1.0
+        return entries.reshape(-1, 9)
+
+
+_DIAGONAL = _Form(np.array([0, 1, 2]), np.array([0, 1, 2]))
+_SYMMETRIC = _Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
 
 
 def fit_4(reading: Floats) -> tuple[Floats, Floats]:
@@ -47,30 +97,19 @@ def fit_4(reading: Floats) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    reading : (n, 3) array
-        Readings in any unit, n >= 4.
+    reading : (..., n, 3) array
+        Readings in any unit, n >= 4; leading axes are sensors.
 
     Returns
     -------
-    (3, 3) array, (3,) array
+    (..., 3, 3) array, (..., 3) array
         W, in the unit of the readings per g, and V.
 
-    Raises
-    ------
-    RefusedFitError
-        If the poses lie on no sphere.
-
     """
-    centre = reading.mean(axis=0)
-    scale = np.sqrt(np.mean((reading - centre) ** 2)) or 1.0
-    r = (reading - centre) / scale
-    # |r|² = 2 V·r + (W² - |V|²)
-    beta = np.linalg.lstsq(np.column_stack([2.0 * r, np.ones(len(r))]), np.sum(r ** 2, axis=1),
-                           rcond=None)[0]
-    gain_squared = beta[3] + beta[:3] @ beta[:3]
-    if not gain_squared > 0.0:
-        raise RefusedFitError('the poses lie on no sphere', _TURN_MORE)
-    return np.sqrt(gain_squared) * scale * np.eye(3), centre + beta[:3] * scale
+    mean, r = _centred(reading)
+    third = (r @ np.sum(r * r, axis=-2)[..., np.newaxis])[..., 0]
+    centre, radius = _sphere(r @ np.swapaxes(r, -1, -2), third, r.shape[-1])
+    return radius[..., np.newaxis, np.newaxis] * _IDENTITY, mean + centre
 
 
 def fit_7(reading: Floats) -> tuple[Floats, Floats]:
@@ -79,21 +118,22 @@ def fit_7(reading: Floats) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    reading : (n, 3) array
-        Readings in any unit, n >= 6.
+    reading : (..., n, 3) array
+        Readings in any unit, n >= 6; leading axes are sensors.
 
     Returns
     -------
-    (3, 3) array, (3,) array
-        W, diagonal, in the unit of the readings per g, and V.
+    (..., 3, 3) array, (..., 3) array
+        W, diagonal, in the unit of the readings per g, and V; NaN for a sensor, among several,
+        whose poses lie on no ellipsoid.
 
     Raises
     ------
     RefusedFitError
-        If the poses lie on no ellipsoid.
+        If the poses of the only sensor lie on no ellipsoid.
 
     """
-    return _fit_quadric(reading, [(0, 0), (1, 1), (2, 2)])
+    return _checked(*_quadric(reading, _DIAGONAL))
 
 
 def fit_10(reading: Floats) -> tuple[Floats, Floats]:
@@ -102,44 +142,97 @@ def fit_10(reading: Floats) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    reading : (n, 3) array
-        Readings in any unit, n >= 9.
+    reading : (..., n, 3) array
+        Readings in any unit, n >= 9; leading axes are sensors.
 
     Returns
     -------
-    (3, 3) array, (3,) array
-        W, symmetric, in the unit of the readings per g, and V.
+    (..., 3, 3) array, (..., 3) array
+        W, symmetric, in the unit of the readings per g, and V; NaN as `fit_7`.
 
     Raises
     ------
     RefusedFitError
-        If the poses lie on no ellipsoid.
+        If the poses of the only sensor lie on no ellipsoid.
 
     """
-    return _fit_quadric(reading, [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
+    return _checked(*_quadric(reading, _SYMMETRIC))
 
 
-def _fit_quadric(reading: Floats, terms: list[tuple[int, int]]) -> tuple[Floats, Floats]:
-    """Fit the quadric whose matrix A has these entries; others are zero."""
-    mat_scale, centre = fit_4(reading)
-    r = (reading - centre) / mat_scale[0, 0]
-    monomials = [r[:, i] * r[:, j] * (1.0 if i == j else 2.0) for i, j in terms]
-    mat_x = np.column_stack([*monomials, r, np.ones(len(r))])
-    beta = np.linalg.eigh(mat_x.T @ mat_x)[1][:, 0]
-    mat_a = np.zeros((3, 3))
-    for value, (i, j) in zip(beta, terms, strict=False):
-        mat_a[i, j] = mat_a[j, i] = value
-    if np.linalg.det(mat_a) < 0.0:  # AN5286: negate the whole vector
-        beta, mat_a = -beta, -mat_a
-    if np.min(np.linalg.eigvalsh(mat_a)) <= 0.0:
+def _checked(mat_w: Floats, vec_v: Floats) -> tuple[Floats, Floats]:
+    """Give the result as it is, but for an only sensor make sure that there is one."""
+    if mat_w.ndim == 2 and not np.isfinite(mat_w[0, 0]):
         raise RefusedFitError('the poses lie on no ellipsoid', _TURN_MORE)
-    offset = -np.linalg.solve(mat_a, beta[len(terms):-1]) / 2.0
-    field_squared = offset @ mat_a @ offset - beta[-1]  # B²
-    if not field_squared > 0.0:
-        raise RefusedFitError('the poses lie on no ellipsoid', _TURN_MORE)
-    values, vectors = np.linalg.eigh(mat_a / field_squared)
-    mat_w = (vectors / np.sqrt(values)) @ vectors.T
-    return mat_w * mat_scale[0, 0], centre + offset * mat_scale[0, 0]
+    return mat_w, vec_v
+
+
+def _centred(reading: Floats) -> tuple[Floats, Floats]:
+    """Give the mean (..., 3), and the readings from there on, (..., 3, n)."""
+    transposed = np.swapaxes(reading, -1, -2)
+    mean = transposed.sum(axis=-1) / reading.shape[-2]
+    return mean, transposed - mean[..., np.newaxis]
+
+
+def _sphere(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
+    """
+    Give centre (..., 3) and radius (...) of the sphere from moments about the mean.
+
+    |r|² = 2 V·r + (W² - |V|²), summed over the poses times r, and alone; their r sum up to zero.
+
+    """
+    trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
+    kept_apart = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
+    centre = np.linalg.solve(second + kept_apart, third[..., np.newaxis])[..., 0] / 2.0
+    squared = trace / count + (centre * centre).sum(axis=-1)
+    return centre, np.sqrt(squared + (squared == 0.0))
+
+
+def _quadric(reading: Floats, form: _Form) -> tuple[Floats, Floats]:
+    """Fit the quadric whose matrix A has the entries of this form; others are zero."""
+    mean, r = _centred(reading)
+    size = len(form.twice)
+    monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
+    monomials[..., size:-1, :] = r
+    np.multiply(r[..., form.first, :], r[..., form.second, :], out=monomials[..., :size, :])
+    moments = monomials @ np.swapaxes(monomials, -1, -2)
+    centre, radius = _sphere(moments[..., size:-1, size:-1],
+                             moments[..., :3, size:-1].sum(axis=-2), r.shape[-1])
+    change = _to_sphere(form, centre, radius[..., np.newaxis])
+    beta = np.linalg.eigh(np.swapaxes(change, -1, -2) @ moments @ change)[1][..., 0]
+    mat_w, offset = _ellipsoid(form, beta)
+    radius = radius[..., np.newaxis]
+    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
+
+
+def _to_sphere(form: _Form, centre: Floats, radius: Floats) -> Floats:
+    """Give the matrix from monomials of r to those of (r - centre) / radius, each `twice`."""
+    size, lead = len(form.twice), centre.shape[:-1]
+    change = np.zeros((*lead, size + 4, size + 4))
+    diagonal = change.reshape(*lead, -1)[..., ::size + 5]
+    moved, twice = centre / -radius, form.twice / (radius * radius)
+    diagonal[..., :size] = twice
+    diagonal[..., size:] = 1.0 / radius
+    change[..., size:-1, :size] = ((moved / radius) @ form.linear).reshape(*lead, 3, size)
+    change[..., -1, :size] = form.twice * moved[..., form.first] * moved[..., form.second]
+    change[..., -1, size:-1] = moved
+    change[..., -1, -1] = 1.0
+    return change
+
+
+def _ellipsoid(form: _Form, beta: Floats) -> tuple[Floats, Floats]:
+    """Give W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
+    size = len(form.twice)
+    mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
+    values, vectors = np.linalg.eigh(mat_a)
+    sign = np.copysign(1.0, values[..., 1:2])  # AN5286: negate the whole vector
+    values = values * sign
+    with np.errstate(invalid='ignore', divide='ignore'):
+        along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] * sign / values
+        field_squared = ((along * along * values).sum(axis=-1, keepdims=True) / 4.0
+                         - beta[..., -1:] * sign)  # B²
+        gain = np.sqrt(field_squared) / np.sqrt(values)
+        mat_w = (vectors * gain[..., np.newaxis, :]) @ np.swapaxes(vectors, -1, -2)
+        return mat_w, (vectors @ along[..., np.newaxis])[..., 0] / -2.0
 
 
 def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:

@@ -38,6 +38,7 @@ from functools import lru_cache
 import numpy as np
 
 from .likelihood import believable
+from .norm_fit import form_of
 from ..effects import EFFECTS
 from ..model import MODELS, parameter_names
 from ..sphere import spread_directions
@@ -60,17 +61,24 @@ _SAME = np.cos(np.radians(5.0))
 _SINGULAR, _NOTHING = 1e-7, 1e-14
 
 
+def effects_of(name: str) -> tuple[str, ...]:
+    """Name the effects of a model; 9 is 10 in other axes."""
+    return MODELS['10' if name == '9' else name]
+
+
 def parameters_of(name: str) -> tuple[str, ...]:
-    """Name the parameters of a model; 9 is 10 in other axes."""
-    return parameter_names(MODELS['10' if name == '9' else name])
+    """Name the parameters of a model."""
+    return parameter_names(effects_of(name))
 
 
 def rows_of(name: str, directions: Floats) -> Floats:
     """Give Φ for each of these (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0))
-             for effect in MODELS['10' if name == '9' else name]]
-    basis = np.concatenate(parts, axis=2)
-    return basis if name == '12' else np.einsum('ni,nip->np', directions, basis)[:, np.newaxis]
+    if name == '12':
+        parts = [EFFECTS[effect].basis(directions, {}, np.zeros(0)) for effect in effects_of(name)]
+        return np.concatenate(parts, axis=2)
+    products = (directions[:, :, np.newaxis] * directions[:, np.newaxis]).reshape(-1, 9)
+    by_entry = np.concatenate([directions, products], axis=1)
+    return (by_entry @ form_of('10' if name == '9' else name).linear)[:, np.newaxis]
 
 
 def pose_noise(noise: Floats | None, directions: Floats) -> Floats:
@@ -168,7 +176,15 @@ def dilution(name: str, directions: Floats, noise: Floats | None = None) -> floa
         leave a parameter open.
 
     """
-    return float(np.sqrt(np.max(spectrum(name, directions, noise)[2][-1])))
+    rows = rows_of(name, directions) * np.sqrt(relative_weights(noise, len(directions))
+                                               )[:, np.newaxis, np.newaxis]
+    rows = rows.reshape(-1, rows.shape[2])
+    information = rows.T @ rows
+    told = np.linalg.eigvalsh(information)
+    if not told[0] > _NOTHING * max(told[-1], 1.0):
+        return np.inf
+    sphere = over_the_sphere(name)
+    return float(np.sqrt(np.max(np.sum((sphere @ np.linalg.inv(information)) * sphere, axis=2))))
 
 
 def coverage(directions: Floats) -> float:

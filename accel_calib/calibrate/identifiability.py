@@ -27,7 +27,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .geometry import LARGEST_DILUTION, parameters_of, spectrum, times
+from .geometry import (
+    effects_of,
+    LARGEST_DILUTION,
+    over_the_sphere,
+    parameters_of,
+    relative_weights,
+    rows_of,
+    spectrum,
+    times,
+)
+from ..effects import EFFECTS
 from ..table import Floats
 
 _OPEN_PART = 0.1
@@ -140,3 +150,42 @@ def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
         found.append(Combination({names[k]: float(sign * row[k]) for k in order},
                                  float(deviation)))
     return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
+
+
+def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats | None = None
+                  ) -> float:
+    """
+    Say how wrong |force| commonly is when a model leaves out what a larger one has.
+
+    What is left out, of the size that is common (`accel_calib.effects`), goes into the parameters
+    that are fitted as these poses let it, and from there to the whole sphere.
+
+    Parameters
+    ----------
+    smaller, larger : {'4', '7', '9', '10'}
+        The models.
+    directions : (n, 3) array
+        Unit vectors of force in the axes of the sensor.
+    noise : (n,) array, optional
+        Noise of each pose, in any unit; equal where it is not given.
+
+    Returns
+    -------
+    float
+        RMS over the sphere [g].
+
+    """
+    effects = [effect for effect in left_out(smaller, larger) for _ in EFFECTS[effect].values]
+    more = [effect in effects for effect, _, _ in (
+        name.partition('.') for name in parameters_of(larger))]
+    root = np.sqrt(relative_weights(noise, len(directions)))[:, np.newaxis]
+    added = np.linalg.lstsq(root * rows_of(smaller, directions)[:, 0],
+                            root * rows_of(larger, directions)[:, 0, more], rcond=None)[0]
+    wrong = over_the_sphere(larger)[:, 0, more] - over_the_sphere(smaller)[:, 0] @ added
+    sizes = np.array([EFFECTS[effect].typical for effect in effects])
+    return float(np.sqrt(np.sum(np.mean(wrong ** 2, axis=0) * sizes ** 2)))
+
+
+def left_out(smaller: str, larger: str) -> list[str]:
+    """Name the effects that a smaller model leaves out."""
+    return [effect for effect in effects_of(larger) if effect not in effects_of(smaller)]

@@ -33,6 +33,7 @@ samples say.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -115,11 +116,15 @@ class Fit:
         """Degrees of freedom of `variance`."""
         return belief_in(self.noise_known) + self.dof
 
-    @property
+    @cached_property
+    def orthonormal(self) -> Floats:
+        """(m, q) array, columns that span the Jacobian."""
+        return np.linalg.qr(self.jacobian)[0]
+
+    @cached_property
     def leverage(self) -> Floats:
         """(m,) array, the share in which each residual shapes its own prediction."""
-        orthonormal = np.linalg.qr(self.jacobian)[0]
-        return np.minimum(np.sum(orthonormal ** 2, axis=1), 1.0)
+        return np.minimum(np.sum(self.orthonormal ** 2, axis=1), 1.0)
 
 
 def norm_rows(model: Model, u: Floats, context: Context) -> Floats:
@@ -192,7 +197,9 @@ def norm_fit_at(name: str, free: Floats, reading: Floats, noise: Floats | None) 
     if believed is not None:
         sigma = noise_along(form, free, reading, believed)
     end = solution_at(form, free, reading, sigma)
-    spread = covariance_of(end.jacobian, end.weighted, believed is not None)
+    dof = len(reading) - end.jacobian.shape[1]
+    spread = np.linalg.inv(end.jacobian.T @ end.jacobian) * variance_factor(
+        float(end.weighted @ end.weighted), dof, believed is not None)
     return Fit(form.model(free), form.ties @ spread @ form.ties.T, end.residual, sigma,
                end.jacobian, believed is not None)
 

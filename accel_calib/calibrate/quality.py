@@ -34,6 +34,9 @@ from ..model import correct, sensor_force
 from ..table import Floats, Poses
 from ..units import MG, Units
 
+_ALONE = 1e-9
+"""Of a residual less than this is left: its pose alone determines a parameter."""
+
 
 @dataclass(frozen=True)
 class Verification:
@@ -173,12 +176,17 @@ def _held_out(fit: Fit, count: int) -> Floats:
 
     """
     each = len(fit.residual) // count
-    orthonormal = np.linalg.qr(fit.jacobian)[0].reshape(count, each, fit.jacobian.shape[1])
-    own = np.eye(orthonormal.shape[1]) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
-    if np.any(np.linalg.svd(own, compute_uv=False) < 1e-9):
-        return np.full((count, own.shape[1]), np.nan)
-    weighted = fit.weighted.reshape(count, -1, 1)
-    left_out: Floats = np.linalg.solve(own, weighted)[:, :, 0] * fit.sigma.reshape(count, -1)
+    if each == 1:
+        own = 1.0 - fit.leverage
+        if np.any(own < _ALONE):
+            return np.full((count, 1), np.nan)
+        return (fit.residual / own)[:, np.newaxis]
+    orthonormal = fit.orthonormal.reshape(count, each, -1)
+    blocks = np.eye(each) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
+    if np.any(np.linalg.svd(blocks, compute_uv=False) < _ALONE):
+        return np.full((count, each), np.nan)
+    weighted = fit.weighted.reshape(count, each, 1)
+    left_out: Floats = np.linalg.solve(blocks, weighted)[:, :, 0] * fit.sigma.reshape(count, each)
     return left_out
 
 

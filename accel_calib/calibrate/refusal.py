@@ -32,11 +32,11 @@ from .geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
-from .identifiability import Combination, identifiability
+from .identifiability import Combination, error_left_in, identifiability, left_out
 from .next_pose import missing_poses
 from ..errors import RefusedFitError
-from ..model import MODELS
 from ..table import Floats
+from ..units import MG
 
 _SAID = 3
 """Combinations left open that are told one by one."""
@@ -73,7 +73,7 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     smaller = [other for other in NORM_MODELS if poses_needed(other) < poses_needed(name)
                and len(directions) >= poses_needed(other)
                and dilution(other, directions, noise) <= WEAK_DILUTION]
-    offer = _offer(name, smaller[-1]) if smaller else ''
+    offer = _offer(name, smaller[-1], directions, noise) if smaller else ''
     few = len(directions) < poses_needed(NORM_MODELS[0])
     open_ = () if few else identifiability(name, directions, noise).undetermined
     raise RefusedFitError(
@@ -104,16 +104,24 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
         return ()
     open_ = identifiability(largest, directions, noise).undetermined
     return (f'the poses do not determine {words_of(open_)}, so that model {chosen} was the '
-            f'largest to choose; to see them, '
+            f'largest to choose: it leaves out {_and(left_out(chosen, largest))}, '
+            f'{_commonly(chosen, largest, directions, noise)}; to see them, '
             f'{_add(missing_poses(largest, directions, noise))}',)
 
 
-def _offer(name: str, smaller: str) -> str:
+def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:
     """Offer a smaller model, with what it leaves out."""
-    without = [effect for effect in MODELS['10' if name == '9' else name]
-               if effect not in MODELS[smaller]]
-    return (f', or use model {smaller}, which these poses carry: it leaves out '
-            f'{_and(without)}')
+    offer = (f', or use model {smaller}, which these poses carry: it leaves out '
+             f'{_and(left_out(smaller, name))}')
+    if name == '12':
+        return offer
+    return f'{offer}, {_commonly(smaller, name, directions, noise)}'
+
+
+def _commonly(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
+    """Say what leaving out comes to."""
+    error = error_left_in(smaller, larger, directions, noise) * MG
+    return f'which in a common sensor makes |a| wrong by {error:.0f} mg'
 
 
 def words_of(open_: Sequence[Combination]) -> str:

@@ -151,48 +151,48 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
         If the poses cannot carry the model.
 
     """
-    noise, least = pose_noise(poses_g.noise, directions), model
-    kept, reason = np.arange(len(poses_g)), f'model {model} was asked for'
-    warnings: tuple[str, ...] = ()
-    if model == 'auto':
-        least = NORM_MODELS[0]
-    refuse_if_unfit(least, directions, noise)
+    noise = pose_noise(poses_g.noise, directions)
+    carried = _carried(model, directions, noise)
+    fits: dict[str, Fit] = {}
+    kept = np.arange(len(poses_g))
     if method == 'ml':
-        largest = _carried(directions, noise)[-1] if model == 'auto' else model
-        kept = _undisturbed(poses_g, largest)
+        kept, fit = _undisturbed(poses_g, list(carried)[-1])
+        fits[list(carried)[-1]] = fit
     left, directions, noise = poses_g.take(kept), directions[kept], noise[kept]
     if len(kept) < len(poses_g):
-        refuse_if_unfit(least, directions, noise)
-    if model == 'auto':
-        carried = _carried(directions, noise)
-        fits = {name: _fit_rows(left, name, method) for name in carried}
-        choice = choose(fits)
-        model, reason = choice.name, choice.reason
-        warnings = unseen(carried[-1], directions, noise)
-        fit = fits[model]
-    else:
-        fit = _fit_rows(left, model, method)
-    return NormFit(model, reason, fit, kept,
-                   warnings_of(fit, dilution(model, directions, noise)) + warnings)
+        carried = _carried(model, directions, noise)
+    fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in carried}
+    if model != 'auto':
+        warnings = warnings_of(fits[model], carried[model])
+        return NormFit(model, f'model {model} was asked for', fits[model], kept, warnings)
+    choice = choose(fits)
+    warnings = (*warnings_of(fits[choice.name], carried[choice.name]),
+                *unseen(list(carried)[-1], directions, noise))
+    return NormFit(choice.name, choice.reason, fits[choice.name], kept, warnings)
 
 
-def _carried(directions: Floats, noise: Floats) -> list[str]:
-    """Name the models that the poses carry, the smallest always."""
-    return [NORM_MODELS[0], *(name for name in NORM_MODELS[1:]
-                              if carries(name, directions, noise))]
+def _carried(model: str, directions: Floats, noise: Floats) -> dict[str, float]:
+    """Give the dilution of each model to look at that the poses carry, the smallest first."""
+    first, *others = NORM_MODELS if model == 'auto' else (model,)
+    found = {first: dilution(first, directions, noise)}
+    refuse_if_unfit(first, directions, noise)
+    for name in others:
+        if carries(name, directions, noise):
+            found[name] = dilution(name, directions, noise)
+    return found
 
 
-def _undisturbed(poses_g: Poses, name: str) -> NDArray[np.intp]:
-    """Give the indices of the poses that are not disturbed, as this model sees them."""
+def _undisturbed(poses_g: Poses, name: str) -> tuple[NDArray[np.intp], Fit]:
+    """Give the indices of the poses that are not disturbed, and the fit to them."""
     kept = np.arange(len(poses_g))
     for _ in range(ROUNDS):
         fit = _fit_rows(poses_g.take(kept), name, 'ml')
         out = extreme(fit.weighted[np.newaxis], fit.jacobian[np.newaxis],
                       np.ones((1, len(kept)), bool), fit.noise_known, len(poses_g))[0]
         if not np.any(out):
-            break
+            return kept, fit
         kept = kept[~out]
-    return kept
+    return kept, _fit_rows(poses_g.take(kept), name, 'ml')
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:

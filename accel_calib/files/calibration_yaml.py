@@ -39,6 +39,12 @@ from ..model import Model
 from ..table import COLUMNS, Floats, Poses
 from ..units import UnitName, Units
 
+try:  # eight times as fast, where PyYAML was built with it
+    from yaml import CSafeDumper as SafeDumper
+    from yaml import CSafeLoader as SafeLoader
+except ImportError:
+    from yaml import SafeDumper, SafeLoader  # type: ignore[assignment]
+
 FORMAT = 'accel_calib calibration'
 VERSION = 1
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
@@ -68,7 +74,7 @@ def format_calibration(calibration: Calibration) -> str:
                      default_flow_style=None)
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(SafeDumper):
     """The safe dumper without anchors: two equal lists are written out twice."""
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -93,7 +99,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
     """
     try:
-        content = yaml.safe_load(text)
+        content = yaml.load(text, Loader=SafeLoader)
     except yaml.YAMLError as err:
         raise _damaged(name, 'it is not YAML') from err
     _check_version(content, name)

@@ -47,6 +47,7 @@ from .stream import Stream
 from .vitals import Vitals
 from .watch import Change, Watch
 from .worker import Worker
+from ..calibrate.watching import told
 from ..units import units_of
 
 if TYPE_CHECKING:
@@ -124,10 +125,13 @@ class CalibratorNode(Node):
 
     def note(self, change: Change) -> None:
         """Act on a rest and on poses."""
+        least, before = self.settings.drift_warn / self.settings.gravity, self.applied.departed
         if change.rest is not None:
-            self.applied.rested(change.rest)
+            self.applied.rested(change.rest, least)
         for dwell in change.ended:
-            self.applied.ended(dwell)
+            self.applied.ended(dwell, least)
+        if self.applied.standing is not None and self.applied.departed is not before:
+            self.get_logger().warning(told(self.applied.standing))
         if change.taken_back:
             self.get_logger().info(f'taken back {change.taken_back} of the poses: the sensor was '
                                    'not still, as is known now')

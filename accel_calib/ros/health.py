@@ -15,8 +15,8 @@
 """
 What the calibrator says of itself: one record, judged in one place.
 
-`Health` is shown on ``/diagnostics`` and answers ``~/self_test``. Drift is the RMS of
-|a| - 1 g over the rests since the calibration was made or loaded, which took no part in the fit.
+`Health` is shown on ``/diagnostics`` and answers ``~/self_test``. Drift is what the rests since
+the calibration was made or loaded say of it, see `accel_calib.calibrate.watching`.
 
 """
 
@@ -28,10 +28,13 @@ from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from ..calibrate.watching import told
 from ..units import MG
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from ..calibrate.watching import Watching
 
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -69,8 +72,10 @@ class Health:
         Last one [°C]; NaN: none.
     rest_ago : float
         Since the last rest, by the header stamps [s]; NaN: there was none.
-    residual, drift, drift_warn : float
-        |a| - 1 g at the last rest; see the module; its limit [g]; NaN: not known.
+    residual : float
+        |a| - 1 g at the last rest [g]; NaN: not known.
+    standing : Watching or None
+        What the rests say of the calibration; None where there is none.
     poses : int
         Poses captured.
     interruptions : int
@@ -98,8 +103,7 @@ class Health:
     temperature: float
     rest_ago: float
     residual: float
-    drift: float
-    drift_warn: float
+    standing: Watching | None
     poses: int
     interruptions: int
     last_interruption: str
@@ -149,12 +153,10 @@ def _calibration(health: Health) -> Finding:
 
 
 def _drift(health: Health) -> Finding:
-    if math.isnan(health.drift):
-        return Finding('drift', _OK, 'no rest since the calibration yet')
-    words = f'{health.drift * MG:.2f} mg off 1 g at rest since the calibration'
-    if health.drift > health.drift_warn:
-        return Finding('drift', _WARN, words + ': calibrate again')
-    return Finding('drift', _OK, words)
+    standing = health.standing
+    if standing is None:
+        return Finding('drift', _OK, 'no calibration yet')
+    return Finding('drift', _WARN if standing.departure is not None else _OK, told(standing))
 
 
 def _storage(health: Health) -> Finding:
@@ -182,7 +184,7 @@ def _figures(health: Health) -> Iterable[tuple[str, str]]:
     yield 'messages', str(health.messages)
     yield 'readings not finite', str(health.bad)
     yield 'residual |a| - 1 g at last rest [mg]', _number(health.residual * MG)
-    yield 'drift since calibration [mg]', _number(health.drift * MG)
+    yield from _drift_figures(health.standing)
     yield 'since last rest [s]', _number(health.rest_ago)
     yield 'poses captured', str(health.poses)
     yield 'next pose', health.next_pose
@@ -190,6 +192,21 @@ def _figures(health: Health) -> Iterable[tuple[str, str]]:
     yield 'last interruption', health.last_interruption or 'none'
     yield 'temperature [°C]', _number(health.temperature)
     yield 'still below [m/s² or native]', f'{health.threshold:.4g}'
+
+
+def _drift_figures(standing: Watching | None) -> Iterable[tuple[str, str]]:
+    """Give what the rests since the calibration say of it."""
+    if standing is None:
+        return
+    departure, temperatures = standing.departure, standing.temperatures
+    yield 'drift since calibration [mg]', _number(standing.drift * MG)
+    yield 'stated uncertainty at last rest [mg]', _number(standing.stated * MG)
+    yield 'rests since calibration', str(standing.count)
+    yield 'rests since it left 1 g', str(standing.lasted)
+    if departure is not None:
+        yield 'left 1 g by [mg]', _number(departure.error * MG)
+    if temperatures:
+        yield 'temperature when calibrated [°C]', f'{temperatures[0]:.1f} to {temperatures[1]:.1f}'
 
 
 def _number(value: float) -> str:

@@ -23,6 +23,7 @@ are taken up as dwells of their own.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..capture import Dwell, poses_from, select
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 _SEPARATE = 64
 """Dwells of this run that can be taken back one by one; older ones are merged for good."""
+
+_SAME_TEMPERATURE = 120.0
+"""Rests this near in time have the same temperature [s]."""
 
 _CONTEXT = ('temperature', 'supply_voltage', 'rate')
 
@@ -63,7 +67,10 @@ class PoseBook:
     def poses(self) -> Poses:
         """Give the pose table, repeated poses merged or left out."""
         dwells = [*self._earlier, *self._dwells, *self._held]
-        return poses_from(select(dwells, self._settings, self._units), self._settings)
+        return poses_from(self._selected(dwells), self._settings)
+
+    def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
+        return select(with_temperature(dwells), self._settings, self._units)
 
     def take_up(self, poses: Poses) -> None:
         """Put poses that were stored before in front."""
@@ -83,7 +90,7 @@ class PoseBook:
         self._dwells.append(dwell)
         if len(self._dwells) > _SEPARATE:
             old = [*self._earlier, self._dwells.pop(0)]
-            self._earlier = select(old, self._settings, self._units)
+            self._earlier = self._selected(old)
 
     def give_up(self, is_over: Callable[[Dwell], bool]) -> int:
         """Take back held rests that are over and came to nothing; give how many they were."""
@@ -107,6 +114,29 @@ class PoseBook:
     def clear(self) -> None:
         """Forget all."""
         self._earlier, self._dwells, self._held = [], [], []
+
+
+def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
+    """
+    Give rests from before the first temperature message the temperature of the nearest rest.
+
+    One pose without it would leave the whole table without it.
+
+    """
+    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
+    if not known:
+        return dwells
+
+    def completed(dwell: Dwell) -> Dwell:
+        if 'temperature' in dwell.context:
+            return dwell
+        near = min(known, key=lambda other: abs(other.time - dwell.time))
+        if abs(near.time - dwell.time) > _SAME_TEMPERATURE:
+            return dwell
+        return replace(dwell, context={**dwell.context,
+                                       'temperature': near.context['temperature']})
+
+    return [completed(dwell) for dwell in dwells]
 
 
 def overlap(one: Dwell, other: Dwell) -> bool:

@@ -33,7 +33,8 @@ import numpy as np
 from .serialized import layout_with, LITTLE_ENDIAN, NAME_AT, NINE, STAMP, THREE
 from .. import imu
 from ..model import check_context
-from ..plain import linear, plain_correct, plain_spread
+from ..plain import linear, plain_correct
+from ..plain_spread import plain_spread
 
 if TYPE_CHECKING:
     from .serialized import Layout

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import gc
 from importlib import import_module
 import signal
 import sys
@@ -32,6 +33,9 @@ _OK, _BAD_INPUT = 0, 2
 
 _LOOK_EVERY = 0.25
 """How often it is looked whether ROS was shut down [s]."""
+
+_SWITCH = 1e-4
+"""After this a message has the interpreter, when another thread is at work [s]."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
@@ -91,6 +95,8 @@ def _spin(node: str) -> None:
     instance = getattr(import_module(module, __package__), name)()
     executor = _executor()
     executor.add_node(instance)
+    sys.setswitchinterval(_SWITCH)
+    gc.freeze()  # what is there stays: to look through it again would take tens of ms
     try:
         instance.start()
         while instance.context.ok():

@@ -102,7 +102,8 @@ class CalibratorSettings:
         'merge', 'What becomes of a repeated pose: a robot that parks repeats itself',
         choices=REPEATED)
     drift_warn: float = _parameter(
-        0.1, 'Warn when |a| at rest has drifted this far from 1 g since the calibration [m/s²]',
+        0.01, 'Smallest lasting departure of |a| at rest from 1 g that is warned of, where it is '
+        'beyond the uncertainty that the calibration states [m/s²]',
         limits=(0.0, 100.0), live=True)
 
 

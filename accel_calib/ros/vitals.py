@@ -85,8 +85,7 @@ class Vitals:
             writable=store is None or store.is_writable(),
             messages=self.messages, bad=self._bad, bad_ago=time.monotonic() - self._bad_at,
             rate=self._rate, length=self.length_g, temperature=self.temperature,
-            rest_ago=rest_ago, residual=applied.residual, drift=applied.drift,
-            drift_warn=node.settings.drift_warn / node.settings.gravity,
+            rest_ago=rest_ago, residual=applied.residual, standing=applied.standing,
             poses=len(node.watch.book.poses()), interruptions=len(breaks),
             last_interruption=f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else '',
             threshold=detector.threshold, next_pose=node.commands.view.next)

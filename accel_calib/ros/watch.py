@@ -16,9 +16,9 @@
 Watch a sensor: samples in, what changed out.
 
 For the sake of the person who turns the sensor a rest counts as soon as it is `min_dwell` long;
-what it comes to is looked at again each time its length has doubled, and when it ends. The
-detector tells of an end only when it is sure that the rest does not go on after a knock; the next
-rest may have begun by then.
+what it comes to is looked at again each time its length has doubled, each `LONG_REST` of a long
+one, and when it ends. The detector tells of an end only when it is sure that the rest does not go
+on after a knock; the next rest may have begun by then.
 
 """
 
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from ..capture import CaptureSettings, Dwell
     from ..table import Floats
     from ..units import Units
+
+LONG_REST = 300.0
+"""A rest is looked at this often at least [s], however long it is."""
 
 _LOOK_EVERY = 0.1
 """Between looks at a rest that is going on [s]."""
@@ -186,10 +189,10 @@ class Watch:
     def _look(self, capture: bool) -> Change | None:
         """See what the rest that is going on comes to."""
         dwell = self.detector.current()
-        if dwell is None or _length(dwell) < 2.0 * _length(self._rest, dwell):
+        if dwell is None or _length(dwell) < _due(_length(self._rest, dwell)):
             return None
         self._rest = dwell
-        self._known_until = dwell.start + 2.0 * _length(dwell)
+        self._known_until = dwell.start + _due(_length(dwell))
         held = self._is_captured(dwell, capture)
         if held:
             self.book.hold(dwell)
@@ -241,6 +244,11 @@ def _pieces(samples: Floats) -> list[Floats]:
     if 0.0 <= times[-1] - times[0] < _PIECE:
         return [samples]
     return np.split(samples, np.flatnonzero(np.diff(np.floor(times / _PIECE))) + 1)
+
+
+def _due(length: float) -> float:
+    """Say how long a rest is when it is looked at next [s]."""
+    return min(2.0 * length, length + LONG_REST)
 
 
 def _length(dwell: Dwell | None, same_as: Dwell | None = None) -> float:

@@ -1,0 +1,176 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Whether a sensor has left its calibration for good: a ratio of two likelihoods.
+
+The errors e = |force| - 1 of the last n rests are jointly normal with covariance S: the noise of
+each rest, and the calibration's own uncertainty, which rests in like attitudes have in common. A
+rest may be knocked, each with probability `_KNOCKED` and for itself, by some `_KNOCK` [g]: the
+likelihood is the sum over all 2ⁿ ways to have been knocked. Against this stands a lasting change,
+since the third last rest or one before it, of which it is open which way it goes:
+
+    offset   e moves by up · b      b normal, of each size of `_SIZES`, in three directions
+    gain     e moves by b           the same in every attitude
+
+averaged over the instants, the ways and the sizes; it may go on to move by `_WANDER` of its size,
+as with temperature. By Markov's inequality such a ratio exceeds `SURE` by chance in at most one of
+that many rests. One knock is no lasting change, nor are two; three rests that agree are.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from ..table import Floats
+
+MEMORY = 6
+"""Rests that are looked at."""
+
+_FEWEST = 3
+"""Rests that a change must have lasted."""
+
+SURE = float(np.exp(14.0))
+"""Ratio of the likelihoods from which a change is believed: one in 1.2 million."""
+
+_KNOCKED, _KNOCK = 0.01, 0.05
+_SIZES = (0.005, 0.05)   # [g]
+_WANDER = 0.1            # part of a change by which it goes on to move from rest to rest
+_CLEAR = 20.0              # ratio from which one way is told from the other
+
+WAYS: dict[str, Callable[[Floats], Floats]] = {
+    'offset': lambda up: up, 'gain': lambda up: np.ones((len(up), 1))}
+"""For each way the (n, q) array by which the rests show the change."""
+
+
+@dataclass(frozen=True)
+class Departure:
+    """
+    A lasting change.
+
+    Parameters
+    ----------
+    rests : int
+        Rests that show it, the last ones.
+    way : str
+        Of `WAYS`, the likelier one.
+    clear : bool
+        Whether the attitudes tell this way from the other.
+    shift : (q,) array
+        The change [g].
+    covariance : (q, q) array
+        Of the shift [g²].
+    error : float
+        What it makes of |a| at these rests, RMS, with its sign where they have the same [g].
+
+    """
+
+    rests: int
+    way: str
+    clear: bool
+    shift: Floats
+    covariance: Floats
+    error: float
+
+
+def departure(error: Floats, covariance: Floats, up: Floats) -> Departure | None:
+    """
+    Find a lasting change.
+
+    Parameters
+    ----------
+    error : (n,) array
+        |force| - 1 of the last rests, the latest last [g].
+    covariance : (n, n) array
+        Of these errors, were nothing changed [g²].
+    up : (n, 3) array
+        Where up is in each rest, unit vectors in the axes of the sensor.
+
+    Returns
+    -------
+    Departure or None
+        None: what is stated explains the errors, or knocks do.
+
+    """
+    most = 0.5 * float(error @ np.linalg.solve(covariance, error))
+    if len(error) < _FEWEST or most - len(error) * np.log1p(-_KNOCKED) < np.log(SURE):
+        return None   # the ratio cannot be larger
+    found = {(way, rests): np.logaddexp.reduce([
+        _likelihood(error, covariance + _moved(_shown(way, rests, up), size)) for size in _SIZES])
+        for way in WAYS for rests in range(_FEWEST, len(error) + 1)}
+    same = _likelihood(error, covariance) + np.log(len(found) * len(_SIZES))
+    if np.logaddexp.reduce(list(found.values())) - same < np.log(SURE):
+        return None
+    way, rests = max(found, key=lambda key: found[key])
+    each = [np.logaddexp.reduce([found[key] for key in found if key[0] == other])
+            for other in WAYS]
+    return _described(way, rests, bool(np.ptp(each) > np.log(_CLEAR)), error, covariance, up)
+
+
+def is_over(known: Departure, error: Floats, covariance: Floats, up: Floats) -> bool:
+    """Tell whether the last rests are clearly without this change; arguments as `departure`."""
+    shown = WAYS[known.way](up)
+    stays = _likelihood(error - shown @ known.shift,
+                        covariance + shown @ known.covariance @ shown.T)
+    return bool(_likelihood(error, covariance) - stays > np.log(SURE))
+
+
+def _shown(way: str, rests: int, up: Floats) -> Floats:
+    """Give how the rests show a change that came before the last `rests` of them."""
+    shown = WAYS[way](up).copy()
+    shown[:len(up) - rests] = 0.0
+    return shown
+
+
+def _moved(shown: Floats, size: float) -> Floats:
+    """Give the (n, n) covariance of what a change of this size makes of the errors."""
+    common: Floats = size ** 2 * shown @ shown.T
+    return common + _WANDER ** 2 * np.diag(np.diag(common))
+
+
+def _likelihood(error: Floats, covariance: Floats) -> float:
+    """Give the logarithm of the likelihood, any of the rests knocked."""
+    return float(np.logaddexp.reduce(_knocks(error, covariance)[1]))
+
+
+def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Give the (k, n) ways to have been knocked, as ones and zeros, and log likelihoods (k,)."""
+    knocked = np.array(list(product((0.0, 1.0), repeat=len(error))))
+    spread = covariance + _KNOCK ** 2 * knocked[:, :, np.newaxis] * np.eye(len(error))
+    count = knocked.sum(axis=1)
+    weight = count * np.log(_KNOCKED) + (len(error) - count) * np.log1p(-_KNOCKED)
+    solved = np.linalg.solve(spread, np.broadcast_to(error, knocked.shape)[:, :, np.newaxis])
+    fit = solved[:, :, 0] @ error + np.linalg.slogdet(spread)[1]
+    return knocked, weight - 0.5 * fit
+
+
+def _described(way: str, rests: int, clear: bool, error: Floats, covariance: Floats,
+               up: Floats) -> Departure:
+    """Estimate a change, the likeliest knocks left aside."""
+    shown = _shown(way, rests, up)
+    prior = max(_SIZES) ** 2
+    knocked, likely = _knocks(error, covariance + _moved(shown, max(_SIZES)))
+    spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
+    told = shown.T @ np.linalg.inv(spread)
+    found = np.linalg.inv(told @ shown + np.eye(shown.shape[1]) / prior)
+    shift = found @ told @ error
+    moved = shown[len(up) - rests:] @ shift
+    sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
+    return Departure(rests, way, clear, shift, found,
+                     sign * float(np.sqrt(np.mean(moved ** 2))))

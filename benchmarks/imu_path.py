@@ -1,0 +1,293 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The Imu path: what the node costs beside bare relays, in one run on one machine.
+
+A driver, a relay or the node, and a user are processes of their own, side by side and again and
+again in turn; figures are medians over the turns, and ratios come first, for they travel best from
+machine to machine::
+
+    python benchmarks/imu_path.py --markdown docs/figures/imu_path.md
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+import os
+from pathlib import Path
+import platform
+import sys
+import tempfile
+import time
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from accel_calib.calibrate import Calibration, fit_poses, level  # noqa: E402
+from accel_calib.files import write_calibration, write_table  # noqa: E402
+from accel_calib.model import Model  # noqa: E402
+from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
+from accel_calib.sphere import spread_directions  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, table  # noqa: E402
+from imu_trial import node, relay, Trial, trial  # noqa: E402
+import numpy as np  # noqa: E402
+
+UNITS = units_of('m/s2')
+SEED = 2030
+EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array([0.012, -0.015, 0.008]),
+           'cross_axis': np.array([0.006, -0.004, 0.003])}
+MORE = {'offset_temperature': np.array([1e-3, -5e-4, 8e-4]),
+        'gain_temperature': np.array([3e-4, 2e-4, -1e-4]),
+        'quadratic': np.array([2e-3, -1e-3, 1e-3])}
+
+Trials = dict[str, list[Trial]]
+
+
+def calibration() -> Calibration:
+    """Make a levelled 10-parameter calibration; its poses have more in them than it knows of."""
+    rng = np.random.default_rng(SEED)
+    directions = spread_directions(36)
+    context = {'temperature': 25.0 + 10.0 * rng.uniform(-1.0, 1.0, len(directions))}
+    poses = simulate_poses(model_with({**EFFECTS, **MORE}), directions, rng, noise_g=0.0005,
+                           context=context)
+    poses = poses.with_columns(reading=UNITS.from_g(poses.reading),
+                               std=UNITS.from_g(poses['std']))
+    fitted = fit_poses(poses, UNITS, model='10')
+    flat = np.array([[0.2, -0.4, 0.8]]) / np.sqrt(0.84) * UNITS.per_g
+    return level(fitted, fitted.predict(flat)[0], 'ros')
+
+
+def refined(linear: Calibration) -> Calibration:
+    """Add effects of temperature and one that is not linear."""
+    model = Model({**linear.model.values, **MORE}, linear.model.rotation)
+    covariance = np.eye(len(model.vector)) * 1e-9
+    size = len(linear.covariance)
+    covariance[:size, :size] = linear.covariance
+    return replace(linear, model=model, covariance=covariance)
+
+
+@contextmanager
+def stored() -> Iterator[tuple[Path, Path]]:
+    """Store both, with poses beside the linear one."""
+    with tempfile.TemporaryDirectory() as folder:
+        linear, more = Path(folder) / 'linear.yaml', Path(folder) / 'refined.yaml'
+        made = calibration()
+        write_calibration(linear, made)
+        write_calibration(more, refined(made))
+        write_table(linear.with_name('linear_poses.csv'), made.poses)
+        yield linear, more
+
+
+class Calls:
+    """Call a service again and again, and note when."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self.spans: dict[str, list[tuple[int, int]]] = {}
+        self.answers: list[str] = []
+
+    def __call__(self) -> None:
+        """Let the stream be for a while, then call ``~/fit`` and ``~/refine``."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from std_srvs.srv import Trigger
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context)
+        user = rclpy.create_node('caller', context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(user)
+        time.sleep(3.0)
+        began = time.monotonic_ns()
+        time.sleep(self._seconds)
+        self.spans['idle'] = [(began, time.monotonic_ns())]
+        for name in ('fit', 'refine'):
+            client = user.create_client(Trigger, f'calibrator/{name}')
+            client.wait_for_service(10.0)
+            self.spans[name], until = [], time.monotonic() + self._seconds
+            while time.monotonic() < until:
+                began = time.monotonic_ns()
+                future = client.call_async(Trigger.Request())
+                executor.spin_until_future_complete(future, timeout_sec=120.0)
+                self.spans[name].append((began, time.monotonic_ns()))
+                self.answers.append(f'{name}: {future.result().message}')
+        executor.shutdown()
+        user.destroy_node()
+        context.try_shutdown()
+
+
+def median(trials: list[Trial], of: Callable[[Trial], float]) -> float:
+    """Give the median of a figure over trials."""
+    return float(np.median([of(each) for each in trials]))
+
+
+def ratio(trials: Trials, of: Callable[[Trial], float], one: str, other: str) -> float:
+    """Give the median of the ratio of two that ran in the same turn."""
+    return float(np.median([of(a) / of(b) for a, b in zip(trials[one], trials[other])]))
+
+
+def quantile(percent: float) -> Callable[[Trial], float]:
+    """Give the function that takes this percentile of the latency [µs]."""
+    return lambda each: float(np.percentile(each.latency_us, percent))
+
+
+def cpu(each: Trial) -> float:
+    """Give the CPU time a message [µs]."""
+    return each.cpu_us
+
+
+def at_1_khz(trials: Trials) -> list[Line]:
+    """Judge the trials at 1 kHz."""
+    turns = len(trials['node'])
+    over_raw = ratio(trials, cpu, 'node', 'serialized')
+    over_typed = ratio(trials, cpu, 'node', 'typed')
+    added = float(np.median([quantile(50)(a) - quantile(50)(b)
+                             for a, b in zip(trials['node'], trials['serialized'])]))
+    p99 = ratio(trials, quantile(99), 'node', 'serialized')
+    more = ratio(trials, cpu, 'refined', 'node')
+    start = median(trials['node'], lambda each: each.start)
+    unheard = ratio(trials, cpu, 'unheard', 'sink')
+    saved = median(trials['node'], cpu) - median(trials['unheard'], cpu)
+    return [
+        Line('CPU a message at 1 kHz, over the bare serialized relay', f'{over_raw:.2f}', '≤ 1.5',
+             turns, over_raw <= 1.5),
+        Line('same, over the bare typed relay under the default executor', f'{over_typed:.2f}',
+             '≤ 0.5', turns, over_typed <= 0.5),
+        Line('latency p50, added to that of the serialized relay', f'{added:.0f} µs', '≤ 50 µs',
+             turns, added <= 50.0),
+        Line('latency p99, over that of the serialized relay', f'{p99:.2f}', '≤ 1.3', turns,
+             p99 <= 1.3),
+        Line('CPU a message with temperature and non-linear effects, over the linear calibration',
+             f'{more:.2f}', '≤ 1.3', turns, more <= 1.3),
+        Line('CPU a message with nobody listening, over a bare subscriber that drops them',
+             f'{unheard:.2f} ({saved:.0f} µs less than with a listener)',
+             'publishers cost nothing', turns, None),
+        Line('start of the node to the first corrected message', f'{start:.2f} s', '≤ 1.5 s',
+             turns, start <= 1.5)]
+
+
+def flooded(trials: Trials) -> Line:
+    """Judge the trials without a pause."""
+    share = ratio(trials, lambda each: each.rate, 'node', 'serialized')
+    rates = [median(trials[name], lambda each: each.rate) for name in ('node', 'serialized')]
+    return Line('flooded: messages/s that came through, over the bare serialized relay',
+                f'{share:.2f} ({rates[0]:,.0f} of {rates[1]:,.0f})', '≥ 0.8',
+                len(trials['node']), share >= 0.8)
+
+
+def lossless(trials: Trials, seconds: float) -> Line:
+    """Judge the trial at 8 kHz."""
+    ours, bare = trials['node'][0], trials['serialized'][0]
+    return Line(f'8 kHz for {seconds:.0f} s, depth 100: messages lost',
+                f'{ours.lost} of {len(ours.sent):,} (bare relay: {bare.lost})', '0', 1,
+                ours.lost == 0)
+
+
+def while_computing(runs: list[tuple[Trial, Calls]]) -> list[Line]:
+    """Judge the trials in which services compute."""
+    lines = []
+    for name in ('fit', 'refine'):
+        ratios, lost, calls = [], 0, 0
+        for each, called in runs:
+            idle = each.between(*called.spans['idle'][0]).latency_us
+            parts = [each.between(*span) for span in called.spans[name]]
+            busy = np.concatenate([part.latency_us for part in parts])
+            ratios.append(float(np.percentile(busy, 99) / np.percentile(idle, 99)))
+            lost += each.between(called.spans[name][0][0], called.spans[name][-1][1]).lost
+            calls += len(parts)
+        worst = float(np.median(ratios))
+        lines.append(Line(f'during `~/{name}`: latency p99 over idle; messages lost',
+                          f'{worst:.2f}; {lost} ({calls} calls)', '≤ 2; 0', len(runs),
+                          worst <= 2.0 and lost == 0))
+    return lines
+
+
+def machine() -> str:
+    """Describe the machine and what else it does."""
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    model = next((line.split(':')[1].strip() for line in lines if line.startswith('model name')),
+                 platform.machine())
+    return (f'{model}, {os.cpu_count()} cores that driver, node and user share; Linux '
+            f'{platform.release()}, Python {platform.python_version()}; load average before: '
+            f'{os.getloadavg()[0]:.1f}.')
+
+
+def figures_of(trials: Trials) -> str:
+    """Give the plain figures, for the noise of the machine to be seen."""
+    rows = ['| at 1 kHz | CPU a message, µs: median (least to most) | p50, µs | p99, µs |',
+            '|---|---|---|---|']
+    for name, each in trials.items():
+        used = [one.cpu_us for one in each]
+        heard = len(each[0].heard) > 0
+        p50, p99 = ((f'{median(each, quantile(q)):.0f}' for q in (50, 99)) if heard else ('', ''))
+        rows.append(f'| {name} | {np.median(used):.0f} ({min(used):.0f} to {max(used):.0f}) | '
+                    f'{p50} | {p99} |')
+    return '\n'.join(rows)
+
+
+def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
+    """Run all trials; give the lines of the table, then the plain figures."""
+    with stored() as (linear, more):
+        commands = {'serialized': relay('serialized'), 'node': node(linear),
+                    'refined': node(more), 'typed': relay('typed')}
+
+        def pause() -> None:
+            time.sleep(seconds)
+
+        steady: Trials = {name: [] for name in (*commands, 'sink', 'unheard')}
+        flood: Trials = {'serialized': [], 'node': []}
+        runs = []
+        for turn in range(turns):
+            for name, command in commands.items():
+                steady[name].append(trial(command, 1000.0, pause))
+            steady['sink'].append(trial(relay('sink'), 1000.0, pause, listened=False))
+            steady['unheard'].append(trial(commands['node'], 1000.0, pause, listened=False))
+            for name, each in flood.items():
+                each.append(trial(commands[name], 0.0, pause))
+            calls = Calls(seconds)
+            runs.append((trial(node(linear, 'auto_capture:=false'), 1000.0, calls), calls))
+            print(f'turn {turn + 1} of {turns}', file=sys.stderr, flush=True)
+        many = {name: [trial(commands[name], 8000.0, lambda: time.sleep(long))]
+                for name in flood}
+    yield [*at_1_khz(steady), flooded(flood), lossless(many, long), *while_computing(runs)]
+    yield figures_of(steady)
+
+
+def main() -> int:
+    """Print the table, and write it where that is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--quick', action='store_true', help='one short turn')
+    parser.add_argument('--markdown', type=Path, help='write the table to this file')
+    given = parser.parse_args()
+    words = machine()
+    lines, plain = run(*((1, 2.0, 5.0) if given.quick else (5, 6.0, 60.0)))
+    text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py '
+            f'--markdown FILE`. {words}\nThe node has a levelled 10-parameter calibration, and '
+            'the messages have covariances, which makes the most work.\n'
+            'Driver and user are rclpy processes too; a set is a turn of all trials.\n\n'
+            f'{table(lines)}\n\n{plain}\n')
+    print(text)
+    if given.markdown:
+        given.markdown.write_text(text, encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
