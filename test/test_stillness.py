@@ -87,8 +87,9 @@ def assert_all_found(result: Captured, truth, missed=0):
 
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('sensor', [
-    {}, {'noise': 5e-5}, {'noise': 0.05}, {'noise': 0.0}, {'rate': 1000.0}, {'rate': 200.0},
-    {'rate': 25.0, 'dwell': (2.0, 8.0)}, {'rate': 100.0, 'correlation': 0.9},
+    {}, {'noise': 5e-5}, {'noise': 0.05, 'dwell': (9.0, 12.0)}, {'noise': 0.0},
+    {'rate': 1000.0}, {'rate': 200.0},
+    {'rate': 25.0, 'dwell': (2.0, 8.0)}, {'rate': 100.0, 'correlation': 0.9, 'dwell': (3.0, 8.0)},
     {'noise': 5e-5, 'step': 1e-3}, {'noise': 3e-4, 'step': 4e-3}, {'dwell': (1.5, 1.6)}],
     ids=lambda sensor: ' '.join(f'{key} {value}' for key, value in sensor.items()) or 'usual')
 def test_every_pose_of_a_sensor_is_found_and_none_in_between(sensor, seed):
@@ -151,6 +152,54 @@ def test_slow_turning_is_not_still(speed, noise):
         assert len(result.poses) == 1
         assert result.poses['time'][0] < 4.0
         assert np.abs(result.poses.reading[0] - [0.0, 0.0, 1.0]).max() < 5e-3 + noise
+
+
+@pytest.mark.parametrize('speed', [0.5, 1.0, 2.0])
+def test_slow_turning_of_a_noisy_sensor_leaves_no_pose(speed):
+    rng = np.random.default_rng(7)
+    time = np.arange(3000) / 100.0
+    angle = np.radians(speed) * np.maximum(time - 14.0, 0.0)
+    force = np.column_stack([np.sin(angle), np.zeros(3000), np.cos(angle)])
+    result = captured(time, force + 0.05 * rng.normal(size=force.shape))
+    assert np.all(result.poses['time'] < 14.0)
+
+
+def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
+    """Give a sensor put down again and again; one rest is turned at 1 °/s. Its gyro tells."""
+    rng = np.random.default_rng(3)
+    readings, rates = [], []
+    for index in range(count):
+        angle = np.radians(np.arange(int(seconds * 100)) / 100.0) * (index == turned_one)
+        force = np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)])
+        force = Rotation.random(random_state=index).apply(force)
+        readings += [force + noise * rng.normal(size=force.shape), rng.normal(size=(100, 3))]
+        axis = Rotation.random(random_state=index).apply([0.0, 1.0, 0.0])
+        bias = np.array([0.02, -0.01, 0.03]) - axis * np.radians(1.0) * (index == turned_one)
+        rates += [bias + 2e-3 * rng.normal(size=force.shape), rng.normal(size=(100, 3))]
+    reading = np.concatenate(readings)
+    return np.arange(len(reading)) / 100.0, reading, np.concatenate(rates)
+
+
+def test_a_dwell_too_short_to_show_slow_turning_in_its_noise_is_no_pose():
+    time, reading, _ = rests_with_a_gyro(None)
+    assert len(captured(time, reading).poses) < 4
+    time, reading, _ = rests_with_a_gyro(None, noise=0.005)
+    assert len(captured(time, reading).poses) == 8
+
+
+def test_a_gyro_tells_rests_from_slow_turning_once_its_bias_is_known():
+    time, reading, rate = rests_with_a_gyro(None)
+    assert len(captured(time, reading, rate=rate).poses) == 8
+    time, reading, rate = rests_with_a_gyro(5)
+    poses = captured(time, reading, rate=rate).poses
+    assert len(poses) == 7
+    assert not np.any((poses['time'] > 20.0) & (poses['time'] < 23.0))
+
+
+def test_a_gyro_that_gives_zeros_vouches_for_nothing():
+    time, reading, _ = rests_with_a_gyro(None)
+    still = captured(time, reading, rate=np.zeros_like(reading)).poses
+    assert len(still) == len(captured(time, reading).poses)
 
 
 def test_turning_about_the_vertical_is_still_for_it_changes_nothing():

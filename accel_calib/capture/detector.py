@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from .chunks import Chunker, Interruption
-from .dwell import Candidate, Dwell, finished
+from .dwell import Candidate, Dwell, judged
 from .rule import Rule
 from .settings import CaptureSettings
 from .sums import CONTEXT, WIDTH
@@ -138,7 +138,7 @@ class StillDetector:
 
     def dwells(self) -> list[Dwell]:
         """Give the dwells that ended so far and are still by the noise that is known now."""
-        return finished(self._candidates, self._rule)
+        return [each for each in judged(self._candidates, self._rule) if each is not None]
 
     @property
     def threshold(self) -> float:
@@ -185,9 +185,8 @@ class StillDetector:
             return []
         known = {id(each) for each in found}
         earlier = [each for each in self._candidates[-_BESIDE:] if id(each) not in known]
-        told = finished([*earlier, *found], self._rule)
-        good = sum(each.accepted(self._rule) for each in found)
-        return told[len(told) - good:]
+        told = judged([*earlier, *found], self._rule)[len(earlier):]
+        return [each for each in told if each is not None]
 
     def _keep(self, found: list[Candidate]) -> list[Candidate]:
         self._candidates += found

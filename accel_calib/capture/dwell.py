@@ -26,7 +26,10 @@ stretch seen tells σ; samples that flip between two steps do not.
 A dwell is refused when its windows vary on average more than `DWELL_RATIO` times the sensor's
 noise, by more than the uncertainty of that average: a tremor that the threshold of a single
 window let pass. The noise may become known after the dwell ended, so dwells are judged again
-when they are asked for. And it is refused when the reading moved steadily through it.
+when they are asked for. And it is refused when the reading moved steadily through it, or when
+its noise would hide that: it must show that it was not turned (see `rule.TURN_G`), which takes
+the longer the noisier the sensor is. Once five dwells have told the bias of the gyro, the gyro
+decides.
 
 References
 ----------
@@ -41,6 +44,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .noise import Trend
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
@@ -53,6 +57,12 @@ DWELL_RATE_RATIO = 1600.0
 """The same for the rate: what the accelerometer does not feel does no harm."""
 
 _OWN_EXCESS = 1.5   # an estimate of one dwell is that uncertain
+_NO_RATE = np.full(3, np.nan)
+_BIAS_DWELLS = 5    # that tell the bias of the gyro
+_GYRO_RATE = np.radians(0.25)
+"""Mean rate beside the bias that shows turning [rad/s]."""
+_SPREADS = 3.0      # of the bias over the dwells, that are below this rate
+_MAD = 1.4826       # standard deviation over median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -119,7 +129,7 @@ class Candidate:
     excess: float
     beside_slope: bool
 
-    def accepted(self, rule: Rule) -> bool:
+    def quiet(self, rule: Rule) -> bool:
         """Tell whether it is still by the noise that is known now."""
         rate = self.dwell.context.get('rate', np.zeros(3))
         noise = rule.noise_of(np.concatenate([self.dwell.mean, np.atleast_1d(rate)]))
@@ -130,11 +140,41 @@ class Candidate:
         return not bool(moved) and not bool(np.any(self.variance > limit))
 
 
-def finished(candidates: Sequence[Candidate], rule: Rule) -> list[Dwell]:
-    """Give the dwells that are still by what is known now, their count by all of them."""
-    good = [each for each in candidates if each.accepted(rule)]
-    common = float(np.median([each.excess for each in good])) if good else 1.0
-    return [_counted(each, max(1.0, common, each.excess / _OWN_EXCESS), rule) for each in good]
+def judged(candidates: Sequence[Candidate], rule: Rule) -> list[Dwell | None]:
+    """Give each dwell if it is still by what is known now, its count by all of them."""
+    quiet = [each.quiet(rule) for each in candidates]
+    excess = [each.excess for each, good in zip(candidates, quiet) if good]
+    common = float(np.median(excess)) if excess else 1.0
+    told = _by_gyro(candidates, np.array(quiet, dtype=bool), rule)
+    found: list[Dwell | None] = []
+    for each, good, turned in zip(candidates, quiet, told):
+        own = max(1.0, common, each.excess / _OWN_EXCESS)
+        rests = not turned if turned is not None else rule.rests(each.slope, own)
+        found.append(_counted(each, own, rule) if good and rests else None)
+    return found
+
+
+def _by_gyro(candidates: Sequence[Candidate], quiet: NDArray[np.bool_], rule: Rule
+             ) -> list[bool | None]:
+    """
+    Tell by the gyro which dwells were turned; None where it cannot tell.
+
+    Its bias is the median over the dwells, and a rate about the vertical turns no pose.
+
+    """
+    rates = np.array([each.dwell.context.get('rate', _NO_RATE) for each in candidates])
+    rates = rates.reshape(-1, 3)
+    known = quiet & np.isfinite(rates).all(axis=1)
+    if not rule.si_rates or known.sum() < _BIAS_DWELLS:
+        return [None] * len(candidates)
+    off = rates - np.median(rates[known], axis=0)
+    spread = _MAD * float(np.max(np.median(np.abs(off[known]), axis=0)))
+    up = np.array([each.dwell.mean / np.linalg.norm(each.dwell.mean) for each in candidates])
+    tilting = np.linalg.norm(np.cross(off, up), axis=1)
+    alive = np.array([bool(np.all(each.average[3:] > 0.0)) for each in candidates])
+    sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
+    turned = known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread))
+    return [True if bad else False if good else None for bad, good in zip(turned, sure)]
 
 
 def _counted(candidate: Candidate, excess: float, rule: Rule) -> Dwell:

@@ -60,12 +60,15 @@ class Trend(NamedTuple):
         Sum over the axes of (slope / its standard error)².
     excess : (...) array
         Variance of a mean over that of white noise, at least 1.
+    error : (...) array
+        Standard error of the slope, were the samples independent, where it is largest.
 
     """
 
     slope: Floats
     strength: Floats
     excess: Floats
+    error: Floats
 
 
 def trend(cells: Floats, spacing: float, white: Floats) -> Trend:
@@ -95,7 +98,8 @@ def trend(cells: Floats, spacing: float, white: Floats) -> Trend:
     power = np.maximum(square / (3.0 * (size - 2)), 1.0)
     excess = np.asarray(power * (1.0 + correlation) / (1.0 - correlation))
     strength = np.sum(slope**2 / (white + _TINY), axis=-1) * time_square / excess
-    return Trend(slope, np.asarray(strength), excess)
+    error = np.sqrt(np.max(white, axis=-1) / time_square)
+    return Trend(slope, np.asarray(strength), excess, np.asarray(error))
 
 
 def excess_of_mean(cells: Floats, white: Floats) -> float:

@@ -72,11 +72,20 @@ RATE_RATIO = 900.0
 STD_CAP_G = 0.15
 """Largest standard deviation that the adaptive threshold takes [g]."""
 
+SHAKING_G = 0.06
+"""Shaking beside the noise that the adaptive threshold takes [g], for a noisy sensor."""
+
 SLOPE_G = 4e-3
 """Slope within a dwell that is let pass [g/s]: a sensor that settles on a soft base."""
 
 DWELL_SLOPE_G = 2e-3
 """Slope through a dwell that is let pass [g/s]: 0.11 °/s; warming up gives some 1e-5 g/s."""
+
+TURN_G = 8.7e-3
+"""Slope below which a dwell has to be to be sure to rest [g/s]: turning at 0.5 °/s."""
+
+SURE = 2.33
+"""Standard errors below it: a dwell that is turned passes in 1 % of the cases."""
 
 SLOPE_NOISE = 0.1
 """The same in standard deviations of the samples per second, for a sensor not turned yet."""
@@ -134,6 +143,11 @@ class Rule:
             return self._per_g
         return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
 
+    @property
+    def si_rates(self) -> bool:
+        """Tell whether rates are taken to be in rad/s: not beside readings in native units."""
+        return self._known
+
     def noise_of(self, mean: Floats) -> Floats:
         """
         Give the variance of the sensor's own noise, as known now, for a mean reading and rate.
@@ -163,8 +177,9 @@ class Rule:
         """Give the (..., 6) largest variances of a still window at this noise."""
         limit = noise * np.repeat([ratio, rate_ratio], 3)
         if self._known:
-            cap = (STD_CAP_G * self._per_g)**2
-            limit[..., :3] = np.minimum(limit[..., :3], cap)
+            most = np.minimum(noise[..., :3] + (SHAKING_G * self._per_g)**2,
+                              (STD_CAP_G * self._per_g)**2)
+            limit[..., :3] = np.minimum(limit[..., :3], most)
         if self._settings.still_std_max > 0.0:
             limit[..., :3] = (self._settings.still_std_max * self._per_g)**2
         return np.asarray(limit)
@@ -215,6 +230,11 @@ class Rule:
             drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=-1)))
         large = np.sqrt(np.sum(found.slope**2, axis=-1)) > drift
         return np.asarray(large & (found.strength > strength))
+
+    def rests(self, found: Trend, excess: float) -> bool:
+        """Tell whether a dwell shows that it was not turned slowly: see `TURN_G`."""
+        size = float(np.linalg.norm(found.slope) + SURE * found.error * np.sqrt(excess))
+        return self.scale == 0.0 or size < TURN_G * self.scale
 
     def _quiet(self, mean: Floats, level: Floats, limit: Floats) -> NDArray[np.bool_]:
         quiet = (np.all(level[:, :3] <= limit[:, :3], axis=1)
