@@ -334,6 +334,22 @@ def test_a_damaged_chunk_is_told_in_one_line(make, share, calibration, tmp_path)
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize('make', ['mcap', 'no chunks', 'sqlite3', 'zstd by rosbags'])
+@pytest.mark.parametrize('share', [0.001, 0.1, 0.5, 0.9])
+def test_a_file_that_is_cut_short_is_told_in_one_line(make, share, calibration, tmp_path):
+    path = write(tmp_path, make, messages(13))
+    file = path if path.is_file() else next(path.glob('*[p3]'))
+    data = file.read_bytes()
+    file.write_bytes(data[:int(share * len(data))])
+    for each in {path, file}:
+        with pytest.raises(InputError, match='is not a whole bag') as refusal:
+            read_recording(each, '/imu/a')
+        assert '\n' not in str(refusal.value)
+        with pytest.raises(InputError, match='is not a whole bag'):
+            correct_bag(each, calibration, tmp_path / 'out', '/imu/a')
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
 @pytest.mark.parametrize('cut', [1, 5, 20, 40])
 def test_records_that_are_cut_short_are_refused(cut):
     whole = record(5, bytes(30)) + record(5, bytes(22))

@@ -30,9 +30,9 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 from . import db3, mcap_rewrite
-from .bag import BLOCK, connections_of, count_of, IMU, imu_topic, open_bag, storage_files
+from .bag import Bag, BLOCK, IMU, imu_topic, open_bag
 from .bag_metadata import write_metadata
-from .bag_samples import first_frame_id, temperature_track, Track
+from .bag_samples import first_frame_id, temperature_track
 from .calibration_yaml import check_sensor
 from .serialized import (
     doubles_at,
@@ -99,17 +99,16 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     partial = out.with_name(f'.{out.name}.partial')
     _remove(partial)
     try:
-        with open_bag(path) as reader:
-            name = imu_topic(reader, path, topic)
-            check_sensor(calibration, first_frame_id(reader, path, name))
-            change = _Correction(calibration, f'{path}, {name}', temperature_track(reader, path),
-                                 count_of(reader, name), progress)
+        with open_bag(path) as bag:
+            name = imu_topic(bag, topic)
+            check_sensor(calibration, first_frame_id(bag, name))
+            change = _Correction(calibration, bag, name, progress)
             partial.parent.mkdir(parents=True, exist_ok=True)
-            if _can_rewrite(path, name):
-                _rewrite(reader, path, partial, out, name, change)
+            if _can_rewrite(bag):
+                _rewrite(bag, partial, out, name, change)
             else:
-                with _writer(reader, path, partial) as writer:
-                    _copy(reader, writer, name, change)
+                with _writer(bag, partial) as writer:
+                    _copy(bag, writer, name, change)
         partial.rename(out)
     finally:
         _remove(partial)
@@ -125,13 +124,13 @@ def _remove(path: Path) -> None:
 class _Correction:
     """Correct messages in their buffer, and count them."""
 
-    def __init__(self, calibration: Calibration, name: str, track: Track | None, count: int,
-                 progress: Progress) -> None:
+    def __init__(self, calibration: Calibration, bag: Bag, topic: str, progress: Progress
+                 ) -> None:
         needed = 'temperature' in calibration.model.needs
         self._calibration = calibration
-        self._name = name
-        self._track = track if needed else None
-        self._count = count
+        self._name = f'{bag.path}, {topic}'
+        self._track = temperature_track(bag) if needed else None
+        self._count = bag.topics[topic, IMU]
         self._progress = progress
         self.done = 0
 
@@ -148,55 +147,51 @@ class _Correction:
         self._progress(self.done, self._count)
 
 
-def _can_rewrite(path: Path, topic: str) -> bool:
-    files = storage_files(path)
-    return bool(files) and all(
-        file.suffix == '.db3' or mcap_rewrite.can_rewrite(file, topic, IMU) for file in files)
+def _can_rewrite(bag: Bag) -> bool:
+    return bool(bag.files) and all(file.suffix == '.db3' or mcap_rewrite.can_rewrite(file)
+                                   for file in bag.files)
 
 
-def _rewrite(reader: AnyReader, path: Path, partial: Path, out: Path, topic: str,
-             change: _Correction) -> None:
+def _rewrite(bag: Bag, partial: Path, out: Path, topic: str, change: _Correction) -> None:
     """Rewrite the files of a rosbag2 one by one; others in its folder are copied."""
-    single = not path.is_dir()
-    if single and out.suffix == path.suffix:
+    names = [file.name for file in bag.files]
+    targets = [partial / name for name in names]
+    if bag.path.is_dir():
+        shutil.copytree(bag.path, partial, ignore=lambda *_: names)
+    elif out.suffix == bag.path.suffix:
         targets = [partial]
-    elif single:
-        partial.mkdir()
-        targets = [partial / f'{out.name}{path.suffix}']
-        write_metadata(reader, targets[0])
     else:
-        files = storage_files(path)
-        names = [file.name for file in files]
-        shutil.copytree(path, partial, ignore=lambda *_: names)
-        targets = [partial / name for name in names]
-    for file, target in zip(storage_files(path), targets, strict=True):
+        partial.mkdir()
+        targets = [partial / f'{out.name}{bag.path.suffix}']
+        write_metadata(bag.reader, targets[0])
+    for file, target in zip(bag.files, targets, strict=True):
         module = db3 if file.suffix == '.db3' else mcap_rewrite
         module.rewrite(file, target, topic, IMU, change)
 
 
-def _writer(reader: AnyReader, path: Path, out: Path) -> Writer1 | Writer2:
+def _writer(bag: Bag, out: Path) -> Writer1 | Writer2:
     """Make a writer of the kind of the bag that is read."""
-    if not reader.is2:
+    if not bag.ros2:
         from rosbags.rosbag1 import Writer as Rosbag1Writer
 
         return Rosbag1Writer(out)
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-    mcap = path.suffix == '.mcap' or any(path.glob('*.mcap*'))
+    mcap = bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))
     return Rosbag2Writer(out, version=9, storage_plugin=StoragePlugin.MCAP if mcap
                          else StoragePlugin.SQLITE3)
 
 
-def _copy(reader: AnyReader, writer: Writer1 | Writer2, topic: str, change: _Correction) -> None:
+def _copy(bag: Bag, writer: Writer1 | Writer2, topic: str, change: _Correction) -> None:
     """Copy all messages, those of the Imu corrected."""
-    add = _adder(reader, writer)
-    outputs = {id(connection): add(connection) for connection in reader.connections}
-    imu = {id(connection) for connection in connections_of(reader, topic)}
-    messages: Iterator[tuple[Any, int, bytes]] = reader.messages()
+    add = _adder(bag.reader, writer)
+    outputs = {id(connection): add(connection) for connection in bag.reader.connections}
+    imu = {id(connection) for connection in bag.connections(topic)}
+    messages: Iterator[tuple[Any, int, bytes]] = bag.reader.messages()
     while block := list(islice(messages, BLOCK)):
         which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-        new = joined([block[k][2] for k in which], ros2=reader.is2)
+        new = joined([block[k][2] for k in which], ros2=bag.ros2)
         if which:
             change(new)
         changed = dict(zip(which, new.each(), strict=True))

@@ -18,19 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .bag import messages_of, TEMPERATURE
+from .bag import Bag, TEMPERATURE
 from .serialized import doubles_at, frame_id_of, layout_of, stamps_of
 from ..errors import InputError
 from ..imu import ACCELERATION, ANGULAR_VELOCITY, FIELDS
 from ..table import Floats, Recording
-
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
 
 _ROWS = 65536  # of a block, about
 _TEMPERATURE_FIELDS = 2  # temperature and its variance
@@ -48,7 +43,7 @@ class Track:
         return np.interp(time, self.time, self.temperature)
 
 
-def imu_blocks(reader: AnyReader, path: Path, topic: str) -> Iterator[Recording]:
+def imu_blocks(bag: Bag, topic: str) -> Iterator[Recording]:
     """
     Read the samples of an Imu topic in blocks.
 
@@ -58,17 +53,17 @@ def imu_blocks(reader: AnyReader, path: Path, topic: str) -> Iterator[Recording]
         If a message is damaged or holds NaN.
 
     """
-    track = temperature_track(reader, path)
+    track = temperature_track(bag)
     parts: list[Recording] = []
     before = 0
-    for messages in messages_of(reader, path, topic):
-        layout = layout_of(messages, FIELDS, f'{path}, {topic}', before)
+    for messages in bag.messages(topic):
+        layout = layout_of(messages, FIELDS, f'{bag.path}, {topic}', before)
         columns = {'time': stamps_of(messages, layout),
                    'reading': doubles_at(messages, layout, ACCELERATION),
                    'rate': doubles_at(messages, layout, ANGULAR_VELOCITY)}
         if track is not None:
             columns['temperature'] = track.at(columns['time'])
-        _check_finite(path, columns['reading'], before)
+        _check_finite(bag, columns['reading'], before)
         parts.append(Recording(columns, np.arange(before, before + len(messages)) + 1))
         before += len(messages)
         if sum(map(len, parts)) >= _ROWS:
@@ -86,15 +81,15 @@ def together(parts: Sequence[Recording]) -> Recording:
     return Recording(columns, np.concatenate([part.row for part in parts]))
 
 
-def _check_finite(path: Path, reading: Floats, before: int) -> None:
+def _check_finite(bag: Bag, reading: Floats, before: int) -> None:
     """Refuse messages whose acceleration is not a number."""
-    faulty = np.flatnonzero(~np.all(np.isfinite(reading), axis=1))
-    if len(faulty):
-        raise InputError(f'{path}: Imu message {before + faulty[0] + 1} holds NaN or infinity',
+    if not np.isfinite(reading).all():
+        first = int(np.argmin(np.isfinite(reading).all(axis=1)))
+        raise InputError(f'{bag.path}: Imu message {before + first + 1} holds NaN or infinity',
                          'mend the driver, or record again')
 
 
-def first_frame_id(reader: AnyReader, path: Path, topic: str) -> str:
+def first_frame_id(bag: Bag, topic: str) -> str:
     """
     Give the frame_id of the first message of an Imu topic.
 
@@ -104,21 +99,22 @@ def first_frame_id(reader: AnyReader, path: Path, topic: str) -> str:
         If there is no message, or it is damaged.
 
     """
-    block = next(messages_of(reader, path, topic), None)
+    block = next(bag.messages(topic), None)
     if block is None:
-        raise InputError(f'{path} has no message on {topic}', 'record while the sensor publishes')
+        raise InputError(f'{bag.path} has no message on {topic}',
+                         'record while the sensor publishes')
     first = block.take(slice(1))
-    return frame_id_of(first, layout_of(first, FIELDS, f'{path}, {topic}'))
+    return frame_id_of(first, layout_of(first, FIELDS, f'{bag.path}, {topic}'))
 
 
-def temperature_track(reader: AnyReader, path: Path) -> Track | None:
+def temperature_track(bag: Bag) -> Track | None:
     """Read all Temperature topics of a bag, where it has any."""
     times: list[Floats] = []
     values: list[Floats] = []
-    for topic in sorted({c.topic for c in reader.connections if c.msgtype == TEMPERATURE}):
+    for topic in bag.of_type(TEMPERATURE):
         before = 0
-        for messages in messages_of(reader, path, topic, TEMPERATURE):
-            layout = layout_of(messages, _TEMPERATURE_FIELDS, f'{path}, {topic}', before)
+        for messages in bag.messages(topic, TEMPERATURE):
+            layout = layout_of(messages, _TEMPERATURE_FIELDS, f'{bag.path}, {topic}', before)
             times.append(stamps_of(messages, layout))
             values.append(doubles_at(messages, layout, slice(0, 1))[:, 0])
             before += len(messages)

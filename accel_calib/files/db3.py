@@ -32,7 +32,27 @@ def opened(path: Path, mode: str) -> sqlite3.Connection:
     return sqlite3.connect(f'{path.absolute().as_uri()}?{mode}', uri=True, isolation_level=None)
 
 
-def topics_of(database: sqlite3.Connection, topic: str, msgtype: str) -> list[int]:
+def topics_in(path: Path) -> dict[tuple[str, str], int]:
+    """
+    Give the topics of a file by name and type, each with a number of messages it does not exceed.
+
+    Raises
+    ------
+    ValueError
+        If messages are not in CDR.
+    sqlite3.Error
+        If it is not a file of rosbag2.
+
+    """
+    with closing(opened(path, 'immutable=1')) as database:
+        last, = database.execute('SELECT coalesce(max(id), 0) FROM messages').fetchone()
+        topics = database.execute('SELECT name, type, serialization_format FROM topics').fetchall()
+    if any(form != 'cdr' for _, _, form in topics):
+        raise ValueError('messages are not in CDR')
+    return {(name, msgtype): last for name, msgtype, _ in topics}
+
+
+def _numbers(database: sqlite3.Connection, topic: str, msgtype: str) -> list[int]:
     """Give the numbers of a topic."""
     return [number for number, in database.execute(
         'SELECT id FROM topics WHERE name = ? AND type = ?', (topic, msgtype))]
@@ -41,7 +61,7 @@ def topics_of(database: sqlite3.Connection, topic: str, msgtype: str) -> list[in
 def topic_messages(path: Path, topic: str, msgtype: str) -> Iterator[Messages]:
     """Give the messages of a topic in the order of the time of receipt, block by block."""
     with closing(opened(path, 'immutable=1')) as database:
-        numbers = topics_of(database, topic, msgtype)
+        numbers = _numbers(database, topic, msgtype)
         rows = database.execute('SELECT data FROM messages WHERE topic_id IN '
                                 f'({marks(numbers)}) ORDER BY timestamp', numbers)
         while block := rows.fetchmany(_BLOCK):
@@ -76,7 +96,7 @@ def rewrite(source: Path, target: Path, topic: str, msgtype: str,
         new.execute('PRAGMA locking_mode = EXCLUSIVE')
         changed: dict[int, memoryview] = {}
         new.create_function('changed', 1, changed.__getitem__)
-        numbers = topics_of(old, topic, msgtype)
+        numbers = _numbers(old, topic, msgtype)
         which = f'topic_id IN ({marks(numbers)})'
         rows = old.execute(f'SELECT id, data FROM messages WHERE {which} ORDER BY id', numbers)
         new.execute('BEGIN')

@@ -41,7 +41,8 @@ from .serialized import Bytes, Indices, merged, Messages, rows_at
 from ..errors import InputError
 
 MAGIC = b'\x89MCAP0\r\n'
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
+HEADER, FOOTER, SCHEMA, CHANNEL = 0x01, 0x02, 0x03, 0x04
+MESSAGE, CHUNK, STATISTICS = 0x05, 0x06, 0x0B
 HEAD = 9  # bytes of operation code and length
 
 _CHANNEL, _LOG_TIME, _DATA = HEAD, HEAD + 6, HEAD + 22  # places in the record of a message
@@ -56,6 +57,18 @@ class Record(NamedTuple):
     size: int
 
 
+class Contents(NamedTuple):
+    """What is in a file: its records, and by channel the topic with its type, and the messages."""
+
+    records: list[Record]
+    channels: dict[int, tuple[str, str]]
+    counts: dict[int, int]
+
+    def of(self, topic: str, msgtype: str) -> list[int]:
+        """Give the channels of a topic."""
+        return [number for number, about in self.channels.items() if about == (topic, msgtype)]
+
+
 class Chunk(NamedTuple):
     """A chunk: least and last log time [ns], checksum or 0, compression, and its records."""
 
@@ -66,15 +79,51 @@ class Chunk(NamedTuple):
     data: bytes | memoryview
 
 
-def records_of(file: BinaryIO) -> list[Record]:
-    """Give the records of a file up to its footer, or up to the first message without a chunk."""
-    position = file.seek(len(MAGIC))
+def contents_of(file: BinaryIO) -> Contents:
+    """
+    Go through the records of a file, without looking into the chunks.
+
+    Raises
+    ------
+    ValueError
+        If it is not a whole file of ROS 2 with all messages in chunks and all channels in a
+        summary.
+
+    """
+    records = _records_of(file)
+    by_code: dict[int, list[bytes]] = {code: [] for code in (HEADER, SCHEMA, CHANNEL, STATISTICS)}
+    for record in records:
+        if record.code in by_code:
+            by_code[record.code].append(content_of(file, record))
+    if records[-1].code != FOOTER or not by_code[STATISTICS] or _text(
+            by_code[HEADER][0], 0) != 'ros2':
+        raise ValueError('not a whole file of ROS 2 with a summary')
+    schemas = {content[:2]: _text(content, 2) for content in by_code[SCHEMA]}
+    channels = {}
+    for content in by_code[CHANNEL]:
+        topic = _text(content, 4)
+        if _text(content, 8 + len(topic.encode())) != 'cdr':
+            raise ValueError(f'{topic} is not in CDR')
+        channels[int.from_bytes(content[:2], 'little')] = topic, schemas[content[2:4]]
+    statistics = by_code[STATISTICS][0]
+    if len(channels) != int.from_bytes(statistics[10:14], 'little'):
+        raise ValueError('the summary does not tell of all channels')
+    return Contents(records, channels, dict(struct.iter_unpack('<HQ', statistics[46:])))
+
+
+def _records_of(file: BinaryIO) -> list[Record]:
+    """Give the records of a file up to its footer."""
+    if file.read(len(MAGIC)) != MAGIC:
+        raise ValueError('not an MCAP file')
     found: list[Record] = []
+    position = len(MAGIC)
     while len(head := file.read(HEAD)) == HEAD:
         record = Record(head[0], position, int.from_bytes(head[1:], 'little'))
         found.append(record)
-        if record.code in (FOOTER, MESSAGE):
+        if record.code == FOOTER:
             break
+        if record.code == MESSAGE:
+            raise ValueError('messages outside of chunks')
         position = file.seek(position + HEAD + record.size)
     return found
 
@@ -85,20 +134,20 @@ def content_of(file: BinaryIO, record: Record) -> bytes:
     return file.read(record.size)
 
 
-def channels_of(file: BinaryIO, records: Sequence[Record], topic: str, msgtype: str) -> list[int]:
-    """Give the channels of a topic, of those that the summary tells of."""
-    contents = [(record.code, content_of(file, record)) for record in records
-                if record.code in (SCHEMA, CHANNEL)]
-    schemas = {content[:2] for code, content in contents
-               if code == SCHEMA and _text(content, 2) == msgtype}
-    return sorted({int.from_bytes(content[:2], 'little') for code, content in contents
-                   if code == CHANNEL and content[2:4] in schemas and _text(content, 4) == topic})
-
-
 def _text(content: bytes, start: int) -> str:
     begin = start + 4
     size = int.from_bytes(content[start:begin], 'little')
     return content[begin:begin + size].decode(errors='replace')
+
+
+def topics_in(path: Path) -> dict[tuple[str, str], int]:
+    """Give the number of messages of each topic, by name and type; raises as `contents_of`."""
+    with path.open('rb') as file:
+        contents = contents_of(file)
+    topics = dict.fromkeys(contents.channels.values(), 0)
+    for channel, count in contents.counts.items():
+        topics[contents.channels[channel]] += count
+    return topics
 
 
 def chunk_of(content: bytes) -> Chunk:
@@ -184,16 +233,16 @@ def _places_of_messages(data: Bytes) -> Indices:
 def topic_messages(path: Path, topic: str, msgtype: str) -> Iterator[Messages] | None:
     """Give the messages of a topic chunk by chunk, or None where `rosbags` has to do it."""
     with path.open('rb') as file:
-        records = records_of(file)
-        channels = channels_of(file, records, topic, msgtype)
-        chunks = [record for record in records if record.code == CHUNK]
+        try:
+            contents = contents_of(file)
+        except ValueError:
+            return None
+        chunks = [record for record in contents.records if record.code == CHUNK]
         begins = [int.from_bytes(content_of(file, record._replace(size=8)), 'little')
                   for record in chunks]
-    if not channels or records[-1].code != FOOTER:
-        return None
     # Least log time of the chunks that follow each.
     limits = [*accumulate(reversed(begins[1:]), min)][::-1]
-    return _in_order(path, chunks, [*limits, _FOREVER], channels)
+    return _in_order(path, chunks, [*limits, _FOREVER], contents.of(topic, msgtype))
 
 
 def _in_order(path: Path, chunks: Sequence[Record], limits: Sequence[int],

@@ -35,17 +35,16 @@ import numpy as np
 
 from .compression import compressed
 from .mcap import (
-    channels_of,
     CHUNK,
     chunk_of,
     content_of,
+    contents_of,
     damaged,
     FOOTER,
     HEAD,
     MAGIC,
     messages_in,
     Record,
-    records_of,
 )
 from .serialized import Messages
 
@@ -82,11 +81,14 @@ class _Moves:
         struct.pack_into('<Q', content, at, self.new(place))
 
 
-def can_rewrite(source: Path, topic: str, msgtype: str) -> bool:
-    """Tell whether all messages stand in chunks, and the summary tells of the channels."""
+def can_rewrite(source: Path) -> bool:
+    """Tell whether a file is as `contents_of` wants it."""
     with source.open('rb') as file:
-        records = records_of(file)
-        return records[-1].code == FOOTER and bool(channels_of(file, records, topic, msgtype))
+        try:
+            contents_of(file)
+        except ValueError:
+            return False
+    return True
 
 
 def rewrite(source: Path, target: Path, topic: str, msgtype: str, change: Change) -> None:
@@ -111,8 +113,8 @@ def rewrite(source: Path, target: Path, topic: str, msgtype: str, change: Change
     moves = _Moves()
     checksum, in_summary = 0, False
     with source.open('rb') as file, target.open('xb') as out:
-        records = records_of(file)
-        channels = channels_of(file, records, topic, msgtype)
+        contents = contents_of(file)
+        records, channels = contents.records, contents.of(topic, msgtype)
         out.write(MAGIC)
         for record in records:
             content = content_of(file, record)

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from .bag import count_of, imu_topic, is_bag, open_bag
+from .bag import IMU, imu_topic, is_bag, open_bag
 from .bag_samples import first_frame_id, imu_blocks, together
 from .table_csv import read_samples
 from ..table import Recording
@@ -95,10 +95,10 @@ def open_recording(path: Path, topic: str = '') -> Iterator[Stream]:
         table = read_samples(path)
         yield Stream(iter((table,)), len(table), None, '')
         return
-    with open_bag(path) as reader:
-        name = imu_topic(reader, path, topic)
-        frame_id = first_frame_id(reader, path, name)
-        yield Stream(imu_blocks(reader, path, name), count_of(reader, name), 'm/s2', frame_id)
+    with open_bag(path) as bag:
+        name = imu_topic(bag, topic)
+        frame_id = first_frame_id(bag, name)
+        yield Stream(imu_blocks(bag, name), bag.topics[name, IMU], 'm/s2', frame_id)
 
 
 def read_recording(path: Path, topic: str = '') -> Source:
