@@ -19,6 +19,7 @@ from .comparison import compare, Comparison, LEVEL
 from .fit import fit_poses, METHODS, MODEL_NAMES
 from .geometry import coverage
 from .identifiability import Identifiability, identifiability
+from .many import fit_many, Fleet
 from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
 from .next_pose import next_pose, NextPose
 from .outlook import Outlook, outlook
@@ -36,6 +37,7 @@ __all__ = [
            'MODEL_NAMES',
            'Calibration',
            'Comparison',
+           'Fleet',
            'FrameName',
            'Identifiability',
            'NextPose',
@@ -48,6 +50,7 @@ __all__ = [
            'compare',
            'coverage',
            'directions_of',
+           'fit_many',
            'fit_poses',
            'identifiability',
            'in_g',

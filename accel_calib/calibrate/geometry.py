@@ -58,7 +58,7 @@ NORM_MODELS = ('4', '7', '10')
 
 _NEAR = np.cos(np.radians(45.0))
 _SAME = np.cos(np.radians(5.0))
-_SINGULAR, _NOTHING = 1e-7, 1e-14
+_SINGULAR, _NOTHING = 1e-6, 1e-14
 
 
 def effects_of(name: str) -> tuple[str, ...]:
@@ -176,15 +176,29 @@ def dilution(name: str, directions: Floats, noise: Floats | None = None) -> floa
         leave a parameter open.
 
     """
-    rows = rows_of(name, directions) * np.sqrt(relative_weights(noise, len(directions))
-                                               )[:, np.newaxis, np.newaxis]
-    rows = rows.reshape(-1, rows.shape[2])
-    information = rows.T @ rows
-    told = np.linalg.eigvalsh(information)
-    if not told[0] > _NOTHING * max(told[-1], 1.0):
-        return np.inf
-    sphere = over_the_sphere(name)
-    return float(np.sqrt(np.max(np.sum((sphere @ np.linalg.inv(information)) * sphere, axis=2))))
+    weights = relative_weights(noise, len(directions))
+    rows = rows_of(name, directions) * np.sqrt(weights)[:, np.newaxis, np.newaxis]
+    return float(dilution_of(name, rows.reshape(-1, rows.shape[2])))
+
+
+def dilution_of(name: str, rows: Floats) -> Floats:
+    """Give the dilution, (...), of poses with these (..., n, p) weighted Φ; as `dilution`."""
+    information = np.swapaxes(rows, -1, -2) @ rows
+    size = rows.shape[-1]
+    trace = np.trace(information, axis1=-2, axis2=-1)
+    ridge = (_NOTHING * trace + 1e-300)[..., np.newaxis, np.newaxis]
+    inverse = np.linalg.inv(information + ridge * np.eye(size))
+    squared = inverse.reshape(*trace.shape, size * size) @ _pairs_over_the_sphere(name)
+    found = np.sqrt(np.max(squared, axis=-1))
+    return np.where(found < 1.0 / _SINGULAR, found, np.inf)
+
+
+@lru_cache(maxsize=8)
+def _pairs_over_the_sphere(name: str) -> Floats:
+    """Give the products of the entries of Φ in each direction, (p², m)."""
+    around = over_the_sphere(name)
+    pairs = np.einsum('mkp,mkq->mpq', around, around)
+    return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
 
 
 def coverage(directions: Floats) -> float:

@@ -55,10 +55,10 @@ from ..table import Floats
 _NO_NOISE_G = 1e-9
 """Samples that scatter less do not scatter at all."""
 
-_LEAST_NOISE = 0.1
+LEAST_NOISE = 0.1
 """A pose that claims less than this part of the median noise is not believed."""
 
-_USUAL_NOISE_G = 5e-4
+USUAL_NOISE_G = 5e-4
 """Noise of a pose of a common MEMS sensor, where it was not measured."""
 
 
@@ -144,7 +144,7 @@ def norm_jacobian(model: Model, u: Floats, context: Context) -> Floats:
 def believable(noise: Floats) -> Floats | None:
     """Raise noise that is far below the others'; None where most claim to have none at all."""
     median = np.median(noise)
-    return np.maximum(noise, _LEAST_NOISE * median) if median > _NO_NOISE_G else None
+    return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
 def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Floats | None
@@ -180,7 +180,7 @@ def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Fl
     believed = None if noise is None else believable(noise)
     start = form.free(mat_w, vec_v)
     # The weights hardly depend on the model: those of the start will do.
-    sigma = (np.full(len(reading), _USUAL_NOISE_G) if believed is None
+    sigma = (np.full(len(reading), USUAL_NOISE_G) if believed is None
              else noise_along(form, start, reading, believed))
     solution, converged = solve(form, start, reading, sigma)
     if not converged:
@@ -192,7 +192,7 @@ def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Fl
 def norm_fit_at(name: str, free: Floats, reading: Floats, noise: Floats | None) -> Fit:
     """Say what poses of unknown orientation tell of these (q,) free values; as `fit_norm`."""
     form = form_of(name)
-    sigma = np.full(len(reading), _USUAL_NOISE_G)
+    sigma = np.full(len(reading), USUAL_NOISE_G)
     believed = None if noise is None else believable(noise)
     if believed is not None:
         sigma = noise_along(form, free, reading, believed)
@@ -222,7 +222,7 @@ def judge(model: Model, reading: Floats, context: Context, noise: Floats | None)
     """
     u = sensor_force(model, reading, context)
     believed = None if noise is None else believable(noise)
-    sigma = np.full(len(u), _USUAL_NOISE_G)
+    sigma = np.full(len(u), USUAL_NOISE_G)
     if believed is not None:
         sigma = np.linalg.norm(norm_rows(model, u, context) * believed, axis=1)
     jacobian = norm_jacobian(model, u, context) / sigma[:, np.newaxis]
@@ -259,7 +259,7 @@ def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, 
 
     """
     noise = None if noise is None else believable(noise)
-    sigma = np.full(reading.size, _USUAL_NOISE_G) if noise is None else noise.ravel()
+    sigma = np.full(reading.size, USUAL_NOISE_G) if noise is None else noise.ravel()
     zero = with_vector(effects, np.zeros(len(parameter_names(effects))))
     basis = parameter_basis(zero, reference, context)
     design = basis.reshape(reading.size, -1) / sigma[:, np.newaxis]

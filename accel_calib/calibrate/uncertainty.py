@@ -42,7 +42,7 @@ _RIGHT = 0.7
 
 _INTERVAL = 0.95
 _NORMAL = 1.959964
-_GRID = 161
+_GRID = 81
 _BEYOND = 1e3
 
 
@@ -57,7 +57,7 @@ def _grid() -> tuple[Floats, Floats, Floats]:
     from scipy.special import ndtr
 
     scale = np.logspace(0.0, 4.0, _GRID)
-    width = np.geomspace(1.9, 250.0, 201)
+    width = np.geomspace(1.9, 250.0, 101)
     return scale, width, 2.0 * ndtr(width[:, np.newaxis] / np.sqrt(scale)) - 1.0
 
 

@@ -38,7 +38,7 @@ from ..units import MG, Units
 
 Method = Literal['ml', 'algebraic']
 
-_CLOSED_FORMS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
+CLOSED_FORMS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
     '4': closed_form.fit_4, '7': closed_form.fit_7,
     '9': closed_form.fit_10, '10': closed_form.fit_10}
 
@@ -197,7 +197,7 @@ def _undisturbed(poses_g: Poses, name: str) -> tuple[NDArray[np.intp], Fit]:
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     """Fit a model for unknown orientation to poses in g."""
-    mat_w, vec_v = _CLOSED_FORMS[name](poses_g.reading)
+    mat_w, vec_v = CLOSED_FORMS[name](poses_g.reading)
     if name == '9':
         mat_w = lower_triangular(mat_w)
     if method == 'ml':
