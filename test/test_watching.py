@@ -22,14 +22,16 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.calibrate.departure import MEMORY
-from accel_calib.calibrate.watching import compared, rest_of, told, Watching, watching
+from accel_calib.calibrate.watching import compared, rests_of, told, Watching, watching
+from accel_calib.capture import capture
+from accel_calib.files.recording import read_recording
 from accel_calib.model import Model, predict
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import units_of
 import numpy as np
 import pytest
-from shared import sensor
+from shared import data, sensor
 
 LEAST = 0.001
 NOISE = 0.0003
@@ -46,10 +48,11 @@ def rested(before: Watching, calibration: Calibration, truth: Model, up: Any,
            rng: np.random.Generator, *, shift: Any = 0.0, noise: float = NOISE,
            temperature: float | None = None) -> Watching:
     """Rest once in each of these attitudes, with the reading shifted by so much [g]."""
-    context = {} if temperature is None else {'temperature': np.array([temperature])}
-    for reading in predict(truth, np.atleast_2d(up), {}):
-        mean = reading + shift + noise * rng.normal(size=3)
-        before = compared(before, rest_of(calibration, mean, np.full(3, noise), context), LEAST)
+    mean = predict(truth, np.atleast_2d(np.asarray(up, float)), {}) + shift
+    mean = mean + noise * rng.normal(size=mean.shape)
+    context = {} if temperature is None else {'temperature': np.full(len(mean), temperature)}
+    for rest in rests_of(calibration, mean, np.full(mean.shape, noise), context):
+        before = compared(before, rest, LEAST)
     return before
 
 
@@ -101,10 +104,10 @@ def test_what_poses_leave_open_is_no_departure() -> None:
     between = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
     state = rested(watching(calibration), calibration, truth, between, rng)
     assert state.stated > 0.003
-    off = 1.5 * state.stated * between
+    off = (3.0 * state.stated - state.rests[0].error) * between
     state = rested(watching(calibration), calibration, truth, [between] * 50, rng, shift=off)
     assert state.departure is None
-    state = rested(watching(calibration), calibration, truth, [between] * 50, rng, shift=8.0 * off)
+    state = rested(watching(calibration), calibration, truth, [between] * 50, rng, shift=4.0 * off)
     assert state.departure is not None
 
 
@@ -150,8 +153,9 @@ def test_sensor_that_repeats_worse_than_stated_is_not_taken_for_a_changed_one() 
     truth = sensor(rng)
     calibration = made(truth, rng, noise=0.0001)
     state = watching(calibration)
-    for reading in predict(truth, random_directions(1500, rng), {}):
-        rest = rest_of(calibration, reading + 0.0003 * rng.normal(size=3), np.full(3, 0.0001), {})
+    reading = predict(truth, random_directions(1500, rng), {})
+    reading = reading + 0.0003 * rng.normal(size=reading.shape)
+    for rest in rests_of(calibration, reading, np.full(reading.shape, 0.0001), {}):
         state = compared(state, rest, LEAST)
         assert state.departure is None
     assert state.scatter == pytest.approx(2.5, rel=0.5)
@@ -162,8 +166,10 @@ def test_poses_that_repeat_badly_widen_what_is_stated() -> None:
     truth = sensor(rng)
     table = simulate_poses(truth, spread_directions(36), rng, noise_g=0.001)
     table = table.with_columns(reading=table.reading + 0.001 * rng.normal(size=(36, 3)))
-    state = watching(fit_poses(table, units_of('g'), model='10'))
+    calibration = fit_poses(table, units_of('g'), model='10')
+    state = watching(calibration)
     assert np.sqrt(state.repeats) == pytest.approx(0.001, rel=0.3)
+    assert rested(state, calibration, truth, UP, rng, noise=0.0001).stated > 0.0009
 
 
 def test_departures_too_small_to_matter_are_passed_over() -> None:
@@ -216,9 +222,28 @@ def test_readings_in_counts_are_watched_like_others() -> None:
     counts = table.with_columns(reading=table.reading * 16384.0, std=table['std'] * 16384.0)
     calibration = fit_poses(counts, units_of('native'), model='10')
     state = watching(calibration)
-    for _ in range(3):
-        mean = predict(truth, UP[np.newaxis], {})[0] + 0.005 * UP + NOISE * rng.normal(size=3)
-        rest = rest_of(calibration, mean * 16384.0, np.full(3, NOISE * 16384.0), {})
+    mean = predict(truth, np.array([UP] * 3), {}) + 0.005 * UP + NOISE * rng.normal(size=(3, 3))
+    for rest in rests_of(calibration, mean * 16384.0, np.full((3, 3), NOISE * 16384.0), {}):
         state = compared(state, rest, LEAST)
     assert state.departure is not None
     assert state.departure.error == pytest.approx(0.005, abs=0.001)
+
+
+@pytest.mark.parametrize(('name', 'unit'), [
+    ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
+def test_real_rests_are_no_departure_until_they_are_shifted(name: str, unit: Any) -> None:
+    units = units_of(unit)
+    poses = capture(read_recording(data(f'{name}.csv')).recording, units).poses
+    others = np.arange(0, len(poses), 2)
+    calibration = fit_poses(poses.take(others), units, model='10')
+    rests = poses.take(np.delete(np.arange(len(poses)), others))
+    force = calibration.correct(rests.reading)
+    shift = calibration.predict(1.005 * force) - calibration.predict(force)
+    state = watching(calibration)
+    for rest in rests_of(calibration, rests.reading, rests.noise, {}):
+        state = compared(state, rest, LEAST)
+        assert state.departure is None
+    for rest in rests_of(calibration, (rests.reading + shift)[:3], rests.noise[:3], {}):
+        state = compared(state, rest, LEAST)
+    assert state.departure is not None
+    assert state.lasted == 3

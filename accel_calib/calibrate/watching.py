@@ -127,27 +127,29 @@ class Watching:
         return self.rests[-1].temperature if self.rests else np.nan
 
 
-def rest_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context) -> Rest:
+def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
+             ) -> list[Rest]:
     """
-    Hold a rest against 1 g.
+    Hold rests against 1 g.
 
     Parameters
     ----------
     calibration : Calibration
         The calibration in use.
-    reading, noise : (3,) array
-        Mean reading and the noise of that mean, in the unit of the readings.
+    reading, noise : (n, 3) array
+        Mean readings and the noise of these means, in the unit of the readings.
     context : mapping of str to array
-        What the effects need, one row.
+        What the effects need, n rows.
 
     """
     model, units = calibration.model, calibration.units
-    u = sensor_force(model, units.to_g(reading)[np.newaxis], context)
-    length = float(np.linalg.norm(u))
-    along = norm_rows(model, u, context)[0] * units.to_g(noise)
-    known = np.asarray(context.get('temperature', np.nan), dtype=float)
-    return Rest(length - 1.0, float(along @ along) + _LEAST_NOISE ** 2,
-                norm_jacobian(model, u, context)[0], u[0] / length, float(known.ravel()[0]))
+    u = sensor_force(model, units.to_g(reading), context)
+    length = np.linalg.norm(u, axis=1)
+    variance = np.sum((norm_rows(model, u, context) * units.to_g(noise)) ** 2, axis=1)
+    slope = norm_jacobian(model, u, context)
+    temperature = np.asarray(context.get('temperature', np.full(len(u), np.nan)), float)
+    return [Rest(float(length[k]) - 1.0, float(variance[k]) + _LEAST_NOISE ** 2, slope[k],
+                 u[k] / length[k], float(temperature[k])) for k in range(len(u))]
 
 
 def watching(calibration: Calibration) -> Watching:

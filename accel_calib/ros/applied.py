@@ -35,7 +35,7 @@ import numpy as np
 from .context import context_of_rest
 from .pose_book import overlap
 from .watch import LONG_REST
-from ..calibrate.watching import compared, rest_of, Watching, watching
+from ..calibrate.watching import compared, rests_of, Watching, watching
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration
@@ -126,8 +126,9 @@ class Applied:
         context = self._context(rest)
         if self._past is None or self.calibration is None or context is None:
             return self._past
-        noise = rest.std / math.sqrt(rest.count)
-        return compared(self._past, rest_of(self.calibration, rest.mean, noise, context), least)
+        noise = rest.std[np.newaxis] / math.sqrt(rest.count)
+        found = rests_of(self.calibration, rest.mean[np.newaxis], noise, context)
+        return compared(self._past, found[0], least)
 
     def _hold(self) -> None:
         self.gravity = None if self.rest is None else self._force(self.rest)

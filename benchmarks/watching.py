@@ -1,0 +1,221 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+How soon a shift is told, and how often one is told that is none: watching, measured.
+
+Each set is a sensor of its own, calibrated (model 10) from poses spread over the sphere, and then
+watched rest by rest, with the smallest departure of `drift_warn`::
+
+    python benchmarks/watching.py --seed 2030 --markdown docs/figures/watching.md
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import sys
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
+
+from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
+from accel_calib.calibrate.watching import compared, rests_of, watching  # noqa: E402
+from accel_calib.model import Model, predict  # noqa: E402
+from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
+from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
+from accel_calib.table import Floats  # noqa: E402
+from accel_calib.units import MG, units_of  # noqa: E402
+from figures import Line, table  # noqa: E402
+import numpy as np  # noqa: E402
+
+Attitudes = Callable[[int, np.random.Generator], Floats]
+
+SHIFT = 0.005
+KNOCK = 0.05
+LEAST = 0.01 / 9.80665
+"""The default of `drift_warn` [g]."""
+
+BEFORE = 10
+AFTER = 30
+
+
+def same(count: int, rng: np.random.Generator) -> Floats:
+    """Rest in one attitude."""
+    return np.repeat(random_directions(1, rng), count, axis=0)
+
+
+def few(count: int, rng: np.random.Generator) -> Floats:
+    """Rest in five attitudes, in any order."""
+    return random_directions(5, rng)[rng.integers(0, 5, count)]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor: poses and noise of a pose mean, and how much worse than that it repeats [g]."""
+
+    poses: int = 12
+    noise: float = 0.0003
+    repeats: float = 0.0
+    near_faces: bool = False
+
+    def scattered(self, reading: Floats, rng: np.random.Generator) -> Floats:
+        """Add what the noise of a mean does not account for."""
+        return reading + self.repeats * rng.normal(size=reading.shape)
+
+    def made(self, rng: np.random.Generator) -> tuple[Model, Calibration]:
+        """Draw one and calibrate it."""
+        truth = model_with({'offset': 0.05 * rng.normal(size=3),
+                            'axis_gain': 0.02 * rng.normal(size=3),
+                            'cross_axis': 0.01 * rng.normal(size=3)})
+        up, jitter = spread_directions(self.poses), 0.1
+        if self.near_faces:
+            up, jitter = np.vstack([np.eye(3), -np.eye(3)] * (self.poses // 6)), 0.04
+        up = up + jitter * rng.normal(size=up.shape)
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        poses = simulate_poses(truth, up, rng, noise_g=10.0 * self.noise, samples=100)
+        poses = poses.with_columns(reading=self.scattered(poses.reading, rng))
+        return truth, fit_poses(poses, units_of('g'), model='10')
+
+    def watched(self, made: tuple[Model, Calibration], up: Floats, shift: Floats,
+                rng: np.random.Generator) -> list[bool]:
+        """Say after each rest whether a departure is told."""
+        truth, calibration = made
+        reading = predict(truth, up, {}) + shift + self.noise * rng.normal(size=up.shape)
+        state, told = watching(calibration), []
+        for rest in rests_of(calibration, self.scattered(reading, rng),
+                             np.full(up.shape, self.noise), {}):
+            state = compared(state, rest, LEAST)
+            told.append(state.departure is not None)
+        return told
+
+
+def delay(sensor: Sensor, attitudes: Attitudes, *, offset: bool, rng: np.random.Generator) -> int:
+    """Give how many rests after a shift it is told; 0: before it."""
+    made = sensor.made(rng)
+    up = attitudes(BEFORE + AFTER, rng)
+    way = random_directions(1, rng) if offset else up * rng.choice([-1.0, 1.0])
+    shift = SHIFT * way * (np.arange(BEFORE + AFTER) >= BEFORE)[:, np.newaxis]
+    told = sensor.watched(made, up, shift, rng)
+    return 0 if any(told[:BEFORE]) else [*told[BEFORE:], True].index(True) + 1
+
+
+def delays(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rng: np.random.Generator,
+           *, offset: bool = False, asked: bool = True) -> Line:
+    """Make the line of how soon a shift is told."""
+    found = np.array([delay(sensor, attitudes, offset=offset, rng=rng) for _ in range(sets)])
+    shares = [100.0 * np.mean((found > 0) & (found <= rests)) for rests in (3, 4, 6, AFTER)]
+    words = (f'{shares[0]:.1f} %; within 4: {shares[1]:.1f}, 6: {shares[2]:.1f}, '
+             f'{AFTER}: {shares[3]:.1f} %')
+    met = bool(shares[0] == 100.0) if asked else None
+    return Line(f'{what}, {sensor.noise * MG:g} mg, {sensor.poses} poses', words,
+                '100 % within 3' if asked else '', sets, met)
+
+
+def alarms(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rests: int,
+           rng: np.random.Generator, *, knocked: float = 0.0) -> Line:
+    """Make the line of false alarms."""
+    count = wrong = 0
+    for _ in range(sets):
+        made = sensor.made(rng)
+        knock = KNOCK * random_directions(rests, rng)
+        knock[rng.random(rests) >= knocked] = 0.0
+        told = np.array(sensor.watched(made, attitudes(rests, rng), knock, rng), int)
+        begun = int(np.sum(np.diff(told, prepend=0) == 1))
+        count, wrong = count + begun, wrong + bool(begun)
+    words = f'{count} in {sets * rests:,} rests ({wrong} of {sets} sensors)'
+    return Line(f'{what}, {sensor.noise * MG:g} mg, {sensor.poses} poses', words, '0', sets,
+                count == 0)
+
+
+def one_knock(sets: int, rng: np.random.Generator) -> Line:
+    """Make the line of single knocks."""
+    count, sensor = 0, Sensor()
+    for _ in range(sets):
+        made, up = sensor.made(rng), same(12, rng)
+        knock = KNOCK * random_directions(1, rng) * (np.arange(12) == 5)[:, np.newaxis]
+        count += any(sensor.watched(made, up, knock, rng))
+    return Line('one rest knocked by 50 mg, told', f'{count}', '0', sets, count == 0)
+
+
+def lines(sets: int, long: int, rests: int, seed: int) -> list[Line]:
+    """Measure all."""
+    rng = np.random.default_rng(seed)
+    sensors = [Sensor(poses, noise) for noise in (0.0001, 0.0003, 0.0005, 0.001)
+               for poses in (12, 36)]
+    found = [delays('5 mg of length at each rest, one attitude', sensor, same, sets, rng,
+                    asked=sensor.noise < 0.001) for sensor in sensors]
+    found += [delays('5 mg of length at each rest, any attitude', sensor, random_directions, sets,
+                     rng, asked=sensor.noise < 0.001) for sensor in sensors]
+    found += [delays('5 mg of offset, any attitude', sensor, random_directions, sets, rng,
+                     offset=True, asked=False) for sensor in sensors]
+    found += [one_knock(sets, rng)]
+    for what, attitudes in (('one attitude', same), ('five attitudes', few),
+                            ('any attitude', random_directions)):
+        found += [alarms(f'alarms, {what}', Sensor(), attitudes, long, rests, rng)]
+    part = max(long // 4, 1)
+    found += [
+        alarms('alarms, one attitude', Sensor(12, 0.001), same, part, rests, rng),
+        alarms('alarms, poses near the faces, any attitude', Sensor(18, near_faces=True),
+               random_directions, part, rests, rng),
+        alarms('alarms, repeats to 0.3 mg, any attitude', Sensor(36, 0.0001, 0.0003),
+               random_directions, part, rests, rng),
+        alarms('alarms, repeats to 0.3 mg, any attitude', Sensor(12, 0.0001, 0.0003),
+               random_directions, part, rests, rng),
+        alarms('alarms, repeats to 1 mg, any attitude', Sensor(12, 0.0001, 0.001),
+               random_directions, part, rests, rng),
+        alarms('alarms, 2 % of rests knocked, any attitude', Sensor(), random_directions, part,
+               rests, rng, knocked=0.02),
+        alarms('alarms, 8 % of rests knocked, one attitude', Sensor(), same, part, rests, rng,
+               knocked=0.08),
+        alarms('alarms, 8 % of rests knocked, any attitude', Sensor(), random_directions, part,
+               rests, rng, knocked=0.08)]
+    return found
+
+
+def heading(given: argparse.Namespace) -> str:
+    """Say what the table is and how it was made."""
+    command = (f'python benchmarks/watching.py --sets {given.sets} --long {given.long} --rests '
+               f'{given.rests} --seed {given.seed}')
+    return f"""# Figures of watching
+
+Made by `{command} --markdown FILE`.
+Noise is that of a pose mean, by axis; {BEFORE} rests come before the shift. A shift of 5 mg of
+length shows in full at each rest; one of 5 mg of an offset by the cosine of the angle between it
+and up, 2.9 mg RMS over all attitudes. Departures below 1 mg are passed over."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table, and write it where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
+    parser.add_argument('--sets', type=int, default=200, help='sensors a shift')
+    parser.add_argument('--long', type=int, default=20, help='sensors watched for alarms')
+    parser.add_argument('--rests', type=int, default=10000, help='rests of each of these')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--markdown', type=Path, help='write the table here')
+    given = parser.parse_args(arguments)
+    text = table(lines(given.sets, given.long, given.rests, given.seed))
+    print(text)
+    if given.markdown:
+        given.markdown.write_text(f'{heading(given)}\n\n{text}\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
