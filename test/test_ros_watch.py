@@ -320,7 +320,16 @@ def test_pose_from_before_the_first_temperature_takes_that_of_the_next() -> None
     book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
     book.end(dwell(0.0, [0, 0, 1]))
     for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
-        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + time}))
-    np.testing.assert_allclose(book.poses()['temperature'], [45.0, 40.0])
+        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + 0.1 * time}))
+    np.testing.assert_allclose(book.poses()['temperature'], [31.5, 31.0])
     early = replace(dwell(-500.0, [0, 1, 0]), context={})
     assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))
+
+
+@pytest.mark.parametrize(('repeated', 'count'), [('merge', 100.0), ('refuse', 50.0)])
+def test_pose_at_another_temperature_is_no_repeated_one(repeated: Any, count: float) -> None:
+    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
+    for time, temperature in ((0.0, 24.0), (10.0, 25.0), (20.0, 38.0)):
+        book.end(replace(dwell(time, [0, 0, 1]), context={'temperature': temperature}))
+    np.testing.assert_allclose(book.poses()['count'], [count, 50.0])
+    assert book.poses()['temperature'][1] == 38.0

@@ -26,6 +26,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..capture import Dwell, poses_from, select
 
 if TYPE_CHECKING:
@@ -40,6 +42,9 @@ _SEPARATE = 64
 
 _SAME_TEMPERATURE = 120.0
 """Rests this near in time have the same temperature [s]."""
+
+_BAND = 5.0
+"""Poses that differ more in temperature are not repeated ones: ~/refine lives on them [°C]."""
 
 _CONTEXT = ('temperature', 'supply_voltage', 'rate')
 
@@ -70,7 +75,13 @@ class PoseBook:
         return poses_from(self._selected(dwells), self._settings)
 
     def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
-        return select(with_temperature(dwells), self._settings, self._units)
+        """Keep, merge or refuse repeated poses, those of each temperature for themselves."""
+        bands: dict[float, list[Dwell]] = {}
+        for dwell in with_temperature(dwells):
+            temperature = float(np.asarray(dwell.context.get('temperature', 0.0)))
+            bands.setdefault(round(temperature / _BAND), []).append(dwell)
+        return [dwell for band in bands.values()
+                for dwell in select(band, self._settings, self._units)]
 
     def take_up(self, poses: Poses) -> None:
         """Put poses that were stored before in front."""

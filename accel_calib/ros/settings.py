@@ -99,7 +99,8 @@ class CalibratorSettings:
         _CAPTURE.min_pose_angle, 'Poses closer than this are repeated ones [rad]',
         limits=(0.0, 1.5))
     repeated: Repeated = _parameter(
-        'merge', 'What becomes of a repeated pose: a robot that parks repeats itself',
+        'merge', 'What becomes of a repeated pose: a robot that parks repeats itself. At another '
+        'temperature it is none',
         choices=REPEATED)
     drift_warn: float = _parameter(
         0.01, 'Smallest lasting departure of |a| at rest from 1 g that is warned of, where it is '
