@@ -87,7 +87,7 @@ def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
 
 
 def test_set_level_tells_of_a_flat_pose_on_another_face(bench: Any, readings: Readings,
-                                                       stored: Stored) -> None:
+                                                        stored: Stored) -> None:
     still = bench.listen(Bool, 'calibrator/still', latched=True)
     bench.calibrator(calibration_file=str(stored()), sensor='arm', passthrough=True)
     bench.feed(readings([[0, 0, 1], [0, 0, -1]], dwell=3.0)[:-5])
