@@ -14,8 +14,9 @@
 
 """Poses to calibration: closed forms, maximum likelihood, mounting, and the record of it."""
 
+from .agreement import LEVEL
 from .calibration import Calibration, level, Quality, Rejected
-from .comparison import compare, Comparison, LEVEL
+from .comparison import compare, Comparison
 from .fit import fit_poses, METHODS, MODEL_NAMES
 from .geometry import coverage
 from .identifiability import Identifiability, identifiability

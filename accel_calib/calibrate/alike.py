@@ -22,12 +22,18 @@ from itertools import combinations
 import numpy as np
 
 from .calibration import Calibration
+from .common_scale import used_poses
+from .unknown import fit_unknown
 from ..effects import Context
-from ..errors import InputError
+from ..errors import InputError, RefusedFitError
+from ..model import MODELS
 from ..table import Floats
 
 _COMMON = ('temperature', 'supply_voltage')
 """What may be set alike for all runs; the rest is each run's own."""
+
+_LARGER = {'4': ('7', '10'), '7': ('10',)}
+"""Models that hold all that a smaller one does; 9 and 12 say no more of |a| than 10 does."""
 
 _WARMER = 5.0
 """Temperatures of two runs further apart than this are worth a word [°C]."""
@@ -63,6 +69,40 @@ def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
                              'parameters', 'fit it again with more poses')
 
 
+def as_sure_as_the_largest(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
+    """
+    Give fits whose uncertainties hold for runs with smaller models, too.
+
+    What a smaller model leaves out it knows without doubt, in its own eyes. But `auto` leaves out
+    what it cannot see in the noise; so that run is no surer of it than the largest model of the
+    runs would be from its poses.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        The runs.
+
+    Returns
+    -------
+    tuple of Calibration
+        Each the run itself, or its poses fitted with the largest model, where they carry it.
+
+    """
+    names = {'10' if run.name in ('9', '12') else run.name for run in calibrations}
+    largest = next((name for name in ('10', '7', '4') if name in names), '')
+    return tuple(_fitted_with(largest, run) for run in calibrations)
+
+
+def _fitted_with(name: str, run: Calibration) -> Calibration:
+    """Fit the poses of a run with a larger model, if it is one and they carry it."""
+    if name not in _LARGER.get(run.name, ()) or run.model.effects != MODELS[run.name]:
+        return run
+    try:
+        return fit_unknown(used_poses(run), run.units, name, 'ml')
+    except RefusedFitError:
+        return run
+
+
 def contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
     """Give the context in which each run is looked at, one row each."""
     common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
@@ -81,24 +121,30 @@ def _own_context(run: Calibration) -> Context:
     return context
 
 
-def notes_of(calibrations: Sequence[Calibration], names: tuple[str, ...], stated: Floats,
-             noisier: Sequence[int]) -> tuple[str, ...]:
+def notes_of(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
+             names: tuple[str, ...], deviation: Floats, noisier: Sequence[int]
+             ) -> tuple[str, ...]:
     """
     Say what else to know of a comparison.
 
     Parameters
     ----------
-    calibrations : sequence of Calibration
-        The runs.
+    calibrations, sure : sequence of Calibration
+        The runs, and what `as_sure_as_the_largest` made of them.
     names : tuple of str
         Of the t common parameters.
-    stated : (n, t) array
-        Their standard deviations; 0 where the model of a run leaves one out.
+    deviation : (n, t) array
+        Their standard deviations; 0 where a run knows one without doubt.
     noisier : sequence of int
         Runs whose poses repeat worse than those of the others.
 
     """
-    return (*_shared(calibrations), *_left_out(names, stated), *_temperatures(calibrations),
+    smaller = [f'run {k} (model {run.name}) leaves out what model {larger.name} finds in others: '
+               'it is taken to say zero there, as surely as its poses tell'
+               for k, (run, larger) in enumerate(zip(calibrations, sure, strict=True), 1)
+               if run is not larger]
+    return (*_shared(calibrations), *smaller, *_left_out(names, deviation),
+            *_temperatures(calibrations),
             *(f'the poses of run {k + 1} repeat significantly worse than those of the others: it '
               'counts for less' for k in noisier))
 
@@ -117,10 +163,10 @@ def _shared(calibrations: Sequence[Calibration]) -> list[str]:
     return notes
 
 
-def _left_out(names: tuple[str, ...], stated: Floats) -> list[str]:
+def _left_out(names: tuple[str, ...], deviation: Floats) -> list[str]:
     """Name what some models leave out and others find."""
     notes: dict[tuple[int, ...], list[str]] = {}
-    for name, column in zip(names, stated.T, strict=True):
+    for name, column in zip(names, deviation.T, strict=True):
         without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
         if 0 < len(without) < len(column):
             notes.setdefault(without, []).append(name)

@@ -15,19 +15,10 @@
 """
 Whether calibrations of one sensor agree within their uncertainties.
 
-Each calibration i has parameters x_i that do not depend on its axes
-(`accel_calib.calibrate.rotation_free`) with covariance C_i
-(`accel_calib.calibrate.common_scale`). If they are all of one sensor, contrasts of the x_i, such
-as their differences, are normal about zero with the covariance K diag(C_i) Kᵀ, and
-
-    T² = dᵀ (K diag(C_i) Kᵀ)⁺ d,   d = K x
-
-over its rank has an F distribution with the degrees of freedom of the noise. A parameter that a
-model leaves out is known to it without doubt: where another model finds that it is not zero, the
-two do not agree. Beside T², which looks in all directions at once, each parameter of each run is
-held against the mean of the other runs (Student's t), for a change of one parameter alone. The
-smaller of the two probabilities counts, twice for there being two, and for the number of
-parameters (Bonferroni). The run without which T² falls most is the one that differs.
+What each says is told in parameters that do not depend on its axes
+(`accel_calib.calibrate.rotation_free`), with covariances on one scale
+(`accel_calib.calibrate.common_scale`), and tested by `accel_calib.calibrate.agreement`. A run with
+a smaller model keeps its values; its uncertainty is that of the largest model.
 
 """
 
@@ -38,7 +29,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .alike import contexts_of, notes_of, refuse_if_unlike
+from .agreement import LEVEL, outlier, p_values, Runs, SAME_G
+from .alike import as_sure_as_the_largest, contexts_of, notes_of, refuse_if_unlike
 from .calibration import Calibration
 from .common_scale import on_one_scale
 from .likelihood import norm_jacobian
@@ -49,15 +41,7 @@ from ..sphere import spread_directions
 from ..table import Floats
 from ..units import MG
 
-LEVEL = 0.03
-"""Calibrations that agree are said not to in at most this share of the cases."""
-
 _DIRECTIONS = spread_directions(300)
-_SAME_G = 1e-7
-"""Differences below this are none; to this a parameter is known that a model leaves out."""
-
-_NO_SPREAD = 1e-10
-"""A variance this much below the largest is none."""
 
 
 @dataclass(frozen=True)
@@ -151,65 +135,30 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class _Runs:
-    """Runs in common parameters: (n, t) values, (n, t, t) covariances, dof of the noise."""
+class _Run:
+    """A calibration, its surer fit, its context, what it says, and the covariance of that fit."""
 
-    values: Floats
-    covariances: Floats
-    dof: float
+    calibration: Calibration
+    sure: Calibration
+    context: Context
+    said: RotationFree
+    slope: Floats
+    covariance: Floats
 
-    def without(self, run: int) -> _Runs:
-        """Give the others."""
-        return _Runs(np.delete(self.values, run, 0), np.delete(self.covariances, run, 0),
-                     self.dof)
+    def length(self, reading: Floats) -> tuple[Floats, Floats]:
+        """Give the corrected |a| of (n, 3) readings in the common unit, and its variance."""
+        here = {key: np.repeat(column, len(reading), 0) for key, column in self.context.items()}
+        u = sensor_force(self.calibration.model, reading / self.said.reading_scale, here)
+        rows = norm_jacobian(self.sure.model, u, here)
+        variance = np.maximum(np.einsum('np,pq,nq->n', rows, self.covariance, rows), 0.0)
+        scale = self.said.force_scale
+        return np.linalg.norm(u, axis=1) * scale, variance * scale ** 2
 
-    @property
-    def squared(self) -> tuple[float, int]:
-        """T² and its rank: differences over their variances, in all directions at once."""
-        count = len(self.values)
-        contrasts = np.linalg.svd(np.ones((1, count)))[2][1:]
-        away = (contrasts @ self.values).ravel()
-        covariance = np.einsum('ai,irs,bi->arbs', contrasts, self.covariances, contrasts)
-        variances, vectors = np.linalg.eigh(covariance.reshape(away.size, away.size))
-        along = vectors.T @ away
-        vary = variances > _NO_SPREAD * max(float(np.max(variances, initial=0.0)), 1e-300)
-        if np.linalg.norm(along[~vary]) > _SAME_G:
-            return np.inf, int(np.sum(vary))
-        return float(np.sum(along[vary] ** 2 / variances[vary])), int(np.sum(vary))
-
-    @property
-    def least(self) -> Floats:
-        """(n,) array, the probability of the parameter of each run that is off the most."""
-        from scipy.special import stdtr
-
-        variance = np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0) + _SAME_G ** 2
-        weight = 1.0 / variance
-        others = np.sum(weight, axis=0) - weight
-        mean = (np.sum(weight * self.values, axis=0) - weight * self.values) / others
-        sizes = np.abs(self.values - mean) / np.sqrt(variance + 1.0 / others)
-        number = np.sum(np.any(variance > 4.0 * _SAME_G ** 2, axis=0))
-        least: Floats = 2.0 * stdtr(self.dof, -np.max(sizes, axis=1)) * max(number, 1)
-        return least
-
-    @property
-    def p_value(self) -> float:
-        """Probability of differences as large, if the runs agree."""
-        count = len(self.values)
-        tests = 1 if count == 2 else count
-        return _either(_beyond(*self.squared, self.dof), float(np.min(self.least)) * tests)
-
-
-def _beyond(chi2: float, rank: int, dof: float) -> float:
-    """Give the probability that T² of this rank is as large."""
-    from scipy.special import chdtrc, fdtrc
-
-    if rank == 0 or not np.isfinite(chi2):
-        return 1.0 if np.isfinite(chi2) else 0.0
-    return float(chdtrc(rank, chi2) if np.isinf(dof) else fdtrc(rank, dof, chi2 / rank))
-
-
-def _either(first: float, second: float) -> float:
-    return min(1.0, 2.0 * min(first, second))
+    def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
+        """Give the (t, t) covariance of the common parameters."""
+        slope = _into(names, self.said, self.slope)
+        carried: Floats = slope @ covariance @ slope.T
+        return carried
 
 
 def compare(calibrations: Sequence[Calibration]) -> Comparison:
@@ -233,24 +182,31 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
 
     """
     refuse_if_unlike(calibrations)
-    contexts = contexts_of(calibrations)
-    per_g = float(np.mean([run.units.per_g for run in calibrations]))
-    free = [rotation_free(run, context, per_g)
-            for run, context in zip(calibrations, contexts, strict=True)]
-    names = tuple(dict.fromkeys(name for run in free for name in run.names))
-    spread = on_one_scale(calibrations)
-    values = np.array([_into(names, run, run.values) for run in free])
-    runs = _Runs(values, np.array([_covariance(names, run, covariance) for run, covariance
-                                   in zip(free, spread.covariances, strict=True)]), spread.dof)
-    stated = np.sqrt([np.maximum(np.diag(_covariance(names, run, calibration.covariance)), 0.0)
-                      for run, calibration in zip(free, calibrations, strict=True)])
-    chi2, rank = runs.squared
-    p_value = runs.p_value
+    sure = as_sure_as_the_largest(calibrations)
+    scaled = on_one_scale(sure)
+    looked = _looked_at(calibrations, sure, scaled.covariances)
+    names = tuple(dict.fromkeys(name for run in looked for name in run.said.names))
+    values = np.array([_into(names, run.said, run.said.values) for run in looked])
+    runs = Runs(values, np.array([run.spread(names, run.covariance) for run in looked]),
+                scaled.dof)
+    stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.sure.covariance))
+                                 for run in looked], 0.0))
+    (chi2, rank), p_value = runs.squared, runs.p_value
     return Comparison(
-        p_value >= LEVEL, p_value, chi2, rank, _outlier(runs) if p_value < LEVEL else None,
-        _each(calibrations, contexts, spread.covariances, free, _p_values(runs)),
+        p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
+        _each(looked, p_values(runs)),
         tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
-        _tilt_deg(calibrations, free), notes_of(calibrations, names, stated, spread.noisier))
+        _tilt_deg(looked), notes_of(calibrations, sure, names, stated, scaled.noisier))
+
+
+def _looked_at(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
+               covariances: Sequence[Floats]) -> list[_Run]:
+    """Give what each calibration says in the common unit and context."""
+    per_g = float(np.mean([run.units.per_g for run in calibrations]))
+    return [_Run(run, one, context, rotation_free(run, context, per_g),
+                 rotation_free(one, context, per_g).slope, covariance)
+            for run, one, context, covariance in
+            zip(calibrations, sure, contexts_of(calibrations), covariances, strict=True)]
 
 
 def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
@@ -260,78 +216,37 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
     return found
 
 
-def _covariance(names: tuple[str, ...], run: RotationFree, covariance: Floats) -> Floats:
-    slope = _into(names, run, run.slope)
-    carried: Floats = slope @ covariance @ slope.T
-    return carried
-
-
-def _p_values(runs: _Runs) -> Floats:
-    """Give the probability, for each run, of its differences to the others."""
-    if len(runs.values) == 2:
-        return np.full(2, runs.p_value)
-    chi2, rank = runs.squared
-    found = []
-    for k, least in enumerate(runs.least):
-        others, others_rank = runs.without(k).squared
-        found.append(_either(_beyond(chi2 - others, rank - others_rank, runs.dof), float(least)))
-    return np.array(found)
-
-
-def _outlier(runs: _Runs) -> int | None:
-    """Find the one run without which the others agree."""
-    if len(runs.values) == 2:
-        return None
-    left = [runs.without(k) for k in range(len(runs.values))]
-    best = int(np.argmin([others.squared[0] for others in left]))
-    return best if left[best].p_value >= LEVEL else None
-
-
 def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
     spread, typical = float(np.std(values, ddof=1)), float(np.sqrt(np.mean(stated ** 2)))
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
-def _each(calibrations: Sequence[Calibration], contexts: Sequence[Context],
-          covariances: Sequence[Floats], free: Sequence[RotationFree], p_values: Floats
-          ) -> tuple[Run, ...]:
+def _each(looked: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
     """Compare the corrected |a| of each run with that of the others, over all directions."""
-    reading = (np.mean([run.vec_v for run in free], axis=0)
-               + _DIRECTIONS @ np.mean([run.mat_s for run in free], axis=0))
-    told = [_length(*one, reading) for one in
-            zip(calibrations, contexts, covariances, free, strict=True)]
+    reading = (np.mean([run.said.vec_v for run in looked], axis=0)
+               + _DIRECTIONS @ np.mean([run.said.mat_s for run in looked], axis=0))
+    told = [run.length(reading) for run in looked]
     length, variance = (np.array(part) for part in zip(*told, strict=True))
-    weight = 1.0 / (np.mean(variance, axis=1) + _SAME_G ** 2)
+    weight = 1.0 / (np.mean(variance, axis=1) + SAME_G ** 2)
     runs = []
-    for k, p_value in enumerate(p_values):
+    for k, chance in enumerate(chances):
         others = np.delete(weight, k) / np.sum(np.delete(weight, k))
         away = length[k] - others @ np.delete(length, k, 0)
         expected = variance[k] + others ** 2 @ np.delete(variance, k, 0)
         largest = int(np.argmax(np.abs(away)))
         runs.append(Run(_rms(away) * MG, _rms(np.sqrt(expected)) * MG,
-                        float(np.abs(away[largest])) * MG, _DIRECTIONS[largest], float(p_value)))
+                        float(np.abs(away[largest])) * MG, _DIRECTIONS[largest], float(chance)))
     return tuple(runs)
-
-
-def _length(calibration: Calibration, context: Context, covariance: Floats, free: RotationFree,
-            reading: Floats) -> tuple[Floats, Floats]:
-    """Give the corrected |a| of (n, 3) readings in the common unit and its variance, (n,) each."""
-    model = calibration.model
-    here = {key: np.repeat(column, len(reading), 0) for key, column in context.items()}
-    u = sensor_force(model, reading / free.reading_scale, here)
-    rows = norm_jacobian(model, u, here)
-    variance = np.maximum(np.einsum('np,pq,nq->n', rows, covariance, rows), 0.0)
-    return np.linalg.norm(u, axis=1) * free.force_scale, variance * free.force_scale ** 2
 
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
 
 
-def _tilt_deg(calibrations: Sequence[Calibration], free: Sequence[RotationFree]) -> float | None:
+def _tilt_deg(looked: Sequence[_Run]) -> float | None:
     """Give the largest angle between what levelled runs take for up [°]."""
-    up = [run.axes[:, 2] for run, calibration in zip(free, calibrations, strict=True)
-          if not np.array_equal(calibration.model.rotation, np.eye(3))]
+    up = [run.said.axes[:, 2] for run in looked
+          if not np.array_equal(run.calibration.model.rotation, np.eye(3))]
     if len(up) < 2:
         return None
     apart = np.linalg.norm(np.array(up)[:, np.newaxis] - np.array(up), axis=2)
