@@ -53,7 +53,7 @@ added on one axis in one run. Two runs of 12 poses have six residuals to tell th
 A cross-axis gain of 0.3 mg/g is as small as what 12 poses leave it known to: `auto` takes model 10
 where the noise makes it look larger, and model 7, which says zero, elsewhere. Over 20 runs that
 choice shows; with `--model 10` it does not. Where the noise is really twice that of the samples,
-some poses look disturbed and are left out, so that the residuals of the rest still tell too little.
+some poses look disturbed and are left out, so that the residuals of the rest tell too little.
 """
 
 CHANGE_G = 1e-3
