@@ -25,7 +25,7 @@ from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.files import bag_samples, correct_bag, open_recording, read_recording
-from accel_calib.files.mcap import messages_in
+from accel_calib.files.mcap_messages import messages_in
 from accel_calib.simulate import simulate_poses, simulate_recording
 from accel_calib.sphere import rotation_from_rpy, spread_directions
 from accel_calib.units import units_of

@@ -20,6 +20,7 @@ import sys
 
 from accel_calib.cli.main import main, parser
 from accel_calib.cli.options import plain
+from accel_calib.cli.progress import progress
 from accel_calib.files import read_calibration, read_poses, write_table
 from accel_calib.simulate import parse_effect
 from accel_calib.sphere import rotation_from_rpy
@@ -298,6 +299,18 @@ def test_only_what_is_used_is_imported(arguments, without, poses):
         timeout=60, check=True)
     assert not set(without) & set(done.stderr.split())
     assert 'accel_calib.cli.main' in done.stderr
+
+
+@pytest.mark.parametrize('terminal', [True, False])
+def test_progress_is_shown_on_a_terminal_alone(terminal, monkeypatch, capsys):
+    monkeypatch.setenv('TERM', 'xterm')
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: terminal)
+    with progress('samples') as told:
+        told(500, 1000)
+    shown = capsys.readouterr()
+    assert shown.out == ''
+    assert ('500 of 1,000 samples' in shown.err) is terminal
+    assert shown.err or not terminal
 
 
 def test_json_holds_no_nan():

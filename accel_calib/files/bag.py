@@ -31,7 +31,7 @@ import sqlite3
 import struct
 from typing import TYPE_CHECKING
 
-from . import db3, mcap
+from . import db3, mcap_messages
 from .bag_index import index_of, Topics
 from .serialized import joined, Messages
 from ..errors import InputError
@@ -103,8 +103,8 @@ class Bag:
 
     def messages(self, topic: str, msgtype: str = IMU) -> Iterator[Messages]:
         """Give the messages of a topic in the order in which they were received, in blocks."""
-        sources = [(mcap if file.suffix == '.mcap' else db3).topic_messages(file, topic, msgtype)
-                   for file in self.files]
+        sources = [(db3 if file.suffix == '.db3' else mcap_messages).topic_messages(
+            file, topic, msgtype) for file in self.files]
         if sources and None not in sources:
             for source in sources:
                 yield from source or ()

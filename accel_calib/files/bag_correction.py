@@ -23,7 +23,7 @@ messages or files are compressed, go message by message through `rosbags`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 import shutil
@@ -157,7 +157,7 @@ def _rewrite(bag: Bag, partial: Path, out: Path, topic: str, change: _Correction
     names = [file.name for file in bag.files]
     targets = [partial / name for name in names]
     if bag.path.is_dir():
-        shutil.copytree(bag.path, partial, ignore=lambda *_: names)
+        _copy_others(bag.path, partial, names)
     elif out.suffix == bag.path.suffix:
         targets = [partial]
     else:
@@ -167,6 +167,15 @@ def _rewrite(bag: Bag, partial: Path, out: Path, topic: str, change: _Correction
     for file, target in zip(bag.files, targets, strict=True):
         module = db3 if file.suffix == '.db3' else mcap_rewrite
         module.rewrite(file, target, topic, IMU, change)
+
+
+def _copy_others(folder: Path, target: Path, names: Sequence[str]) -> None:
+    """Copy what is in a folder beside the files of these names."""
+    others = [item for item in folder.iterdir() if item.name not in names]
+    target.mkdir()
+    for item in others:
+        copy = shutil.copytree if item.is_dir() else shutil.copyfile
+        copy(item, target / item.name)
 
 
 def _writer(bag: Bag, out: Path) -> Writer1 | Writer2:

@@ -43,9 +43,9 @@ from .mcap import (
     FOOTER,
     HEAD,
     MAGIC,
-    messages_in,
     Record,
 )
+from .mcap_messages import messages_in
 from .serialized import Messages
 
 CHUNK_INDEX, ATTACHMENT_INDEX, METADATA_INDEX = 0x08, 0x0A, 0x0D
