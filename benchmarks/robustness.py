@@ -36,24 +36,30 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.calibrate.norm_fit import form_of, solution_at  # noqa: E402
+from accel_calib.capture import capture  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
+from accel_calib.simulate import path  # noqa: E402
 from accel_calib.sphere import random_directions  # noqa: E402
-from accel_calib.table import Floats  # noqa: E402
+from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import (  # noqa: E402
     Case,
     draw,
+    draw_sensor,
     error_mg,
     knock,
     misplaced,
     NOISE,
+    spread,
     without_noise,
 )
+from scipy.signal import lfilter  # noqa: E402
 
 G = units_of('g')
 _SHOWS_MG = 2.0
+RATE = 100.0
 Job = tuple[Any, ...]
 
 
@@ -159,6 +165,49 @@ def of_choice(job: Job) -> dict[str, float]:
             for model in ('auto', '4', '7', '10')}
 
 
+def of_wiring(job: Job) -> bool:
+    """Say whether a fault of the wiring is named, and nothing is where there is none."""
+    fault, seed = job
+    rng = np.random.default_rng([seed, len(fault)])
+    case = misplaced(rng, 12, float(rng.choice([0.0, 2.0])))
+    axes = rng.permutation(3)[:2]
+    reading = case.poses.reading.copy()
+    if fault == 'sign':
+        reading[:, axes[0]] *= -1.0
+        words = f'the {"xyz"[axes[0]]} axis has the wrong sign'
+    elif fault == 'swap':
+        reading[:, axes] = reading[:, axes[::-1]]
+        words = f'{"xyz"[min(axes)]} and {"xyz"[max(axes)]} are swapped'
+    elif fault == 'units':
+        try:
+            fit_poses(case.poses.with_columns(reading=9.80665 * reading), G)
+        except AccelCalibError as error:
+            return 'm/s2' in error.advice
+        return False
+    found = fit_poses(case.poses.with_columns(reading=reading), G)
+    told = [text for text in found.warnings if 'wrong sign' in text or 'swapped' in text]
+    return not told if fault == 'none' else bool(told) and words in told[0]
+
+
+def of_recording(job: Job) -> Floats:
+    """Say which parameters are inside their intervals, from samples that are correlated [s]."""
+    correlation, seed = job
+    rng = np.random.default_rng([seed, int(1000 * correlation)])
+    sensor = draw_sensor(rng, '10')
+    force, _ = path(spread(16, rng), RATE, 4.0, 1.0)
+    white = 3e-3 * rng.normal(size=force.shape)
+    kept = np.exp(-1.0 / (RATE * correlation)) if correlation else 0.0
+    noise = lfilter([np.sqrt(1.0 - kept ** 2)], [1.0, -kept], white, axis=0)
+    columns = {'time': np.arange(len(force)) / RATE, 'reading': sensor.reading(force) + noise}
+    poses = capture(Recording(columns, numbered(columns)), G).poses
+    try:
+        found = fit_poses(poses, G, model='10')
+    except AccelCalibError:
+        return np.zeros(0)
+    away = found.model.vector - form_of('10').free(sensor.gain, sensor.offset)
+    return (np.abs(away) <= 1.96 * np.sqrt(np.diag(found.covariance))).astype(float)
+
+
 Run = Callable[[Callable[[Job], Any], Sequence[Job]], list[Any]]
 
 
@@ -227,6 +276,28 @@ def intervals(run: Run, sets: int, seed: int) -> Iterator[Line]:
                    f'{corrected:.1f} %', '93 to 97 %', 10 * sets, met)
 
 
+def wiring(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure whether faults of the wiring are said."""
+    words = {'sign': 'one axis with the wrong sign', 'swap': 'two axes swapped',
+             'units': 'm/s² given as g', 'none': 'nothing wrong'}
+    for fault, what in words.items():
+        told = np.array(run(of_wiring, [(fault, seed + k) for k in range(sets)]))
+        yield _share(f'known orientations, {what}: said in words', told,
+                     0.99 if fault == 'none' else 1.0)
+
+
+def recordings(run: Run, sets: int, seed: int) -> Iterator[Line]:
+    """Measure intervals from recordings whose samples are correlated."""
+    for correlation in (0.0, 0.02, 0.05, 0.2):
+        held = [part for part in run(of_recording, [(correlation, seed + k)
+                                                    for k in range(2 * sets)]) if len(part)]
+        each = 100.0 * np.mean(held, axis=0)
+        yield Line(f'recording of 16 rests of 4 s, samples correlated over {correlation:g} s: 95 '
+                   '% intervals hold', f'parameters {np.min(each):.1f} to {np.max(each):.1f} %, '
+                   f'mean {np.mean(each):.1f} %', '93 to 97 %', len(held),
+                   93.0 <= float(np.mean(each)) <= 97.0)
+
+
 def choices(run: Run, sets: int, seed: int) -> Iterator[Line]:
     """Measure auto against the best fixed model."""
     for kind in ('4', '7', '10'):
@@ -246,7 +317,7 @@ def _share(what: str, good: Floats, least: float) -> Line:
 
 
 ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals': intervals,
-        'choices': choices}
+        'recordings': recordings, 'wiring': wiring, 'choices': choices}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
