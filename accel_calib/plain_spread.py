@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import chain
+from operator import add
 
 import numpy as np
 
@@ -33,8 +34,8 @@ from .plain import arrays_of, linear, others_of
 from .plain_effects import PlainContext, PlainEffect, Triple
 from .table import Floats
 
-Spread = Callable[[Triple, PlainContext], Sequence[float]]
-"""Specific force, context -> the nine numbers of a covariance."""
+Spread = Callable[[Triple, PlainContext, Sequence[float]], Sequence[float]]
+"""Specific force, context, the nine numbers of a covariance -> these with that of it added."""
 
 
 def plain_spread(calibration: Calibration, scale: float = 1.0) -> Spread:
@@ -51,7 +52,8 @@ def plain_spread(calibration: Calibration, scale: float = 1.0) -> Spread:
     Returns
     -------
     callable
-        Takes a corrected force and its context; gives nine floats, row by row.
+        Takes a corrected force, its context and a symmetric covariance, row by row; gives that and
+        what the calibration leaves uncertain.
 
     """
     others = others_of(calibration.model)
@@ -63,9 +65,9 @@ def plain_spread(calibration: Calibration, scale: float = 1.0) -> Spread:
 
 
 def _spread_through_arrays(calibration: Calibration, scale: float) -> Spread:
-    def spread(force: Triple, context: PlainContext) -> Sequence[float]:
+    def spread(force: Triple, context: PlainContext, own: Sequence[float]) -> Sequence[float]:
         found = calibration.force_covariance(np.array([force]) / scale, arrays_of(context))
-        return [float(each) for each in (found * scale**2).ravel()]
+        return [float(each) for each in (found * scale**2).ravel() + own]
 
     return spread
 
@@ -97,12 +99,26 @@ def _linear_spread(model: Model, covariance: Floats, unit: float) -> Spread:
     form[:, :, range(4), range(4)] /= 2.0
     six = [form[i, j][np.triu_indices(4)].tolist()
            for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    ((a0, a1, a2, a3, a4, a5, a6, a7, a8, a9), (b0, b1, b2, b3, b4, b5, b6, b7, b8, b9),
+     (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9), (d0, d1, d2, d3, d4, d5, d6, d7, d8, d9),
+     (e0, e1, e2, e3, e4, e5, e6, e7, e8, e9), (f0, f1, f2, f3, f4, f5, f6, f7, f8, f9)) = six
 
-    def spread(force: Triple, context: PlainContext) -> Sequence[float]:
+    def spread(force: Triple, context: PlainContext, own: Sequence[float]) -> Sequence[float]:
         x, y, z = force
-        found = [a + x * (b + e * x + f * y + g * z) + y * (c + h * y + i * z) + z * (d + j * z)
-                 for a, b, c, d, e, f, g, h, i, j in six]
-        xx, xy, xz, yy, yz, zz = found
+        xx, xy, xz, _, yy, yz, _, _, zz = own
+        # Written out: a loop over the six takes twice the time.
+        xx += a0 + x * (a1 + a4 * x + a5 * y + a6 * z) + y * (a2 + a7 * y + a8 * z) + z * (
+            a3 + a9 * z)
+        xy += b0 + x * (b1 + b4 * x + b5 * y + b6 * z) + y * (b2 + b7 * y + b8 * z) + z * (
+            b3 + b9 * z)
+        xz += c0 + x * (c1 + c4 * x + c5 * y + c6 * z) + y * (c2 + c7 * y + c8 * z) + z * (
+            c3 + c9 * z)
+        yy += d0 + x * (d1 + d4 * x + d5 * y + d6 * z) + y * (d2 + d7 * y + d8 * z) + z * (
+            d3 + d9 * z)
+        yz += e0 + x * (e1 + e4 * x + e5 * y + e6 * z) + y * (e2 + e7 * y + e8 * z) + z * (
+            e3 + e9 * z)
+        zz += f0 + x * (f1 + f4 * x + f5 * y + f6 * z) + y * (f2 + f7 * y + f8 * z) + z * (
+            f3 + f9 * z)
         return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
     return spread
@@ -128,14 +144,13 @@ def _bent_spread(model: Model, covariance: Floats, unit: float) -> Spread:
     into, turn = linear(model.rotation / unit, np.zeros(3)), model.rotation.T * unit
     mat_w = model.linear_part[0].tolist()
 
-    def spread(force: Triple, context: PlainContext) -> Sequence[float]:
+    def spread(force: Triple, context: PlainContext, own: Sequence[float]) -> Sequence[float]:
         u = into(*force, context)
         rows = zip(*(each.basis(u, context) for each in others))
         known = [1.0, *force, *chain.from_iterable(chain.from_iterable(rows))]
         moved = turn @ _inverse(_slope(mat_w, others, u, context)) @ (
             np.dot(known, table).reshape(3, -1))
-        found: list[float] = (moved @ moved.T).ravel().tolist()
-        return found
+        return [*map(add, own, (moved @ moved.T).ravel().tolist())]
 
     return spread
 

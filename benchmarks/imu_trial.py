@@ -117,7 +117,7 @@ def process(command: list[str], environment: dict[str, str]) -> Iterator[subproc
     finally:
         if command[0] == '-m':
             running.send_signal(signal.SIGTERM)
-        running.communicate(timeout=60)
+        running.communicate(timeout=20)
 
 
 def trial(command: list[str], rate: float, during: Callable[[], object], *,

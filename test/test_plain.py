@@ -33,6 +33,7 @@ from shared import sensor
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
          'std': (0.01, 0.02, 0.03), 'approach': (0.0, 0.6, -0.8)}
+OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
 SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0}
 SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
 
@@ -70,8 +71,10 @@ def check(calibration, scale):
         found = correct(*reading.tolist(), KNOWN)
         np.testing.assert_allclose(found, force[0] * scale, rtol=0, atol=1e-12)
         expected = calibration.force_covariance(force, arrays())[0] * scale ** 2
-        np.testing.assert_allclose(np.reshape(spread(found, KNOWN), (3, 3)), expected,
-                                   rtol=1e-9, atol=1e-18)
+        spreads = spread(found, KNOWN, [0.0] * 9), spread(found, KNOWN, OWN)
+        np.testing.assert_allclose(np.reshape(spreads[0], (3, 3)), expected, rtol=1e-9,
+                                   atol=1e-18)
+        np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
 
 
 @pytest.mark.parametrize('levelled', [False, True])

@@ -24,7 +24,6 @@ covariances, is turned once.
 from __future__ import annotations
 
 import math
-from operator import add
 import struct
 from typing import TYPE_CHECKING
 
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from ..plain_effects import PlainContext, Triple
     from ..table import Floats
 
+_FORCE, _MOTION, _ALL = (struct.Struct(each) for each in ('<12d', '<3d72s3d', '<3d72s12d'))
 _ABSENT = struct.pack('<d', -1.0)
 _NONE: Triple = (0.0, 0.0, 0.0)
 _NO_CONTEXT: PlainContext = {}
@@ -107,6 +107,8 @@ class Rewriter:
             If the model needs context that is not there.
 
         """
+        if self._turns:
+            return self._turned(data, temperature)
         x, y, z = THREE.unpack_from(data, self._force)
         if not math.isfinite(x + y + z):
             return None
@@ -115,11 +117,35 @@ class Rewriter:
         spread = data[self._force_spread:]
         if spread != self._seen_force:
             self._see_force(spread)
-        if self._own is not None:
-            spread = NINE.pack(*map(add, self._own, self._uncertainty(force, context)))
-        if not self._name and not self._turns:
-            return data[:self._force] + THREE.pack(*force) + spread
-        return self._front(data) + THREE.pack(*force) + spread
+        front = self._renamed(data) + data[self._begin:self._force] if self._name else (
+            data[:self._force])
+        if self._own is None:
+            return front + THREE.pack(*force) + spread
+        return front + _FORCE.pack(*force, *self._uncertainty(force, context, self._own))
+
+    def _turned(self, data: bytes, temperature: float) -> bytes | None:
+        """Give a corrected message in the levelled frame."""
+        p, q, r, spread, x, y, z = _MOTION.unpack_from(data, self._rate)
+        if not math.isfinite(x + y + z):
+            return None
+        if spread != self._seen_rate:
+            self._see_rate(spread)
+        context = self._context(data, temperature) if self._needs else _NO_CONTEXT
+        force = self._correct(x, y, z, context)
+        p, q, r = self._turn(p, q, r, context)
+        spread = data[self._force_spread:]
+        if spread != self._seen_force:
+            self._see_force(spread)
+        front = self._renamed(data) + data[self._begin:self._rate] if self._name else (
+            data[:self._rate])
+        if self._own is None:
+            return front + _MOTION.pack(p, q, r, self._turned_rate, *force) + spread
+        return front + _ALL.pack(p, q, r, self._turned_rate, *force,
+                                 *self._uncertainty(force, context, self._own))
+
+    def _renamed(self, data: bytes) -> bytes:
+        """Give the message up to the 37 doubles, renamed."""
+        return LITTLE_ENDIAN + data[4:NAME_AT] + self._name
 
     def _context(self, data: bytes, temperature: float) -> PlainContext:
         """Give what `context.context_of_message` gives, in plain floats."""
@@ -140,19 +166,11 @@ class Rewriter:
         self._seen_force = spread
         self._own = _turned(self._inverse, spread)
 
-    def _front(self, data: bytes) -> bytes:
-        """Give the message up to the acceleration, renamed and turned where that is asked for."""
-        head = LITTLE_ENDIAN + data[4:NAME_AT] + self._name if self._name else data[:self._begin]
-        if not self._turns:
-            return head + data[self._begin:self._force]
-        spread = data[self._rate_spread:self._force]
-        if spread != self._seen_rate:
-            self._seen_rate = spread
-            turned = _turned(self._rotation.T, spread)
-            self._turned_rate = spread if turned is None else NINE.pack(*turned)
-        x, y, z = THREE.unpack_from(data, self._rate)
-        rate = THREE.pack(*self._turn(x, y, z, _NO_CONTEXT))
-        return head + data[self._begin:self._rate] + rate + self._turned_rate
+    def _see_rate(self, spread: bytes) -> None:
+        """Learn how sure the messages say that the angular velocity is."""
+        self._seen_rate = spread
+        turned = _turned(self._rotation.T, spread)
+        self._turned_rate = spread if turned is None else NINE.pack(*turned)
 
 
 def _turned(matrix: Floats, spread: bytes) -> list[float] | None:

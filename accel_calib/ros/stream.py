@@ -109,32 +109,28 @@ class Stream:
 
     def on_serialized(self, data: bytes) -> None:
         """Take a serialized Imu."""
-        try:
-            self._take(data)
-        except RuntimeError:
-            if self._node.context.ok():
-                raise  # otherwise it was publishing while a signal came
-
-    def _take(self, data: bytes) -> None:
-        """Correct and publish a message, and have it wait for the watch."""
         now = monotonic()
         due = now >= self._due
         if due:
             self._count_listeners()
         layout = self._layout
-        if (data[:4] != LITTLE_ENDIAN or data[NAME_AT:layout.name_end] != layout.name
-                or len(data) != layout.size):
-            found = layout_of(data)
-            if found is None:
-                self._on_odd(data)
-                return
-            self._adopt(found)
-        if self._listeners or self._motion_listeners:
-            self._send(data)
-        self._waiting.append(data)
-        if due:
-            self._due = now + _TOGETHER
-            self.take_in()
+        try:
+            if (data[:4] != LITTLE_ENDIAN or data[NAME_AT:layout.name_end] != layout.name
+                    or len(data) != layout.size):
+                found = layout_of(data)
+                if found is None:
+                    self._on_odd(data)
+                    return
+                self._adopt(found)
+            if self._listeners or self._motion_listeners:
+                self._send(data)
+            self._waiting.append(data)
+            if due:
+                self._due = now + _TOGETHER
+                self.take_in()
+        except RuntimeError:
+            if self._node.context.ok():
+                raise  # otherwise it was publishing while a signal came
 
     def _count_listeners(self) -> None:
         """See who listens: what nobody listens to is not made."""
