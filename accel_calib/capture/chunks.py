@@ -30,13 +30,14 @@ without a jump back in its stamps; after either the period is learned anew.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from .settings import CaptureSettings
-from .sums import CHUNKS_PER_WINDOW, Indices, smallest_steps, sums_of, WIDTH
+from .sums import CHUNKS_PER_WINDOW, Indices, smallest_steps, sums_of
 from ..table import Floats
 
 _LEARN = 16          # intervals from which the period is learned
@@ -46,6 +47,7 @@ _GAP_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # stamps out of order by no more than this, or _BACK_PERIODS, are jitter
 _BACK_PERIODS = 2.0
 _INTERRUPTIONS_MAX = 10_000
+_NONE: Floats = np.empty((4, 0))
 _PENDING_MAX = 200_000  # samples of one chunk: more mean that the clock stands still
 
 
@@ -77,14 +79,14 @@ class Chunks:
 
     Parameters
     ----------
-    sums : (m, ROW) array
+    sums : (ROW, m) array
         Sums over the samples of each chunk; time relative to `epoch`, readings and rates
         relative to `origin`.
     begin, end : (m,) array
         First and last stamp [s].
-    step : (m, 2) array
+    step : (2, m) array
         Smallest step between successive readings, and rates, that is not 0; infinite where
-        there is none.
+        there is none, or none smaller than before.
     epoch : float
         Start of the segment [s].
     origin : (6,) array
@@ -109,12 +111,34 @@ class Chunks:
     fresh: bool
 
 
+def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
+    """Put chunks of one segment together."""
+    parts: list[Chunks] = []
+    for each in found:
+        if each.fresh and parts:
+            yield _one(parts)
+            parts = []
+        parts.append(each)
+    if parts:
+        yield _one(parts)
+
+
+def _one(parts: Sequence[Chunks]) -> Chunks:
+    if len(parts) == 1:
+        return parts[0]
+    return replace(parts[0], sums=np.concatenate([each.sums for each in parts], axis=1),
+                   begin=np.concatenate([each.begin for each in parts]),
+                   end=np.concatenate([each.end for each in parts]),
+                   step=np.concatenate([each.step for each in parts], axis=1))
+
+
 class Chunker:
     """Turn samples into chunks, block after block; the same chunks whatever the blocks."""
 
     def __init__(self, settings: CaptureSettings) -> None:
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
-        self._pending: Floats = np.empty((0, WIDTH))
+        self._pending: Floats = _NONE
+        self._least = [np.inf, np.inf]
         self._origin: Floats | None = None
         self._period = -1.0
         self._length = 0.0
@@ -126,9 +150,9 @@ class Chunker:
     @property
     def boundary(self) -> float:
         """Give the stamp that completes the chunk that is being filled [s]."""
-        if self._period < 0.0 or not len(self._pending):
+        if self._period < 0.0 or not self._pending.size:
             return -np.inf
-        latest = max(self._latest, float(self._pending[:, 0].max()))
+        latest = max(self._latest, float(self._pending[0].max()))
         index = np.floor((latest - self._epoch) / self._length)
         return float(self._epoch + (index + 1.0) * self._length)
 
@@ -138,26 +162,27 @@ class Chunker:
 
         Parameters
         ----------
-        samples : (n, WIDTH) array
-            Time [s], reading, rate, context.
+        samples : (k, n) array
+            Time [s] and reading, and, where k is more than 4, rate, and more than 7, context.
         last : bool
             True if no more samples follow: a period is then learned from what is there.
 
         """
-        pending = np.concatenate([self._pending, samples])
-        if self._origin is None and len(pending):
-            self._origin = np.nan_to_num(pending[0, 1:7])
+        pending = _joined(self._pending, samples)
+        if self._origin is None and pending.size:
+            first = np.nan_to_num(pending[1:7, 0])
+            self._origin = np.pad(first, (0, 6 - len(first)))
         done: list[Chunks] = []
-        while self._learned(pending, last):
-            cut = self._first_break(pending[:, 0])
-            chunks, rest = self._split(pending[:cut])
+        while self._learned(pending[0], last):
+            cut, in_order = self._first_break(pending[0])
+            chunks, rest = self._split(pending[:, :cut], in_order)
             if len(chunks.begin):
                 done.append(chunks)
                 self._fresh = False
-            if cut == len(pending):
+            if cut == pending.shape[1]:
                 pending = rest
                 break
-            pending = pending[cut:]
+            pending = pending[:, cut:]
             self._period = -1.0
             self._fresh = True
         self._pending = self._bounded(pending)
@@ -165,56 +190,84 @@ class Chunker:
 
     def restart(self) -> None:
         """Begin a new segment with the next sample."""
-        self._pending = np.empty((0, WIDTH))
+        self._pending = _NONE
         self._period = -1.0
         self._fresh = True
 
-    def _learned(self, pending: Floats, last: bool) -> bool:
+    def _learned(self, time: Floats, last: bool) -> bool:
         if self._period >= 0.0:
             return True
-        if len(pending) <= (1 if last else _LEARN):
+        if len(time) <= (1 if last else _LEARN):
             return False
-        steps = np.diff(pending[:_LEARN + 1, 0])
+        steps = np.diff(time[:_LEARN + 1])
         median = float(np.median(steps))
         self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
         self._length = max(self._shortest, _SAMPLES * self._period)
-        self._epoch = self._latest = float(pending[0, 0])
+        self._epoch = self._latest = float(time[0])
         return True
 
-    def _first_break(self, time: Floats) -> int:
+    def _first_break(self, time: Floats) -> tuple[int, bool]:
+        """Give where the first break is, and whether the stamps before it are in order."""
+        gap = max(_GAP_SECONDS, _GAP_PERIODS * self._period)
+        step: Floats = time[1:] - time[:-1]
+        first = time[0] - self._latest
+        if step.min(initial=first) >= 0.0 and step.max(initial=first) <= gap:
+            return len(time), True
         before = np.maximum.accumulate(np.concatenate([[self._latest], time]))[:-1]
         step = time - before
-        gap = max(_GAP_SECONDS, _GAP_PERIODS * self._period)
         back = max(_BACK_SECONDS, _BACK_PERIODS * self._period)
         breaks = np.flatnonzero((step > gap) | (step < -back))
         if not len(breaks):
-            return len(time)
+            return len(time), False
         cut = int(breaks[0])
         kind: Literal['gap', 'jump_back'] = 'gap' if step[cut] > 0.0 else 'jump_back'
         self.interruptions.append(Interruption(float(before[cut]), kind, float(step[cut])))
-        return cut
+        return cut, False
 
-    def _split(self, samples: Floats) -> tuple[Chunks, Floats]:
-        latest = np.maximum.accumulate(np.concatenate([[self._latest], samples[:, 0]]))[1:]
-        index = np.floor((latest - self._epoch) / self._length)
-        edges = np.flatnonzero(np.diff(index)) + 1
+    def _split(self, samples: Floats, in_order: bool) -> tuple[Chunks, Floats]:
+        latest = samples[0]
+        if not in_order:
+            latest = np.maximum.accumulate(np.concatenate([[self._latest], latest]))[1:]
+        index = latest - self._epoch
+        index /= self._length
+        np.floor(index, out=index)
+        edges = np.flatnonzero(index[1:] != index[:-1]) + 1
         whole = int(edges[-1]) if len(edges) else 0
         starts = np.concatenate([[0], edges[:-1]]) if whole else np.empty(0, dtype=np.int64)
         if whole:
             self._latest = float(latest[whole - 1])
-        return self._chunks(samples[:whole], starts.astype(np.intp)), samples[whole:]
+        return self._chunks(samples[:, :whole], starts.astype(np.intp)), samples[:, whole:]
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         assert self._origin is not None
-        ends = np.append(starts[1:], len(samples)) - 1 if len(starts) else starts
-        return Chunks(sums_of(samples, starts, self._epoch, self._origin),
-                      samples[starts, 0], samples[ends, 0], smallest_steps(samples, starts),
-                      self._epoch, self._origin, self._length, self._period, self._fresh)
+        ends = np.append(starts[1:], samples.shape[1]) - 1 if len(starts) else starts
+        return Chunks(sums_of(samples, starts, self._epoch, self._origin), samples[0, starts],
+                      samples[0, ends], self._steps(samples, starts), self._epoch,
+                      self._origin, self._length, self._period, self._fresh)
+
+    def _steps(self, samples: Floats, starts: Indices) -> Floats:
+        step = np.full((2, len(starts)), np.inf)
+        for which, rows in enumerate((slice(1, 4), slice(4, 7))):
+            if len(samples) >= rows.stop and len(starts):
+                step[which] = smallest_steps(samples[rows], starts, self._least[which])
+                self._least[which] = min(self._least[which], float(step[which].min()))
+        return step
 
     def _bounded(self, pending: Floats) -> Floats:
-        if len(pending) <= _PENDING_MAX or self._period < 0.0:
+        if pending.shape[1] <= _PENDING_MAX or self._period < 0.0:
             return pending
         self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
         self._period = -1.0
         self._fresh = True
-        return np.empty((0, WIDTH))
+        return _NONE
+
+
+def _joined(one: Floats, other: Floats) -> Floats:
+    """Give the samples of both; what only one of them has is NaN in the other."""
+    if not one.size:
+        return other
+    if len(one) != len(other):
+        rows = max(len(one), len(other))
+        one, other = (np.pad(each, ((0, rows - len(each)), (0, 0)), constant_values=np.nan)
+                      for each in (one, other))
+    return np.concatenate([one, other], axis=1)

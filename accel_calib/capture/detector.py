@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .chunks import Chunker, Interruption
+from .chunks import Chunker, Interruption, together
 from .dwell import Candidate, Dwell, judged
 from .rule import Rule
 from .settings import CaptureSettings
@@ -113,14 +114,28 @@ class StillDetector:
             As `push`.
 
         """
-        found = self._feed(samples, last=False)
+        return self.push_columns(_columns(samples))
+
+    def push_columns(self, samples: Floats) -> list[Dwell]:
+        """
+        Take many samples at once, (k, n): the columns of `push_block` as rows.
+
+        Rows that hold nothing may be left out at the end: k is 4, 7 or 9.
+
+        """
+        return self._told(self.add([samples]))
+
+    def add(self, blocks: Iterable[Floats]) -> list[Candidate]:
+        """Take many samples as `push_columns`, and leave the dwells to be asked for."""
+        found = self._feed(blocks, last=False)
         self._boundary = self._chunker.boundary
-        return self._told(found)
+        return found
 
     def close(self) -> list[Dwell]:
         """End the running dwell, for no sample follows; give it if it is one."""
         buffer, self._buffer = self._buffer, []
-        found = self._feed(np.array(buffer).reshape(-1, WIDTH), last=True) + self._leave()
+        samples = _columns(np.array(buffer).reshape(-1, WIDTH))
+        found = self._feed([samples], last=True) + self._leave()
         self._chunker.restart()
         self._boundary = -math.inf
         return self._told(found)
@@ -149,7 +164,8 @@ class StillDetector:
         is known of a sensor in native units.
 
         """
-        limit = self._rule.limit_of(self._rule.noise_of(np.nan_to_num(self._mean)))
+        mean = np.nan_to_num(self._mean)[:, np.newaxis]
+        limit = self._rule.limit_of(self._rule.noise_of(mean))
         return float(np.sqrt(np.max(limit[:3])))
 
     @property
@@ -157,9 +173,10 @@ class StillDetector:
         """Give the breaks in the stamps so far, the last thousands of them."""
         return tuple(self._chunker.interruptions)
 
-    def _feed(self, samples: Floats, last: bool) -> list[Candidate]:
+    def _feed(self, blocks: Iterable[Floats], last: bool) -> list[Candidate]:
         found: list[Candidate] = []
-        for chunks in self._chunker.feed(samples, last):
+        whole = [chunks for block in blocks for chunks in self._chunker.feed(block, last)]
+        for chunks in together(whole):
             if chunks.fresh:
                 found += self._leave()
             judged = self._rule.feed(chunks)
@@ -185,9 +202,16 @@ class StillDetector:
             return []
         known = {id(each) for each in found}
         earlier = [each for each in self._candidates[-_BESIDE:] if id(each) not in known]
-        told = judged([*earlier, *found], self._rule)[len(earlier):]
+        told = judged([*earlier, *found], self._rule, len(earlier))
         return [each for each in told if each is not None]
 
     def _keep(self, found: list[Candidate]) -> list[Candidate]:
         self._candidates += found
         return found
+
+
+def _columns(samples: Floats) -> Floats:
+    """Give (n, 9) samples as rows, without those that hold nothing."""
+    known: NDArray[np.bool_] = np.any(~np.isnan(samples), axis=0)
+    rows = WIDTH if known[7:].any() else 7 if known[4:7].any() else 4
+    return np.ascontiguousarray(samples[:, :rows].T)

@@ -46,8 +46,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .noise import Trend
+from .noise import strength_of, Trend
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
+from .sliding import Line
 from ..table import Floats
 
 DWELL_RATIO = 3.2
@@ -57,7 +58,6 @@ DWELL_RATE_RATIO = 1600.0
 """The same for the rate: what the accelerometer does not feel does no harm."""
 
 _OWN_EXCESS = 1.5   # an estimate of one dwell is that uncertain
-_NO_RATE = np.full(3, np.nan)
 _BIAS_DWELLS = 5    # that tell the bias of the gyro
 _GYRO_RATE = np.radians(0.25)
 """Mean rate beside the bias that shows turning [rad/s]."""
@@ -100,6 +100,13 @@ class Dwell:
     orientation: int
 
 
+# What `Candidate.levels` holds, of three axes each.
+LOWEST = slice(0, 6)     # lower end of the mean variance of the windows
+AVERAGE = slice(6, 12)   # mean variance of the windows
+MEAN = slice(12, 18)
+SLOPE = slice(18, 33)    # slope, residuals, neighbours, white; time_square, length, spacing
+
+
 @dataclass(frozen=True)
 class Candidate:
     """
@@ -109,12 +116,8 @@ class Candidate:
     ----------
     dwell : Dwell
         The dwell.
-    variance : (6,) array
-        Lower end of the mean variance of its windows, of reading and rate.
-    average : (6,) array
-        The mean variance itself.
-    slope : Trend
-        Slope of the reading through the dwell.
+    levels : (33,) array
+        `LOWEST`, `AVERAGE` and `MEAN` of reading and rate, and `SLOPE` of the reading.
     excess : float
         Variance of the mean over that of independent samples, estimated from this dwell.
     beside_slope : bool
@@ -123,63 +126,86 @@ class Candidate:
     """
 
     dwell: Dwell
-    variance: Floats
-    average: Floats
-    slope: Trend
+    levels: Floats
     excess: float
     beside_slope: bool
 
-    def quiet(self, rule: Rule) -> bool:
-        """Tell whether it is still by the noise that is known now."""
-        rate = self.dwell.context.get('rate', np.zeros(3))
-        noise = rule.noise_of(np.concatenate([self.dwell.mean, np.atleast_1d(rate)]))
-        limit = rule.limit_of(noise, DWELL_RATIO, DWELL_RATE_RATIO)
-        strength = WEAK_STRENGTH if self.beside_slope else STRENGTH
-        moved = rule.moved(self.slope, np.asarray(rule.scale), self.average[:3], strength,
-                           DWELL_SLOPE_G)
-        return not bool(moved) and not bool(np.any(self.variance > limit))
 
-
-def judged(candidates: Sequence[Candidate], rule: Rule) -> list[Dwell | None]:
-    """Give each dwell if it is still by what is known now, its count by all of them."""
-    quiet = [each.quiet(rule) for each in candidates]
-    excess = [each.excess for each, good in zip(candidates, quiet) if good]
-    common = float(np.median(excess)) if excess else 1.0
-    told = _by_gyro(candidates, np.array(quiet, dtype=bool), rule)
-    found: list[Dwell | None] = []
-    for each, good, turned in zip(candidates, quiet, told):
-        own = max(1.0, common, each.excess / _OWN_EXCESS)
-        rests = not turned if turned is not None else rule.rests(each.slope, own)
-        found.append(_counted(each, own, rule) if good and rests else None)
-    return found
-
-
-def _by_gyro(candidates: Sequence[Candidate], quiet: NDArray[np.bool_], rule: Rule
-             ) -> list[bool | None]:
+def judged(candidates: Sequence[Candidate], rule: Rule, first: int = 0) -> list[Dwell | None]:
     """
-    Tell by the gyro which dwells were turned; None where it cannot tell.
+    Give each dwell from the first on if it is still by what is known now.
+
+    Its count, and the bias of the gyro, go by all of them.
+
+    """
+    if not candidates:
+        return []
+    levels = np.array([each.levels for each in candidates]).T
+    slopes = _slopes(levels[SLOPE])
+    beside = np.array([each.beside_slope for each in candidates])
+    own = np.array([each.excess for each in candidates])
+    quiet = _quiet(levels, slopes, beside, rule)
+    common = float(np.median(own[quiet])) if quiet.any() else 1.0
+    excess = np.maximum(max(1.0, common), own / _OWN_EXCESS)
+    turned, sure = _by_gyro(levels, quiet, rule)
+    good = quiet & ~turned & (sure | rule.rests(slopes, excess))
+    std, count = _counts(candidates[first:], levels[MEAN][:3, first:], excess[first:], rule)
+    return [replace(each.dwell, std=std[:, k].copy(), count=float(count[k])) if good[first + k]
+            else None for k, each in enumerate(candidates[first:])]
+
+
+def _slopes(parts: Floats) -> Trend:
+    slope, square, neighbours, white = parts[:12].reshape(4, 3, -1)
+    return strength_of(Line(slope, square, neighbours, parts[12], parts[13]), parts[14], white,
+                       slice(0, 3))
+
+
+def _quiet(levels: Floats, slopes: Trend, beside: NDArray[np.bool_], rule: Rule
+           ) -> NDArray[np.bool_]:
+    """Tell which are still by the noise that is known now, and did not move steadily."""
+    limit = rule.limit_of(rule.noise_of(levels[MEAN]), DWELL_RATIO, DWELL_RATE_RATIO)
+    strength = np.where(beside, WEAK_STRENGTH, STRENGTH)
+    moved = rule.moved(slopes, np.asarray(rule.scale), levels[AVERAGE][:3], strength,
+                       DWELL_SLOPE_G)
+    return np.asarray(~moved & ~np.any(levels[LOWEST] > limit, axis=0))
+
+
+def _by_gyro(levels: Floats, quiet: NDArray[np.bool_], rule: Rule
+             ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Tell by the gyro which dwells were turned, and which surely were not.
 
     Its bias is the median over the dwells, and a rate about the vertical turns no pose.
 
+    Parameters
+    ----------
+    levels : (33, k) array
+        As those of a candidate.
+    quiet : (k,) array of bool
+        Dwells to learn from.
+    rule : Rule
+        Tells whether the rates are in rad/s.
+
     """
-    rates = np.array([each.dwell.context.get('rate', _NO_RATE) for each in candidates])
-    rates = rates.reshape(-1, 3)
-    known = quiet & np.isfinite(rates).all(axis=1)
+    up, rates = levels[MEAN][:3], levels[MEAN][3:]
+    known = quiet & np.isfinite(rates).all(axis=0)
     if not rule.si_rates or known.sum() < _BIAS_DWELLS:
-        return [None] * len(candidates)
-    off = rates - np.median(rates[known], axis=0)
-    spread = _MAD * float(np.max(np.median(np.abs(off[known]), axis=0)))
-    up = np.array([each.dwell.mean / np.linalg.norm(each.dwell.mean) for each in candidates])
-    tilting = np.linalg.norm(np.cross(off, up), axis=1)
-    alive = np.array([bool(np.all(each.average[3:] > 0.0)) for each in candidates])
+        return np.zeros_like(quiet), np.zeros_like(quiet)
+    off = rates - np.median(rates[:, known], axis=1, keepdims=True)
+    spread = _MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
+    tilting = (np.linalg.norm(np.cross(off, up, axis=0), axis=0)
+               / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
+    alive = np.all(levels[AVERAGE][3:] > 0.0, axis=0)
     sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
-    turned = known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread))
-    return [True if bad else False if good else None for bad, good in zip(turned, sure)]
+    return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
-def _counted(candidate: Candidate, excess: float, rule: Rule) -> Dwell:
-    dwell = candidate.dwell
-    resolution, rounding = rule.rounding(dwell.mean, dwell.std)
-    std = np.maximum(dwell.std, resolution)
-    variance = std**2 * excess / dwell.samples + rounding
-    return replace(dwell, std=std, count=float(np.sum(std**2) / np.sum(variance)))
+def _counts(candidates: Sequence[Candidate], mean: Floats, excess: Floats, rule: Rule
+            ) -> tuple[Floats, Floats]:
+    """Give (3, k) standard deviations and (k,) independent samples, rounding included."""
+    std = np.array([each.dwell.std for each in candidates]).T
+    samples = np.array([each.dwell.samples for each in candidates])
+    resolution, left = rule.rounding(mean, std)
+    std = np.maximum(std, resolution)
+    variance = std**2 * excess / samples + left
+    return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))

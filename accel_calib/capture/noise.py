@@ -42,6 +42,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .sliding import Line
 from ..table import Floats
 
 _CORRELATION_MAX = 0.9
@@ -54,7 +55,7 @@ class Trend(NamedTuple):
 
     Parameters
     ----------
-    slope : (..., 3) array
+    slope : (3, ...) array
         Unit of the cells per second.
     strength : (...) array
         Sum over the axes of (slope / its standard error)².
@@ -71,35 +72,38 @@ class Trend(NamedTuple):
     error: Floats
 
 
-def trend(cells: Floats, spacing: float, white: Floats) -> Trend:
+def strength_of(line: Line, spacing: float | Floats, white: Floats, axes: slice) -> Trend:
     """
-    Give the slope of these cells.
+    Give slopes with how they stand to their noise.
 
     Parameters
     ----------
-    cells : (..., 3, K) array
-        Means of K consecutive cells.
-    spacing : float
+    line : Line
+        Lines through cells, (3 or more, n).
+    spacing : float or (n,) array
         Time from cell to cell [s].
-    white : (..., 3) array
+    white : (3 or more, n) array
         Variance of a cell mean, were the samples independent.
+    axes : slice
+        The three axes to take together.
 
     """
-    size = cells.shape[-1]
-    time = (np.arange(size) - 0.5 * (size - 1)) * spacing
-    time_square = float(np.sum(time**2))
-    centred = cells - cells.mean(axis=-1, keepdims=True)
-    slope = np.asarray(np.sum(centred * time, axis=-1) / time_square)
-    left = centred - slope[..., np.newaxis] * time
-    left /= np.sqrt(white + _TINY)[..., np.newaxis]
-    square = np.sum(left**2, axis=(-2, -1))
-    neighbours = np.sum(left[..., 1:] * left[..., :-1], axis=(-2, -1))
+    size = line.length
+    white = white[axes] + _TINY
+    slope, weight = line.slope[axes] / spacing, 1.0 / white
+    square = _over_axes(line.square[axes] * weight)
+    neighbours = _over_axes(line.neighbours[axes] * weight)
     correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
     power = np.maximum(square / (3.0 * (size - 2)), 1.0)
-    excess = np.asarray(power * (1.0 + correlation) / (1.0 - correlation))
-    strength = np.sum(slope**2 / (white + _TINY), axis=-1) * time_square / excess
-    error = np.sqrt(np.max(white, axis=-1) / time_square)
-    return Trend(slope, np.asarray(strength), excess, np.asarray(error))
+    excess = power * (1.0 + correlation) / (1.0 - correlation)
+    time_square = line.time_square * spacing**2
+    strength = _over_axes(slope * slope * weight) * time_square / excess
+    error = np.sqrt(np.maximum(np.maximum(white[0], white[1]), white[2]) / time_square)
+    return Trend(slope, strength, excess, error)
+
+
+def _over_axes(values: Floats) -> Floats:
+    return np.asarray(values[0] + values[1] + values[2])
 
 
 def excess_of_mean(cells: Floats, white: Floats) -> float:
@@ -125,8 +129,8 @@ def excess_of_mean(cells: Floats, white: Floats) -> float:
 
 def _autocovariance(centred: Floats, lags: int) -> Floats:
     size = centred.shape[1]
-    return np.array([np.mean(centred[:, lag:] * centred[:, :size - lag])
-                     for lag in range(lags)])
+    total = sum(np.correlate(row, row, 'full')[size - 1:size - 1 + lags] for row in centred)
+    return np.asarray(total / (len(centred) * (size - np.arange(lags))))
 
 
 def _long_run(covariance: Floats, size: int) -> float:

@@ -34,6 +34,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .chunks import Interruption
 from .detector import StillDetector
@@ -44,7 +45,8 @@ from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import Units
 
-_BLOCK = 1 << 16   # samples
+_BLOCK = 1 << 14     # samples summed at a time: few enough to stay in the cache
+_AT_ONCE = 1 << 17   # samples judged at a time
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     spans: list[tuple[float, float]] = []
     recorded = 0
     for part in [recording] if isinstance(recording, Recording) else recording:
-        for start in range(0, len(part), _BLOCK):
-            samples = _block(part, start, start + _BLOCK)
-            detector.push_block(samples)
-            spans.append((float(samples[0, 0]), float(samples[-1, 0])))
-            recorded += len(samples)
+        for start in range(0, len(part), _AT_ONCE):
+            stop = min(start + _AT_ONCE, len(part))
+            detector.add(_block(part, first, min(first + _BLOCK, stop))
+                         for first in range(start, stop, _BLOCK))
+        if len(part):
+            spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
+            recorded += len(part)
     detector.close()
     dwells = select(detector.dwells(), settings, units)
     interruptions = detector.interruptions
@@ -122,23 +126,36 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
 
 
 def _block(recording: Recording, start: int, stop: int) -> Floats:
+    """Give the columns of some samples: as many rows of WIDTH as there is something in."""
     which = slice(start, stop)
-    samples = np.full((len(recording.row[which]), WIDTH), np.nan)
-    samples[:, 0] = recording['time'][which]
-    samples[:, 1:4] = recording.reading[which]
-    given = 4
+    time = recording['time'][which]
+    samples = np.empty((_width(recording), len(time)))
+    samples[0] = time
+    samples[1:4] = recording.reading[which].T
+    given = samples[:4]
     if 'rate' in recording:
-        samples[:, 4:7] = recording['rate'][which]
-        given = 7
-    for column, name in enumerate(CONTEXT, start=7):
+        given = samples[:7]
+        given[4:] = recording['rate'][which].T
+    samples[len(given):] = np.nan
+    for row, name in enumerate(CONTEXT, start=7):
         if name in recording:
-            samples[:, column] = recording[name][which]
-    bad = np.flatnonzero(~np.isfinite(samples[:, :given]).all(axis=1))
-    if len(bad):
-        row = recording.row[start + bad[0]]
-        message = f'row {row} holds a time, reading or rate that is not a finite number'
-        raise InputError(message, 'remove that row, or repair the recording')
+            samples[row] = recording[name][which]
+    if not np.isfinite(given.sum()):
+        _refuse(given, recording.row[which])
     return samples
+
+
+def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
+    bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
+    if len(bad):
+        message = f'row {row[bad[0]]} holds a time, reading or rate that is not a finite number'
+        raise InputError(message, 'remove that row, or repair the recording')
+
+
+def _width(recording: Recording) -> int:
+    if any(name in recording for name in CONTEXT):
+        return WIDTH
+    return 7 if 'rate' in recording else 4
 
 
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:

@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 from .chunks import Chunks
 from .noise import Trend
 from .settings import CaptureSettings
-from .sums import ROW
+from .sums import FIRST, ROW
 from .window import at_least, clipped, granted, rounding, Stretch, stretch, windows
 from ..table import Floats
 from ..units import Units
@@ -105,9 +105,9 @@ class Judged(NamedTuple):
     ----------
     chunks : Chunks
         The chunks.
-    level : (m, 6) array
+    level : (6, m) array
         Variance within the window, of reading and rate; NaN where not known.
-    limit : (m, 6) array
+    limit : (6, m) array
         What the variance had to be below.
     still : (m,) array of bool
         The rule.
@@ -132,7 +132,8 @@ class Rule:
         self._per_g = units.per_g
         self._lowest = np.full(3, np.inf)
         self._highest = np.full(3, -np.inf)
-        self._before = np.full((HORIZON - 1, ROW), np.nan)
+        self._axes = 3
+        self._before = np.full((ROW, HORIZON - 1), np.nan)
         self._floor = np.full(6, np.inf)
         self._step = np.full(2, np.inf)
 
@@ -150,12 +151,13 @@ class Rule:
 
     def noise_of(self, mean: Floats) -> Floats:
         """
-        Give the variance of the sensor's own noise, as known now, for a mean reading and rate.
+        Give the variance of the sensor's own noise, as known now, for (6, n) means.
 
         Infinite before anything is known.
 
         """
-        noise = at_least(self._floor, self._step, mean)
+        axes = len(mean)
+        noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
         return granted(noise, np.asarray(self.scale))
 
     def rounding(self, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
@@ -164,50 +166,54 @@ class Rule:
 
         Returns
         -------
-        std : (3,) array
+        std : (n,) array
             Standard deviation of the rounding of a sample; more than 0 in any case.
-        variance : (3,) array
+        variance : (3, n) array
             Of the error of the mean that averaging does not remove.
 
         """
-        return rounding(float(self._step[0]), self._floor, mean, std)
+        return rounding(float(self._step[0]), self._floor[:3, np.newaxis], mean, std)
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
-        """Give the (..., 6) largest variances of a still window at this noise."""
-        limit = noise * np.repeat([ratio, rate_ratio], 3)
+        """Give the (3 or 6, n) largest variances of a still window at this noise."""
+        limit = noise * ratio
+        limit[3:] = noise[3:] * rate_ratio
         if self._known:
-            most = np.minimum(noise[..., :3] + (SHAKING_G * self._per_g)**2,
+            most = np.minimum(noise[:3] + (SHAKING_G * self._per_g)**2,
                               (STD_CAP_G * self._per_g)**2)
-            limit[..., :3] = np.minimum(limit[..., :3], most)
+            np.minimum(limit[:3], most, out=limit[:3])
         if self._settings.still_std_max > 0.0:
-            limit[..., :3] = (self._settings.still_std_max * self._per_g)**2
+            limit[:3] = (self._settings.still_std_max * self._per_g)**2
         return np.asarray(limit)
 
     def feed(self, chunks: Chunks) -> Judged:
         """Judge consecutive chunks."""
         if chunks.fresh:
-            self._before = np.full((HORIZON - 1, ROW), np.nan)
-        rows = np.concatenate([self._before, chunks.sums])
-        self._before = rows[len(rows) - HORIZON + 1:]
-        mean, level = windows(rows, chunks.origin)
-        size = len(chunks.sums)
-        mean, recent = mean[-size:], level[-size:]
+            self._before = np.full((ROW, HORIZON - 1), np.nan)
+        rows = np.concatenate([self._before, chunks.sums], axis=1)
+        self._before = rows[:, rows.shape[1] - HORIZON + 1:].copy()
+        if self._axes == 3 and np.isfinite(rows[FIRST.start + 3]).any():
+            self._axes = 6
+        size = chunks.sums.shape[1]
+        mean, level = windows(rows, self._axes)
+        mean = mean[:, -size:] + chunks.origin[:self._axes, np.newaxis]
+        recent = level[:, -size:]
         seen = {length: stretch(rows, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
         noise = self._learn(seen[LONG], mean, chunks.step)
-        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=1))
+        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0))
         limit = self.limit_of(granted(noise, scale))
         trending = np.zeros(size, dtype=np.intp)
         for length, each in seen.items():
-            reading = Trend(*(part[:, 0] for part in each.trend))
-            calm = np.all(each.highest[:, :3] <= limit[:, :3], axis=1)
-            trending[calm & self.moved(reading, scale, each.variance[:, :3])] = length
+            calm = np.all(each.highest <= limit[:3], axis=0)
+            trending[calm & self.moved(each.trend, scale, each.variance[:3])] = length
         still = self._quiet(mean, recent, limit) & (trending == 0)
-        return Judged(chunks, recent, limit, still, trending)
+        return Judged(chunks, _six(recent, np.nan), _six(limit, np.inf), still, trending)
 
-    def moved(self, found: Trend, scale: Floats, variance: Floats, strength: float = STRENGTH,
-              drift_g: float = SLOPE_G) -> NDArray[np.bool_]:
+    def moved(self, found: Trend, scale: Floats, variance: Floats,
+              strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
+              ) -> NDArray[np.bool_]:
         """
         Tell whether a slope stands out of its noise and is more than a drift.
 
@@ -217,9 +223,9 @@ class Rule:
             The slope.
         scale : (...) array
             Reading of 1 g.
-        variance : (..., 3) array
+        variance : (3, ...) array
             Of the samples.
-        strength : float
+        strength : float or array
             What stands out.
         drift_g : float
             What passes as a drift [g/s].
@@ -227,40 +233,50 @@ class Rule:
         """
         drift = drift_g * scale
         if not self._known:
-            drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=-1)))
-        large = np.sqrt(np.sum(found.slope**2, axis=-1)) > drift
+            drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=0)))
+        large = np.sum(found.slope**2, axis=0) > drift**2
         return np.asarray(large & (found.strength > strength))
 
-    def rests(self, found: Trend, excess: float) -> bool:
-        """Tell whether a dwell shows that it was not turned slowly: see `TURN_G`."""
-        size = float(np.linalg.norm(found.slope) + SURE * found.error * np.sqrt(excess))
-        return self.scale == 0.0 or size < TURN_G * self.scale
+    def rests(self, found: Trend, excess: Floats) -> NDArray[np.bool_]:
+        """Tell whether dwells show that they were not turned slowly: see `TURN_G`."""
+        size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
+        return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
 
     def _quiet(self, mean: Floats, level: Floats, limit: Floats) -> NDArray[np.bool_]:
-        quiet = (np.all(level[:, :3] <= limit[:, :3], axis=1)
-                 & ~np.any(level[:, 3:] > limit[:, 3:], axis=1))
+        quiet = np.all(level[:3] <= limit[:3], axis=0)
+        if len(level) > 3:
+            quiet &= ~np.any(level[3:] > limit[3:], axis=0)
         if self._known:
-            norm = np.linalg.norm(mean[:, :3], axis=1) / self._per_g
+            norm = np.sqrt(np.sum(mean[:3]**2, axis=0)) / self._per_g
             quiet &= np.abs(norm - 1.0) <= self._settings.still_norm_tolerance
-        if self._settings.still_gyro_max > 0.0:
-            quiet &= ~(np.linalg.norm(mean[:, 3:], axis=1) > self._settings.still_gyro_max)
+        if self._settings.still_gyro_max > 0.0 and len(mean) > 3:
+            quiet &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
         return np.asarray(quiet)
 
     def _scales(self, mean: Floats, quiet: NDArray[np.bool_]) -> Floats:
         if self._known:
-            return np.full(len(mean), self._per_g)
-        at_rest = np.where(quiet[:, np.newaxis], mean[:, :3], np.nan)
-        low = np.fmin.accumulate(np.concatenate([self._lowest[np.newaxis], at_rest]))[1:]
-        high = np.fmax.accumulate(np.concatenate([self._highest[np.newaxis], at_rest]))[1:]
-        if len(mean):
-            self._lowest, self._highest = low[-1], high[-1]
-        return np.asarray(np.maximum(0.5 * np.max(high - low, axis=1), 0.0))
+            return np.asarray(self._per_g)
+        at_rest = np.where(quiet, mean[:3], np.nan)
+        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+        if mean.shape[1]:
+            self._lowest, self._highest = low[:, -1], high[:, -1]
+        return np.asarray(np.maximum(0.5 * np.max(high - low, axis=0), 0.0))
 
     def _learn(self, seen: Stretch, mean: Floats, step: Floats) -> Floats:
-        dof = np.maximum(2.0 * seen.samples[:, np.newaxis] / (1.0 + seen.trend.excess), 1.0)
-        average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=1)
-        steps = np.minimum.accumulate(np.concatenate([self._step[np.newaxis], step]))[1:]
-        average[clipped(average, steps, mean)] = np.nan
-        floor = np.fmin.accumulate(np.concatenate([self._floor[np.newaxis], average]))[1:]
-        self._floor, self._step = floor[-1], steps[-1]
+        axes = len(mean)
+        dof = np.maximum(2.0 * seen.samples / (1.0 + seen.excess), 1.0)
+        average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=0)
+        steps = np.minimum.accumulate(np.column_stack([self._step, step]), axis=1)[:, 1:]
+        average[:3][clipped(average, steps, mean)] = np.nan
+        average[:, 0] = np.fmin(average[:, 0], self._floor[:axes])
+        floor = np.fmin.accumulate(average, axis=1)
+        self._floor[:axes], self._step = floor[:, -1], steps[:, -1]
         return at_least(floor, steps, mean)
+
+
+def _six(values: Floats, rest: float) -> Floats:
+    """Give (6, m) values; those of a rate that is not given are `rest`."""
+    if len(values) == 6:
+        return values
+    return np.concatenate([values, np.full_like(values, rest)])

@@ -22,11 +22,14 @@ a dwell of days takes no more memory than one of a minute.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .chunks import Chunks
 from .dwell import Candidate, Dwell
-from .noise import excess_of_mean, Trend, trend
+from .noise import excess_of_mean
+from .sliding import line
 from .sums import CONTEXT, CONTEXT_COUNT, CONTEXT_SUM, COUNT, FIRST, ROW, SECOND, TIME
 from ..table import Floats
 
@@ -60,42 +63,45 @@ class Run:
         self._epoch = chunks.epoch
         self._origin = chunks.origin
         self._length = chunks.length
-        self._cells: Floats = np.empty((0, DWELL_ROW))
-        self._partial: Floats = np.empty((0, DWELL_ROW))
+        self._cells: Floats = np.empty((DWELL_ROW, 0))
+        self._partial: Floats = np.empty((DWELL_ROW, 0))
         self._size = 1
         self._begin = self._end = 0.0
         self.chunks = 0
         self.orientation = orientation
 
     def add(self, rows: Floats, begin: Floats, end: Floats) -> None:
-        """Add consecutive chunks: rows of sums, first and last stamps."""
-        if not len(rows):
+        """Add consecutive chunks: (DWELL_ROW, m) sums, first and last stamps."""
+        count = rows.shape[1]
+        if not count:
             return
         self._begin = self._begin if self.chunks else float(begin[0])
         self._end = float(end[-1])
-        self.chunks += len(rows)
-        while len(rows):
-            room = (2 * CELLS - len(self._cells)) * self._size - len(self._partial)
-            self._append(rows[:room])
-            rows = rows[room:]
+        self.chunks += count
+        while rows.shape[1]:
+            room = ((2 * CELLS - self._cells.shape[1]) * self._size - self._partial.shape[1])
+            self._append(rows[:, :room])
+            rows = rows[:, room:]
 
     def _append(self, rows: Floats) -> None:
-        rows = np.concatenate([self._partial, rows])
-        whole = len(rows) // self._size * self._size
-        cells = rows[:whole].reshape(-1, self._size, DWELL_ROW).sum(axis=1)
-        self._cells = np.concatenate([self._cells, cells])
-        self._partial = rows[whole:]
-        if len(self._cells) == 2 * CELLS:
-            self._cells = self._cells[0::2] + self._cells[1::2]
+        if self._size > 1:
+            rows = np.concatenate([self._partial, rows], axis=1)
+            whole = rows.shape[1] // self._size * self._size
+            self._partial = rows[:, whole:]
+            rows = rows[:, :whole].reshape(DWELL_ROW, -1, self._size).sum(axis=2)
+        cells = rows if not self._cells.size else np.concatenate([self._cells, rows], axis=1)
+        self._cells = cells
+        if cells.shape[1] == 2 * CELLS:
+            self._cells = cells[:, 0::2] + cells[:, 1::2]
             self._size *= 2
 
     def _total(self) -> Floats:
-        return np.asarray(self._cells.sum(axis=0) + self._partial.sum(axis=0))
+        return np.asarray(self._cells.sum(axis=1) + self._partial.sum(axis=1))
 
     def continued_by(self, rows: Floats, scale: float) -> bool:
         """Tell whether these chunks have the same mean reading as the dwell so far."""
         old = self._total()
-        new = rows.sum(axis=0)
+        new = rows.sum(axis=1)
         level = np.maximum(old[LEVEL] / max(old[WINDOWS], 1.0), new[LEVEL] / new[WINDOWS])
         apart = np.abs(old[FIRST] / old[COUNT] - new[FIRST] / new[COUNT])[:3]
         return bool(np.all(apart <= np.sqrt(level[:3]) + _AGREE_G * scale))
@@ -113,23 +119,26 @@ class Run:
         dwell = Dwell(self._begin, self._end, self._epoch + float(total[TIME] / count),
                       mean[:3], np.sqrt(variance), count / max(excess, 1.0), int(count),
                       _context(total, mean[3:]), self.orientation)
-        spread = np.sqrt((1.0 + max(excess, 1.0)) / count)
-        return Candidate(dwell, level * np.exp(-2.0 * spread), level, slope, excess,
-                         beside_slope)
+        spread = math.sqrt((1.0 + max(excess, 1.0)) / count)
+        levels = np.concatenate([level * math.exp(-2.0 * spread), level, mean, slope])
+        return Candidate(dwell, levels, excess, beside_slope)
 
-    def _noise(self, variance: Floats, level: Floats) -> tuple[float, Trend]:
-        cells = (self._cells[:, FIRST] / self._cells[:, COUNT, np.newaxis])[:, :3].T
-        per_cell = float(np.mean(self._cells[:, COUNT]))
+    def _noise(self, variance: Floats, level: Floats) -> tuple[float, Floats]:
+        """Give the excess of the noise of the mean, and the slope as `dwell.SLOPE` has it."""
+        cells = self._cells[FIRST.start:FIRST.start + 3] / self._cells[COUNT]
+        per_cell = float(self._cells[COUNT].sum()) / cells.shape[1]
+        found = line(cells)
+        spacing = self._size * self._length
         return (excess_of_mean(cells, variance / per_cell),
-                trend(cells, self._size * self._length, level / per_cell))
+                np.concatenate([found.slope, found.square, found.neighbours, level / per_cell,
+                                [found.time_square, cells.shape[1], spacing]]))
 
 
 def _context(total: Floats, rate: Floats) -> dict[str, float | Floats]:
     context: dict[str, float | Floats] = {}
-    counts, sums = total[CONTEXT_COUNT], total[CONTEXT_SUM]
-    for name, count, value in zip(CONTEXT, counts, sums):
+    for name, count, value in zip(CONTEXT, total[CONTEXT_COUNT], total[CONTEXT_SUM]):
         if count > 0.0:
             context[name] = float(value / count)
-    if np.all(np.isfinite(rate)):
+    if math.isfinite(rate.sum()):
         context['rate'] = rate
     return context

@@ -42,27 +42,50 @@ ROW = 18
 
 
 def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Floats:
-    """Give the (m, ROW) sums over the samples from each start to the next."""
-    sums = np.empty((len(starts), ROW))
+    """
+    Give the (ROW, m) sums over the samples from each start to the next.
+
+    Parameters
+    ----------
+    samples : (k, n) array
+        Time and reading (k = 4), and rate (7), and context (WIDTH).
+    starts : (m,) array of int
+        First samples of the chunks.
+    epoch, origin : float, (6,) array
+        What time, and reading and rate, are relative to.
+
+    """
+    sums = np.full((ROW, len(starts)), np.nan)
+    sums[CONTEXT_COUNT] = sums[CONTEXT_SUM] = 0.0
     if not len(starts):
         return sums
-    centred = samples[:, :7] - np.concatenate([[epoch], origin])
-    context = samples[:, 7:]
-    known = np.isfinite(context)
-    sums[:, COUNT] = np.diff(np.append(starts, len(samples)))
-    sums[:, TIME:FIRST.stop] = np.add.reduceat(centred, starts, axis=0)
-    sums[:, SECOND] = np.add.reduceat(np.square(centred[:, 1:]), starts, axis=0)
-    sums[:, CONTEXT_COUNT] = np.add.reduceat(known.astype(float), starts, axis=0)
-    sums[:, CONTEXT_SUM] = np.add.reduceat(np.where(known, context, 0.0), starts, axis=0)
+    sums[COUNT] = np.diff(starts, append=samples.shape[1])
+    sums[TIME] = np.add.reduceat(samples[0] - epoch, starts)
+    values = min(len(samples), 7) - 1
+    centred = samples[1:1 + values] - origin[:values, np.newaxis]
+    sums[FIRST.start:FIRST.start + values] = np.add.reduceat(centred, starts, axis=1)
+    np.multiply(centred, centred, out=centred)
+    sums[SECOND.start:SECOND.start + values] = np.add.reduceat(centred, starts, axis=1)
+    if len(samples) == WIDTH:
+        known = np.isfinite(samples[7:])
+        sums[CONTEXT_COUNT] = np.add.reduceat(known.astype(float), starts, axis=1)
+        sums[CONTEXT_SUM] = np.add.reduceat(np.where(known, samples[7:], 0.0), starts, axis=1)
     return sums
 
 
-def smallest_steps(samples: Floats, starts: Indices) -> Floats:
-    """Give the (m, 2) smallest steps of reading and rate that are not 0, else infinity."""
-    if not len(starts):
-        return np.empty((0, 2))
-    step = np.full((len(samples), 6), np.inf)
-    np.abs(np.diff(samples[:, 1:7], axis=0), out=step[1:])
-    step[starts] = np.inf
+def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
+    """
+    Give the (m,) smallest steps within chunks that are not 0, where they are below `least`.
+
+    Infinity elsewhere: only a new smallest one matters, and it shows at a glance.
+
+    """
+    step = np.abs(values[:, 1:] - values[:, :-1])
+    if np.count_nonzero(step < least) == np.count_nonzero(step == 0.0):
+        return np.full(len(starts), np.inf)
     step[~(step > 0.0)] = np.inf
-    return np.asarray(np.minimum.reduceat(step.reshape(-1, 2, 3).min(axis=2), starts))
+    lowest = np.full(values.shape[1], np.inf)
+    lowest[1:] = step.min(axis=0)
+    lowest[starts] = np.inf
+    found = np.minimum.reduceat(lowest, starts)
+    return np.asarray(np.where(found < least, found, np.inf))

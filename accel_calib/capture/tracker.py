@@ -52,6 +52,14 @@ KNOCK = CHUNKS_PER_WINDOW + 3
 _LEAD = CHUNKS_PER_WINDOW - 2   # chunks before the first still window that belong to the dwell
 
 
+# Rows of a table of judged chunks, after those of a dwell.
+_BEGIN = DWELL_ROW
+_END = _BEGIN + 1
+_LIMIT = slice(_END + 1, _END + 7)
+_STILL = _LIMIT.stop
+_TRENDING = _STILL + 1
+
+
 class Tracker:
     """Join still chunks to dwells, for one segment."""
 
@@ -85,7 +93,7 @@ class Tracker:
 
     def current(self) -> Candidate | None:
         """Give the running dwell as it would be if it ended now."""
-        if not len(self._waiting.still) or not self._waiting.still[-1]:
+        if not len(self._waiting) or not self._waiting.still[-1]:
             return None
         twin = copy.copy(self)
         twin._run = copy.copy(self._run)
@@ -102,14 +110,14 @@ class Tracker:
             if stop > start:
                 part = rows.part(start, stop)
                 done += self._extend(part) if verdict[start] else self._skip(part)
-        self._waiting = rows.part(len(verdict), len(rows.still))
+        self._waiting = rows.part(len(verdict), len(rows))
         return done
 
     def _skip(self, rows: _Rows) -> list[Candidate]:
-        self._pause += len(rows.still)
+        self._pause += len(rows)
         self._lead = self._lead.then(rows).tail(_LEAD)
         self._held = _Rows.none()
-        sloping = bool(np.any(rows.trending))
+        sloping = rows.sloping
         self._beside_slope |= sloping
         done = self._end() if self._pause > KNOCK or sloping else []
         self._beside_slope = sloping or (self._beside_slope and self._run is not None)
@@ -122,12 +130,12 @@ class Tracker:
             if self._run is None or not self._goes_on(first):
                 done = self._end()
                 self._run = Run(self._chunks, self.number)
-            rows = first.then(rows.part(1, len(rows.still)))
+            rows = first.then(rows.part(1, len(rows)))
             self._pause = 0
         rows = self._held.then(rows)
         self._lead = _Rows.none()
         self._held = rows.tail(1)
-        return done + self._add(rows.part(0, len(rows.still) - 1))
+        return done + self._add(rows.part(0, len(rows) - 1))
 
     def _goes_on(self, first: _Rows) -> bool:
         return (self._run is not None and self._run.chunks > 0
@@ -136,14 +144,18 @@ class Tracker:
     def _add(self, rows: _Rows) -> list[Candidate]:
         assert self._run is not None
         done: list[Candidate] = []
-        while self._longest and self._run.chunks + len(rows.still) >= self._longest:
+        while self._longest and self._run.chunks + len(rows) >= self._longest:
             room = self._longest - self._run.chunks
-            self._run.add(rows.sums[:room], rows.begin[:room], rows.end[:room])
+            self._append(rows.part(0, room))
             done.append(self._run.candidate())
             self._run = Run(self._chunks, self.number)
-            rows = rows.part(room, len(rows.still))
-        self._run.add(rows.sums, rows.begin, rows.end)
+            rows = rows.part(room, len(rows))
+        self._append(rows)
         return done
+
+    def _append(self, rows: _Rows) -> None:
+        assert self._run is not None
+        self._run.add(rows.sums, rows.table[_BEGIN], rows.table[_END])
 
     def _end(self) -> list[Candidate]:
         found = self._finished()
@@ -160,71 +172,77 @@ class Tracker:
 
 
 class _Rows:
-    """Judged chunks, with the windows' variance among the sums."""
+    """Judged chunks, one column each, the windows' variance among the sums."""
 
-    def __init__(self, sums: Floats, begin: Floats, end: Floats, limit: Floats,
-                 still: NDArray[np.bool_], trending: NDArray[np.intp]) -> None:
-        self.sums = sums
-        self.begin = begin
-        self.end = end
-        self.limit = limit
-        self.still = still
-        self.trending = trending
+    def __init__(self, table: Floats) -> None:
+        self.table = table
 
     @classmethod
     def none(cls) -> _Rows:
-        """Give no rows."""
-        empty = np.empty(0, dtype=bool)
-        return cls(np.empty((0, DWELL_ROW)), np.empty(0), np.empty(0), np.empty((0, 6)),
-                   empty, np.empty(0, dtype=np.intp))
+        """Give no chunks."""
+        return cls(np.empty((_TRENDING + 1, 0)))
 
     @classmethod
     def of(cls, judged: Judged) -> _Rows:
         """Give the rows of judged chunks."""
         chunks = judged.chunks
-        one = np.ones((len(chunks.sums), 1))
-        return cls(np.hstack([chunks.sums, judged.level, one]), chunks.begin, chunks.end,
-                   judged.limit, judged.still, judged.trending)
+        one = np.ones(len(judged.still))
+        return cls(np.vstack([chunks.sums, judged.level, one, chunks.begin, chunks.end,
+                              judged.limit, judged.still, judged.trending]))
 
-    def _each(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_],
-                             NDArray[np.intp]]:
-        return self.sums, self.begin, self.end, self.limit, self.still, self.trending
+    def __len__(self) -> int:
+        return self.table.shape[1]
+
+    @property
+    def sums(self) -> Floats:
+        """(DWELL_ROW, n) array."""
+        return self.table[:DWELL_ROW]
+
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """(n,) array."""
+        return self.table[_STILL] > 0.0
+
+    @property
+    def sloping(self) -> bool:
+        """Whether a slope was seen over any of them."""
+        return bool((self.table[_TRENDING] > 0.0).any())
 
     def part(self, start: int, stop: int) -> _Rows:
-        """Give the rows from start to before stop."""
-        sums, begin, end, limit, still, trending = self._each()
-        which = slice(start, stop)
-        return _Rows(sums[which], begin[which], end[which], limit[which], still[which],
-                     trending[which])
+        """Give the chunks from start to before stop."""
+        return _Rows(self.table[:, start:stop])
 
     def tail(self, size: int) -> _Rows:
-        """Give the last rows."""
-        return self.part(max(len(self.still) - size, 0), len(self.still))
+        """Give the last chunks."""
+        return self.part(max(len(self) - size, 0), len(self))
 
     def then(self, other: _Rows) -> _Rows:
-        """Give these rows and the others after them."""
-        return _Rows(*(np.concatenate(pair) for pair in zip(self._each(), other._each())))
+        """Give these chunks and the others after them."""
+        if not len(self):
+            return other
+        return _Rows(np.concatenate([self.table, other.table], axis=1))
 
     def without_windows(self) -> _Rows:
-        """Give the rows with their windows left out of the sums."""
-        sums = self.sums.copy()
-        sums[:, LEVEL] = 0.0
-        sums[:, WINDOWS] = 0.0
-        return _Rows(sums, self.begin, self.end, self.limit, self.still, self.trending)
+        """Give the chunks with their windows left out of the sums."""
+        table = self.table.copy()
+        table[LEVEL] = 0.0
+        table[WINDOWS] = 0.0
+        return _Rows(table)
 
     def verdict(self, last: bool) -> NDArray[np.bool_]:
-        """Give the final verdict on those of the first rows for which it is due."""
-        size = len(self.still)
+        """Give the final verdict on those of the first chunks for which it is due."""
+        size, still = len(self), self.still
         index = np.arange(size)
-        bad = np.flatnonzero(~self.still)
-        place = np.searchsorted(bad, index)
-        ended = np.append(bad, 2 * size + HORIZON)[place]
+        nearest = np.where(still, 2 * size + HORIZON, index)
+        ended = np.minimum.accumulate(nearest[::-1])[::-1]
         due = np.minimum(index + HORIZON, ended)
         if last:
             due = np.minimum(due, size - 1)
-        due = due[due < size]
-        count = len(due)
-        level = self.sums[:count, LEVEL]
-        verdict = self.still[:count] & ~np.any(level > self.limit[due], axis=1)
-        over = np.append(self.trending, 0)[np.minimum(ended[:count], size)]
-        return np.asarray(verdict & ~(ended[:count] - index[:count] < over))
+        count = int(np.searchsorted(due, size))
+        due, ended = due[:count], ended[:count]
+        limit = self.table[_LIMIT]
+        verdict = still[:count].copy()
+        for level, most in zip(self.table[LEVEL], limit):
+            verdict &= ~(level[:count] > most[due])
+        over = np.append(self.table[_TRENDING], 0.0)[np.minimum(ended, size)]
+        return np.asarray(verdict & ~(ended - index[:count] < over))

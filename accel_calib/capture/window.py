@@ -12,17 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Sliding windows over rows of sums: their means, variances and slopes, and the least variance."""
+"""Windows over chunks: their means, variances and slopes, and the least variance."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from .noise import Trend, trend
+from .noise import strength_of, Trend
+from .sliding import lines, sliding_max, sliding_sum
 from .sums import CHUNKS_PER_WINDOW, COUNT, FIRST, SECOND
 from ..table import Floats
 
@@ -32,21 +32,20 @@ RELATIVE = 1e-6
 STD_FLOOR_G = 3.3e-4
 """Noise that is granted to any sensor [g]: smaller shaking does no harm."""
 
-
-def rolling(values: Floats, length: int, last: int) -> Floats:
-    """Give the last windows of this length over rows: (last, columns, length)."""
-    if last == 1:
-        return values[len(values) - length:].T[np.newaxis]
-    return sliding_window_view(values[len(values) - last - length + 1:], length, axis=0)
+_DIGITS = 1e-14
+"""Of the square of a reading: what differences of sums may be wrong by."""
 
 
-def windows(rows: Floats, origin: Floats) -> tuple[Floats, Floats]:
-    """Give mean and variance of the windows."""
-    sums = sliding_window_view(rows[:, :SECOND.stop], CHUNKS_PER_WINDOW, axis=0).sum(axis=-1)
-    count = sums[:, COUNT, np.newaxis]
-    mean = sums[:, FIRST] / count
-    level = np.maximum(sums[:, SECOND] - sums[:, FIRST] * mean, 0.0) / (count - 1.0)
-    return mean + origin, level
+def windows(rows: Floats, axes: int) -> tuple[Floats, Floats]:
+    """Give mean and variance of the windows that end with each chunk, (axes, n)."""
+    count = sliding_sum(rows[COUNT], CHUNKS_PER_WINDOW)
+    first = sliding_sum(rows[FIRST.start:FIRST.start + axes], CHUNKS_PER_WINDOW)
+    level = sliding_sum(rows[SECOND.start:SECOND.start + axes], CHUNKS_PER_WINDOW)
+    mean = first / count
+    level -= first * mean
+    np.maximum(level, 0.0, out=level)
+    level /= count - 1.0
+    return mean, level
 
 
 class Stretch(NamedTuple):
@@ -56,65 +55,91 @@ class Stretch(NamedTuple):
     Parameters
     ----------
     trend : Trend
-        Slopes of reading and rate, (m, 2, 3).
-    variance : (m, 6) array
+        Slopes of the reading, (3, m).
+    excess : (groups, m) array
+        As that of the trend, of reading and rate.
+    variance : (axes, m) array
         Mean of the windows' variances.
-    highest : (m, 6) array
-        Highest of them.
+    highest : (3, m) array
+        Highest of them, of the reading.
     samples : (m,) array
         Samples.
 
     """
 
     trend: Trend
+    excess: Floats
     variance: Floats
     highest: Floats
     samples: Floats
 
 
 def stretch(rows: Floats, level: Floats, length: int, size: int, spacing: float) -> Stretch:
-    """Give what was over so many chunks, for the last rows."""
-    inside = rolling(level, length - CHUNKS_PER_WINDOW + 1, size)
-    variance = inside.mean(axis=-1)
-    count = rolling(rows[:, COUNT, np.newaxis], length, size).sum(axis=-1)
-    means = rolling(rows[:, FIRST] / rows[:, COUNT, np.newaxis], length, size)
-    white = variance * length / count
-    found = trend(means.reshape(size, 2, 3, length), spacing, white.reshape(size, 2, 3))
-    return Stretch(found, variance, inside.max(axis=-1), count[:, 0])
+    """Give what was over so many chunks, for the last `size` ones."""
+    axes = len(level)
+    rows = rows[:, rows.shape[1] - size - length + 1:]
+    inner = length - CHUNKS_PER_WINDOW + 1
+    level = level[:, level.shape[1] - size - inner + 1:]
+    variance = sliding_sum(level, inner) / inner
+    count = sliding_sum(rows[COUNT], length)
+    cells = rows[FIRST.start:FIRST.start + axes] / rows[COUNT]
+    white = variance * (length / count)
+    square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
+    white += _DIGITS * square.repeat(3, axis=0)
+    line = lines(cells, length)
+    trends = [strength_of(line, spacing, white, slice(first, first + 3))
+              for first in range(0, axes, 3)]
+    return Stretch(trends[0], np.array([each.excess for each in trends]), variance,
+                   sliding_max(level[:3], inner), count)
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
-    """Give (..., 6) variances, not less than the resolution and the size of the mean allow."""
-    known = np.where(np.isfinite(step), step, 0.0)
-    resolution = np.repeat(0.25 * known**2, 3, axis=-1)
-    return np.asarray(np.fmax(np.fmax(floor, resolution), _tiny(mean)))
+    """
+    Give variances not less than the resolution and the size of the mean allow.
+
+    Parameters
+    ----------
+    floor : (axes, n) array
+        The variances, of the reading (axes = 3) and the rate (6).
+    step : (2, n) array
+        Smallest steps seen.
+    mean : (axes, n) array
+        Mean readings and rates.
+
+    """
+    groups = len(floor) // 3
+    known = np.where(np.isfinite(step[:groups]), step[:groups], 0.0)
+    least = np.fmax(0.25 * known**2, _tiny(mean))
+    return np.asarray(np.fmax(floor, np.repeat(least, 3, axis=0)))
 
 
 def _tiny(mean: Floats) -> Floats:
-    size = np.sqrt(np.sum(mean.reshape((*mean.shape[:-1], 2, 3))**2, axis=-1))
-    return np.repeat((RELATIVE * size)**2, 3, axis=-1)
+    """Give (groups, n) variances that are granted to data without noise."""
+    square = (mean * mean).reshape((-1, 3, *mean.shape[1:]))
+    return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
 
 
 def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
     """Tell which axes are constant while another varies by more than rounding: no noise."""
-    least = at_least(np.zeros(6), step, mean)[:, :3]
-    constant = average[:, :3] <= _tiny(mean)[:, :3]
-    varies = np.any(average[:, :3] > 2.0 * least, axis=1)
-    rates = np.zeros_like(constant)
-    return np.hstack([constant & varies[:, np.newaxis], rates])
+    reading = mean[:3]
+    tiny = _tiny(reading)
+    least = at_least(np.zeros_like(reading), step, reading)
+    constant = average[:3] <= tiny
+    return np.asarray(constant & np.any(average[:3] > 2.0 * least, axis=0))
 
 
 def granted(noise: Floats, scale: Floats) -> Floats:
-    """Give (..., 6) variances, those of the reading not less than is granted to any sensor."""
-    reading = np.fmax(noise[..., :3], (STD_FLOOR_G * scale[..., np.newaxis])**2)
-    return np.concatenate([reading, noise[..., 3:]], axis=-1)
+    """Give (axes, n) variances, those of the reading not less than is granted to any sensor."""
+    found = noise.copy()
+    found[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
+    return found
 
 
 def rounding(step: float, floor: Floats, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
     """Give what steps of the reading do to samples and to their mean; see `Rule.rounding`."""
     step = step if np.isfinite(step) else 0.0
-    tiny = RELATIVE * float(np.linalg.norm(mean))
+    tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
     square = step**2 / 12.0
-    own = np.minimum(np.sqrt(floor[:3]), std)
-    left = square * np.exp(-np.square(2.0 * np.pi * own / max(step, tiny)))
-    return np.full(3, max(np.sqrt(square), tiny)), np.maximum(left, 1e-2 * tiny**2)
+    own = np.minimum(np.sqrt(floor), std)
+    left = square * np.exp(-np.square(2.0 * np.pi * own / np.maximum(step, tiny)))
+    return np.maximum(np.sqrt(square), tiny), np.maximum(left, 1e-2 * tiny**2)

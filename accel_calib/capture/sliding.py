@@ -1,0 +1,140 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Sums, maxima and slopes over sliding windows, at a cost that grows with the logarithm of length.
+
+A window of L is put together from windows of 1, 2, 4, …, so that what comes out for a window
+depends on its own values alone, whatever stands before it and wherever a block ends.
+
+**Slope.** With k = 0 … L-1 and t = k - (L-1)/2 the least squares slope is Σ t x / Σ t², from
+Σ x and Σ k x. The power of the residuals r and the product of neighbours follow without the
+residuals themselves, from Σ x², Σ x x' (x' the next), and with m the mean, T = Σ t x, b the slope:
+
+    Σ r²   = Σ x² - L m² - b T
+    Σ r r' = Σ x x' - m (2 Σ x - x_0 - x_L-1) + (L-1) m²
+             - b (2 T - (t_L-1 + 1)(x_L-1 - x_0)) + b² Σ t t'
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..table import Floats
+
+
+class Line(NamedTuple):
+    """
+    Least squares lines through windows, in units of one step.
+
+    Parameters
+    ----------
+    slope : (..., n) array
+        By step.
+    square, neighbours : (..., n) array
+        Sum of the squared residuals, and of the products of neighbours.
+    time_square : float or array
+        Σ t².
+    length : int or array
+        Of the windows.
+
+    """
+
+    slope: Floats
+    square: Floats
+    neighbours: Floats
+    time_square: float | Floats
+    length: int | Floats
+
+
+def sliding_sum(values: Floats, length: int) -> Floats:
+    """Give the sums over windows of this length along the last axis: (..., n - length + 1)."""
+    return _folded(values, length, np.add)
+
+
+def sliding_max(values: Floats, length: int) -> Floats:
+    """Give the maxima over windows of this length."""
+    return _folded(values, length, np.maximum)
+
+
+def lines(values: Floats, length: int) -> Line:
+    """Give the lines through all windows of this length."""
+    total, weighted = _weighted(values, length)
+    first, last = values[..., :1 - length], values[..., length - 1:]
+    square = sliding_sum(values * values, length)
+    product = sliding_sum(values[..., :-1] * values[..., 1:], length - 1)
+    time = np.arange(length) - 0.5 * (length - 1)
+    time_square = float(np.sum(time**2))
+    moment = weighted - 0.5 * (length - 1) * total
+    slope = moment / time_square
+    mean = total / length
+    # Both are measured from the mean: the digits of a small noise on a large level are lost once.
+    square -= total * mean
+    square -= slope * moment
+    product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
+    product -= slope * (2.0 * moment - (time[-1] + 1.0) * (last - first))
+    product += slope * slope * float(np.sum(time[1:] * time[:-1]))
+    return Line(slope, np.maximum(square, 0.0), product, time_square,
+                length)
+
+
+def line(values: Floats) -> Line:
+    """Give the line through one window, (axes, length), by its residuals."""
+    length = values.shape[1]
+    time = np.arange(length) - 0.5 * (length - 1)
+    time_square = float(time @ time)
+    centred = values - values.mean(axis=1, keepdims=True)
+    slope = centred @ time / time_square
+    left = centred - slope[:, np.newaxis] * time
+    return Line(slope, np.einsum('ak,ak->a', left, left),
+                np.einsum('ak,ak->a', left[:, 1:], left[:, :-1]), time_square, length)
+
+
+def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats]) -> Floats:
+    count = values.shape[-1] - length + 1
+    found: Floats | None = None
+    size, start = 1, 0
+    while True:
+        if length & size:
+            part = values[..., start:start + count]
+            found = part if found is None else fold(found, part)
+            start += size
+        if start == length:
+            return np.asarray(found)
+        values = fold(values[..., :-size], values[..., size:])
+        size *= 2
+
+
+def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
+    """Give Σ x and Σ k x over the windows."""
+    count = values.shape[-1] - length + 1
+    weighted = np.zeros_like(values)
+    total_found = np.zeros((*values.shape[:-1], count))
+    found = np.zeros_like(total_found)
+    size, start = 1, 0
+    while True:
+        if length & size:
+            part = values[..., start:start + count]
+            found = found + weighted[..., start:start + count] + start * part
+            total_found = total_found + part
+            start += size
+        if start == length:
+            return total_found, found
+        weighted = weighted[..., :-size] + weighted[..., size:] + size * values[..., size:]
+        values = values[..., :-size] + values[..., size:]
+        size *= 2
