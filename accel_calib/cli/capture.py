@@ -21,12 +21,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from . import options
-from .progress import Progress, progress
+from .progress import progress
 from ..calibrate import check_units
 from ..capture import capture, CaptureSettings
 from ..capture.settings import REPEATED
 from ..errors import InputError
-from ..files import open_recording, Stream, write_table
+from ..files import open_recording, Progress, Stream, write_table
 from ..table import Recording
 from ..units import Units, units_of
 

@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 import sys
+from typing import TYPE_CHECKING
 
-Progress = Callable[[int, int], object]
-"""Is told how many are done, and of how many."""
+if TYPE_CHECKING:
+    from ..files import Progress
 
 
 @contextmanager

@@ -15,7 +15,7 @@
 """Pose tables, recordings and calibrations on disk: one reader and one writer each."""
 
 from .bag import is_bag
-from .bag_correction import correct_bag
+from .bag_correction import correct_bag, Progress
 from .calibration_yaml import (
     check_sensor,
     format_calibration,
@@ -26,6 +26,6 @@ from .calibration_yaml import (
 from .recording import open_recording, read_recording, Source, Stream
 from .table_csv import read_poses, read_samples, write_table
 
-__all__ = ['Source', 'Stream', 'check_sensor', 'correct_bag', 'format_calibration', 'is_bag',
-           'open_recording', 'parse_calibration', 'read_calibration', 'read_poses',
+__all__ = ['Progress', 'Source', 'Stream', 'check_sensor', 'correct_bag', 'format_calibration',
+           'is_bag', 'open_recording', 'parse_calibration', 'read_calibration', 'read_poses',
            'read_recording', 'read_samples', 'write_calibration', 'write_table']
