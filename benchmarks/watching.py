@@ -58,12 +58,13 @@ AFTER = 30
 
 
 NOT_REACHED = """\
-With pose means of 0.5 mg a shift takes a fourth rest now and then: 12 such poses may leave |a| open by
-1 mg and more, and how well the sensor repeats is told badly by ten rests (were that known, 99 %
-would be told within three). With 1 mg, 5 mg hardly leave what is stated. An offset is not seen at rests
-that lie square to it, and at random attitudes any three errors look like some offset, so that knocks
-are ruled out only when three rests show it clearly. Alarms come where the samples say a tenth of how badly
-12 poses repeat, in the first rests, and where one rest in twelve is knocked."""
+With pose means of 0.5 mg a shift takes a fourth rest now and then: 12 such poses state 1 mg and
+more for one rest in ten, and how well the sensor repeats is told badly by ten rests (were that
+known, 99 % would be told within three). With 1 mg, 5 mg hardly leave what is stated. An offset
+is not seen at rests that lie square to it, and at random attitudes any three errors look like
+some offset, so that knocks are ruled out only when three rests show it clearly. Alarms come
+where the samples say a tenth of how badly 12 poses repeat, and where one rest in twelve is
+knocked."""
 
 
 def same(count: int, rng: np.random.Generator) -> Floats:
