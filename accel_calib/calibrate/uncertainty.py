@@ -16,12 +16,12 @@
 How far the residuals let the measured noise be believed.
 
 The variance of a residual is λ times what the noise of its pose says. Either the noise is right,
-λ = 1, or poses repeat worse than their samples say, by a factor of which nothing is known: log λ
-is evenly spread from 0 to log 10⁴. The residuals weigh the one against the other (Bayes' rule with
-the likelihood λ^(-dof/2) exp(-chi²/2λ)); a value is then spread as a mixture of normal
-distributions, and its stated variance is such that ±1.96 standard deviations hold 95 % of it.
-Where the noise is not measured at all, λ comes from the residuals alone and the mixture is
-Student's t.
+λ = 1, or poses repeat worse than their samples say, or better, by a factor of which nothing is
+known: log λ is evenly spread from log 0.01 to log 10⁴. The residuals weigh the one against the
+other (Bayes' rule with the likelihood λ^(-dof/2) exp(-chi²/2λ)); a value is then spread as a
+mixture of normal distributions, and its stated variance is such that ±1.96 standard deviations
+hold 95 % of it. Where the noise is not measured at all, λ comes from the residuals alone and the
+mixture is Student's t.
 
 """
 
@@ -42,7 +42,10 @@ _RIGHT = 0.7
 
 _INTERVAL = 0.95
 _NORMAL = 1.959964
-_GRID = 81
+_SCALES = np.logspace(-2.0, 4.0, 121)
+_ONE = 40
+"""λ looked at; the place of λ = 1."""
+
 _BEYOND = 1e3
 
 
@@ -52,13 +55,12 @@ def belief_in(noise_known: bool) -> float:
 
 
 @cache
-def _grid() -> tuple[Floats, Floats, Floats]:
-    """Give λ (m,), half widths (k,), and the part of N(0, λ) that each width holds, (k, m)."""
+def _grid() -> tuple[Floats, Floats]:
+    """Give half widths (k,), and the part of N(0, λ) that each of them holds, (m, k)."""
     from scipy.special import ndtr
 
-    scale = np.logspace(0.0, 4.0, _GRID)
-    width = np.geomspace(1.9, 250.0, 101)
-    return scale, width, 2.0 * ndtr(width[:, np.newaxis] / np.sqrt(scale)) - 1.0
+    width = np.geomspace(0.15, 250.0, 141)
+    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
 
 
 def variance_factor(chi2: Floats | float, dof: Floats | int, noise_known: bool) -> Floats:
@@ -96,12 +98,13 @@ def _of_residuals(chi2: Floats, dof: Floats) -> Floats:
 
 def _of_mixture(chi2: Floats, dof: Floats) -> Floats:
     """Give the factor where the noise is measured, and may be right."""
-    scale, width, held = _grid()
-    likelihood = (chi2[..., np.newaxis] * (1.0 - 1.0 / scale)
-                  - dof[..., np.newaxis] * np.log(scale)) / 2.0
-    weight = np.exp(likelihood - np.max(likelihood, axis=-1, keepdims=True)) * (1.0 - _RIGHT)
-    weight[..., 0] += _RIGHT * _GRID * np.exp(-np.max(likelihood, axis=-1))
-    part = (weight / np.sum(weight, axis=-1, keepdims=True)) @ held.T
+    width, held = _grid()
+    likelihood = (chi2[..., np.newaxis] * (1.0 - 1.0 / _SCALES)
+                  - dof[..., np.newaxis] * np.log(_SCALES)) / 2.0
+    largest = np.max(likelihood, axis=-1, keepdims=True)
+    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
+    weight[..., _ONE] += _RIGHT * len(_SCALES) * np.exp(-largest[..., 0])
+    part = (weight / np.sum(weight, axis=-1, keepdims=True)) @ held
     above = np.argmax(part >= _INTERVAL, axis=-1)
     here, before = (np.take_along_axis(part, k[..., np.newaxis], axis=-1)[..., 0]
                     for k in (above, above - 1))
