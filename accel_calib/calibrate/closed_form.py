@@ -45,6 +45,9 @@ _FACE_COSINE = np.cos(np.radians(20.0))
 _RIDGE = 1e-12
 """Keeps poses in a plane from dividing by zero: they put the centre into the plane."""
 
+_BLOCK = 8192
+"""Poses at a time: their monomials stay in the cache."""
+
 _IDENTITY = np.eye(3)
 _TURN_MORE = 'take poses with each side of the sensor up and down, and some edges'
 
@@ -191,10 +194,9 @@ def _quadric(reading: Floats, form: _Form) -> tuple[Floats, Floats]:
     """Fit the quadric whose matrix A has the entries of this form; others are zero."""
     mean, r = _centred(reading)
     size = len(form.twice)
-    monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
-    monomials[..., size:-1, :] = r
-    np.multiply(r[..., form.first, :], r[..., form.second, :], out=monomials[..., :size, :])
-    moments = monomials @ np.swapaxes(monomials, -1, -2)
+    moments = _moments(form, r[..., :_BLOCK])
+    for start in range(_BLOCK, r.shape[-1], _BLOCK):
+        moments = moments + _moments(form, r[..., start:start + _BLOCK])
     centre, radius = _sphere(moments[..., size:-1, size:-1],
                              moments[..., :3, size:-1].sum(axis=-2), r.shape[-1])
     change = _to_sphere(form, centre, radius[..., np.newaxis])
@@ -202,6 +204,15 @@ def _quadric(reading: Floats, form: _Form) -> tuple[Floats, Floats]:
     mat_w, offset = _ellipsoid(form, beta)
     radius = radius[..., np.newaxis]
     return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
+
+
+def _moments(form: _Form, r: Floats) -> Floats:
+    """Sum up the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
+    size = len(form.twice)
+    monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
+    monomials[..., size:-1, :] = r
+    np.multiply(r[..., form.first, :], r[..., form.second, :], out=monomials[..., :size, :])
+    return monomials @ np.swapaxes(monomials, -1, -2)
 
 
 def _to_sphere(form: _Form, centre: Floats, radius: Floats) -> Floats:
