@@ -74,10 +74,12 @@ def test_poses_of_real_recordings_are_found(name, unit, poses):
     assert 'rate' in result.poses
 
 
-def test_poses_of_real_recordings_are_found_without_the_gyro():
-    samples = real('mpu9150_imu0.csv')
-    result = capture(recording(time=samples['time'], reading=samples.reading), units_of('m/s2'))
-    assert 20 <= len(result.poses) <= 22
+@pytest.mark.parametrize(('name', 'unit', 'poses'), [
+    ('mpu9150_imu0.csv', 'm/s2', 21), ('xsens_mti_counts.csv', 'native', 38)])
+def test_poses_of_real_recordings_are_found_without_the_gyro(name, unit, poses):
+    samples = real(name)
+    result = capture(recording(time=samples['time'], reading=samples.reading), units_of(unit))
+    assert len(result.poses) == poses
 
 
 def test_streaming_a_real_recording_gives_the_same_poses():

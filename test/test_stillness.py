@@ -285,3 +285,23 @@ def test_a_long_dwell_takes_bounded_memory_and_keeps_its_mean():
     assert len(result.poses) == 1
     np.testing.assert_allclose(result.poses.reading[0], reading[5:-10].mean(axis=0), atol=1e-5)
     assert result.poses['count'][0] > 0.6 * len(time)
+
+
+def test_a_detector_keeps_only_the_last_dwells_and_those_are_as_they_would_be():
+    time, reading, _ = turned(3, poses=8)
+    samples = np.column_stack([time, reading, np.full((len(time), 5), np.nan)])
+    detector = StillDetector(CaptureSettings(), G, keep=3)
+    detector.push_block(samples)
+    detector.close()
+    assert [each.start for each in detector.dwells()] == [
+        each.start for each in pushed(time, reading).dwells()[-3:]]
+
+
+def test_a_dwell_that_turned_out_not_to_be_still_is_withdrawn():
+    time, reading, _ = turned(2, noise=2e-3, poses=4)
+    first, held = still(8, 5.0)
+    held = held + 0.01 * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
+    reading = np.concatenate([held, [[0.0, 0.0, 3.0]] * 100, reading])
+    detector = pushed(np.arange(len(reading)) / 100.0, reading)
+    assert len(detector.withdrawn()) == 1
+    assert min(detector.withdrawn()) < 1.0

@@ -17,8 +17,8 @@ Samples to still poses: streaming for the node, the same rule over arrays for re
 
 The way of the data: `chunks` sums the samples over short stretches of header time, `rule` says
 of each whether the sensor is still, `tracker` joins still chunks to dwells, `run` sums a dwell,
-`dwell` judges it, `poses` makes the pose table. `detector` is the way in; both paths go through
-it. `sums`, `window` and `noise` are the arithmetic below.
+`average` says what it comes to, `dwell` judges it, `poses` makes the pose table. `detector` is the
+way in; both paths go through it. `sums`, `window`, `sliding` and `noise` are the arithmetic below.
 
 """
 

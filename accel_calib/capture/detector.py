@@ -16,15 +16,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .average import figures, SPAN
 from .chunks import Chunker, Interruption, together
-from .dwell import Candidate, Dwell, judged
+from .dwell import Dwell, judged
 from .rule import Rule
+from .run import Run
 from .settings import CaptureSettings
 from .sums import CONTEXT, WIDTH
 from .tracker import Tracker
@@ -47,15 +50,17 @@ class StillDetector:
         What is still, and for how long.
     units : Units
         Unit of the readings.
+    keep : int or None
+        So many dwells are kept, the last ones; None: all.
 
     """
 
-    def __init__(self, settings: CaptureSettings, units: Units) -> None:
+    def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000) -> None:
         self._settings = settings
         self._chunker = Chunker(settings)
         self._rule = Rule(settings, units)
         self._tracker: Tracker | None = None
-        self._candidates: list[Candidate] = []
+        self._figures: deque[Floats] = deque(maxlen=keep)
         self._still = False
         self._mean = np.full(6, np.nan)
         self._number = 0
@@ -125,20 +130,20 @@ class StillDetector:
         """
         return self._told(self.add([samples]))
 
-    def add(self, blocks: Iterable[Floats]) -> list[Candidate]:
-        """Take many samples as `push_columns`, and leave the dwells to be asked for."""
-        found = self._feed(blocks, last=False)
+    def add(self, blocks: Iterable[Floats]) -> int:
+        """Take many samples as `push_columns`; give the number of dwells, to be asked for."""
+        count = self._keep(self._feed(blocks, last=False))
         self._boundary = self._chunker.boundary
-        return found
+        return count
 
     def close(self) -> list[Dwell]:
         """End the running dwell, for no sample follows; give it if it is one."""
         buffer, self._buffer = self._buffer, []
         samples = _columns(np.array(buffer).reshape(-1, WIDTH))
-        found = self._feed([samples], last=True) + self._leave()
+        count = self._keep(self._feed([samples], last=True) + self._leave())
         self._chunker.restart()
         self._boundary = -math.inf
-        return self._told(found)
+        return self._told(count)
 
     @property
     def still(self) -> bool:
@@ -147,13 +152,18 @@ class StillDetector:
 
     def current(self) -> Dwell | None:
         """Give the running dwell so far, if it makes a pose already."""
-        found = None if self._tracker is None else self._tracker.current()
-        told = [] if found is None else self._told([found])
+        run = None if self._tracker is None else self._tracker.current()
+        told = [] if run is None else self._beside(figures([run]), list(self._figures))
         return told[0] if told else None
 
     def dwells(self) -> list[Dwell]:
-        """Give the dwells that ended so far and are still by the noise that is known now."""
-        return [each for each in judged(self._candidates, self._rule) if each is not None]
+        """Give the dwells that ended, of those kept, and are still by what is known now."""
+        return [each for each in self._judged() if each is not None]
+
+    def withdrawn(self) -> set[float]:
+        """Give the starts of those kept that turned out not to be still."""
+        return {float(column[SPAN.start]) for column, each in zip(self._figures, self._judged())
+                if each is None}
 
     @property
     def threshold(self) -> float:
@@ -173,8 +183,8 @@ class StillDetector:
         """Give the breaks in the stamps so far, the last thousands of them."""
         return tuple(self._chunker.interruptions)
 
-    def _feed(self, blocks: Iterable[Floats], last: bool) -> list[Candidate]:
-        found: list[Candidate] = []
+    def _feed(self, blocks: Iterable[Floats], last: bool) -> list[Run]:
+        found: list[Run] = []
         whole = [chunks for block in blocks for chunks in self._chunker.feed(block, last)]
         for chunks in together(whole):
             if chunks.fresh:
@@ -182,32 +192,40 @@ class StillDetector:
             judged = self._rule.feed(chunks)
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, judged, self._number)
-            found += self._keep(self._tracker.feed(judged))
+            found += self._tracker.feed(judged)
             self._still = bool(judged.still[-1])
             self._mean = chunks.origin
         return found
 
-    def _leave(self) -> list[Candidate]:
+    def _leave(self) -> list[Run]:
         if self._tracker is None:
             return []
-        found = self._keep(self._tracker.close())
+        found = self._tracker.close()
         self._number = self._tracker.number
         self._tracker = None
         self._still = False
         return found
 
-    def _told(self, found: list[Candidate]) -> list[Dwell]:
-        """Give the dwells of these, judged beside the earlier ones."""
-        if not found:
-            return []
-        known = {id(each) for each in found}
-        earlier = [each for each in self._candidates[-_BESIDE:] if id(each) not in known]
-        told = judged([*earlier, *found], self._rule, len(earlier))
-        return [each for each in told if each is not None]
+    def _keep(self, found: list[Run]) -> int:
+        """Keep what these come to, and give their number."""
+        if found:
+            self._figures.extend(figures(found).T.copy())
+        return len(found)
 
-    def _keep(self, found: list[Candidate]) -> list[Candidate]:
-        self._candidates += found
-        return found
+    def _judged(self) -> list[Dwell | None]:
+        return judged(np.array(self._figures).T, self._rule) if self._figures else []
+
+    def _told(self, count: int) -> list[Dwell]:
+        """Give the last so many dwells, judged beside the earlier ones."""
+        if not count:
+            return []
+        last = [self._figures[k] for k in range(-min(count, len(self._figures)), 0)]
+        return self._beside(np.array(last).T, list(self._figures)[:-count])
+
+    def _beside(self, found: Floats, earlier: list[Floats]) -> list[Dwell]:
+        earlier = earlier[-_BESIDE:]
+        table = np.concatenate([np.array(earlier).T, found], axis=1) if earlier else found
+        return [each for each in judged(table, self._rule, len(earlier)) if each is not None]
 
 
 def _columns(samples: Floats) -> Floats:

@@ -40,15 +40,18 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import average as row
 from .noise import strength_of, Trend
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
 from .sliding import Line
+from .sums import CONTEXT
 from ..table import Floats
 
 DWELL_RATIO = 3.2
@@ -100,58 +103,31 @@ class Dwell:
     orientation: int
 
 
-# What `Candidate.levels` holds, of three axes each.
-LOWEST = slice(0, 6)     # lower end of the mean variance of the windows
-AVERAGE = slice(6, 12)   # mean variance of the windows
-MEAN = slice(12, 18)
-SLOPE = slice(18, 33)    # slope, residuals, neighbours, white; time_square, length, spacing
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """
-    A dwell with what it is judged by.
-
-    Parameters
-    ----------
-    dwell : Dwell
-        The dwell.
-    levels : (33,) array
-        `LOWEST`, `AVERAGE` and `MEAN` of reading and rate, and `SLOPE` of the reading.
-    excess : float
-        Variance of the mean over that of independent samples, estimated from this dwell.
-    beside_slope : bool
-        True if the reading sloped just before or after.
-
-    """
-
-    dwell: Dwell
-    levels: Floats
-    excess: float
-    beside_slope: bool
-
-
-def judged(candidates: Sequence[Candidate], rule: Rule, first: int = 0) -> list[Dwell | None]:
+def judged(table: Floats, rule: Rule, first: int = 0) -> list[Dwell | None]:
     """
     Give each dwell from the first on if it is still by what is known now.
 
     Its count, and the bias of the gyro, go by all of them.
 
+    Parameters
+    ----------
+    table : (FIGURES, k) array
+        The dwells, as `average.figures` gives them.
+    rule : Rule
+        Knows the noise.
+    first : int
+        Index of the first that is asked for.
+
     """
-    if not candidates:
-        return []
-    levels = np.array([each.levels for each in candidates]).T
-    slopes = _slopes(levels[SLOPE])
-    beside = np.array([each.beside_slope for each in candidates])
-    own = np.array([each.excess for each in candidates])
-    quiet = _quiet(levels, slopes, beside, rule)
-    common = float(np.median(own[quiet])) if quiet.any() else 1.0
-    excess = np.maximum(max(1.0, common), own / _OWN_EXCESS)
-    turned, sure = _by_gyro(levels, quiet, rule)
+    slopes = _slopes(table[row.SLOPE])
+    quiet = _quiet(table, slopes, rule)
+    common = float(np.median(table[row.EXCESS, quiet])) if quiet.any() else 1.0
+    excess = np.maximum(max(1.0, common), table[row.EXCESS] / _OWN_EXCESS)
+    turned, sure = _by_gyro(table, quiet, rule)
     good = quiet & ~turned & (sure | rule.rests(slopes, excess))
-    std, count = _counts(candidates[first:], levels[MEAN][:3, first:], excess[first:], rule)
-    return [replace(each.dwell, std=std[:, k].copy(), count=float(count[k])) if good[first + k]
-            else None for k, each in enumerate(candidates[first:])]
+    std, count = _counts(table[:, first:], excess[first:], rule)
+    return [_dwell(*each) if fine else None
+            for fine, *each in zip(good[first:], table.T[first:], std.T.copy(), count.tolist())]
 
 
 def _slopes(parts: Floats) -> Trend:
@@ -160,34 +136,25 @@ def _slopes(parts: Floats) -> Trend:
                        slice(0, 3))
 
 
-def _quiet(levels: Floats, slopes: Trend, beside: NDArray[np.bool_], rule: Rule
-           ) -> NDArray[np.bool_]:
+def _quiet(table: Floats, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
     """Tell which are still by the noise that is known now, and did not move steadily."""
-    limit = rule.limit_of(rule.noise_of(levels[MEAN]), DWELL_RATIO, DWELL_RATE_RATIO)
-    strength = np.where(beside, WEAK_STRENGTH, STRENGTH)
-    moved = rule.moved(slopes, np.asarray(rule.scale), levels[AVERAGE][:3], strength,
+    limit = rule.limit_of(rule.noise_of(table[row.MEAN]), DWELL_RATIO, DWELL_RATE_RATIO)
+    strength = np.where(table[row.BESIDE] > 0.0, WEAK_STRENGTH, STRENGTH)
+    moved = rule.moved(slopes, np.asarray(rule.scale), table[row.AVERAGE][:3], strength,
                        DWELL_SLOPE_G)
-    return np.asarray(~moved & ~np.any(levels[LOWEST] > limit, axis=0))
+    return np.asarray(~moved & ~np.any(table[row.LOWEST] > limit, axis=0))
 
 
-def _by_gyro(levels: Floats, quiet: NDArray[np.bool_], rule: Rule
+def _by_gyro(table: Floats, quiet: NDArray[np.bool_], rule: Rule
              ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
     Tell by the gyro which dwells were turned, and which surely were not.
 
-    Its bias is the median over the dwells, and a rate about the vertical turns no pose.
-
-    Parameters
-    ----------
-    levels : (33, k) array
-        As those of a candidate.
-    quiet : (k,) array of bool
-        Dwells to learn from.
-    rule : Rule
-        Tells whether the rates are in rad/s.
+    Its bias is the median over the dwells that are quiet, and a rate about the vertical turns no
+    pose.
 
     """
-    up, rates = levels[MEAN][:3], levels[MEAN][3:]
+    up, rates = table[row.MEAN][:3], table[row.MEAN][3:]
     known = quiet & np.isfinite(rates).all(axis=0)
     if not rule.si_rates or known.sum() < _BIAS_DWELLS:
         return np.zeros_like(quiet), np.zeros_like(quiet)
@@ -195,17 +162,27 @@ def _by_gyro(levels: Floats, quiet: NDArray[np.bool_], rule: Rule
     spread = _MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
     tilting = (np.linalg.norm(np.cross(off, up, axis=0), axis=0)
                / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
-    alive = np.all(levels[AVERAGE][3:] > 0.0, axis=0)
+    alive = np.all(table[row.AVERAGE][3:] > 0.0, axis=0)
     sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
-def _counts(candidates: Sequence[Candidate], mean: Floats, excess: Floats, rule: Rule
-            ) -> tuple[Floats, Floats]:
+def _counts(table: Floats, excess: Floats, rule: Rule) -> tuple[Floats, Floats]:
     """Give (3, k) standard deviations and (k,) independent samples, rounding included."""
-    std = np.array([each.dwell.std for each in candidates]).T
-    samples = np.array([each.dwell.samples for each in candidates])
-    resolution, left = rule.rounding(mean, std)
-    std = np.maximum(std, resolution)
-    variance = std**2 * excess / samples + left
+    resolution, left = rule.rounding(table[row.MEAN][:3], table[row.STD])
+    std = np.maximum(table[row.STD], resolution)
+    variance = std**2 * excess / table[row.SAMPLES] + left
     return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
+
+
+def _dwell(column: Floats, std: Floats, count: float) -> Dwell:
+    column = column.copy()
+    figure = column.tolist()
+    begin, end, time = figure[row.SPAN]
+    context: dict[str, float | Floats] = {
+        name: value for name, value in zip(CONTEXT, figure[row.AROUND]) if math.isfinite(value)}
+    mean = column[row.MEAN]
+    if math.isfinite(figure[row.MEAN][-1]):
+        context['rate'] = mean[3:]
+    return Dwell(begin, end, time, mean[:3], std, count, int(figure[row.SAMPLES]), context,
+                 int(figure[row.ORIENTATION]))

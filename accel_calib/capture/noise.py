@@ -106,37 +106,47 @@ def _over_axes(values: Floats) -> Floats:
     return np.asarray(values[0] + values[1] + values[2])
 
 
-def excess_of_mean(cells: Floats, white: Floats) -> float:
+def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
-    Give the variance of the mean of these cells over that of white noise.
+    Give the variance of the mean of each series of cells over that of white noise.
 
     Parameters
     ----------
-    cells : (3, K) array
-        Means of K consecutive cells.
-    white : (3,) array
+    centred : (3, k, K) array
+        Means of consecutive cells less their mean, and 0 after the end of a series.
+    sizes : (k,) array
+        Lengths of the series.
+    white : (3, k) array
         Variance of a cell mean, were the samples independent; axes with 0 are left out.
+
+    Returns
+    -------
+    (k,) array
+        The excess; 1 where there is too little to tell.
 
     """
     axes = white > 0.0
-    size = cells.shape[1]
-    if not axes.any() or size < 4:
-        return 1.0
-    centred = cells[axes] - cells[axes].mean(axis=1, keepdims=True)
-    centred /= np.sqrt(white[axes])[:, np.newaxis]
-    return _long_run(_autocovariance(centred, size // 2), size)
+    scaled = centred / np.sqrt(np.where(axes, white, np.inf))[:, :, np.newaxis]
+    covariance = _autocovariance(scaled, sizes, np.maximum(axes.sum(axis=0), 1))
+    found = _long_run(covariance, sizes)
+    return np.where(axes.any(axis=0) & (sizes >= 4), found, 1.0)
 
 
-def _autocovariance(centred: Floats, lags: int) -> Floats:
-    size = centred.shape[1]
-    total = sum(np.correlate(row, row, 'full')[size - 1:size - 1 + lags] for row in centred)
-    return np.asarray(total / (len(centred) * (size - np.arange(lags))))
+def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
+    """Give (k, lags) by the Fourier transform, padded so that no end meets the beginning."""
+    length = centred.shape[2]
+    padded = 1 << (2 * length - 1).bit_length()
+    power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)
+    lags = np.arange(max(length // 2, 2))
+    terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0)
+    return np.asarray(np.fft.irfft(power, padded, axis=1)[:, lags]
+                      / (terms * axes[:, np.newaxis]))
 
 
-def _long_run(covariance: Floats, size: int) -> float:
-    pairs = covariance[:len(covariance) // 2 * 2].reshape(-1, 2).sum(axis=1)
-    stop = np.flatnonzero(pairs <= 0.0)
-    kept = pairs[:stop[0]] if len(stop) else pairs
-    found = 2.0 * float(np.sum(kept)) - float(covariance[0])
-    lost = (4.0 * len(kept) - 1.0) / size
-    return max(found, 0.0) / max(1.0 - lost, 0.25)
+def _long_run(covariance: Floats, sizes: Floats) -> Floats:
+    pairs = covariance[:, 0:-1:2] + covariance[:, 1::2]
+    usable = np.arange(pairs.shape[1]) < (sizes // 2 // 2)[:, np.newaxis]
+    kept = np.logical_and.accumulate((pairs > 0.0) & usable, axis=1)
+    found = 2.0 * np.sum(np.where(kept, pairs, 0.0), axis=1) - covariance[:, 0]
+    lost = (4.0 * kept.sum(axis=1) - 1.0) / sizes
+    return np.asarray(np.maximum(found, 0.0) / np.maximum(1.0 - lost, 0.25))

@@ -105,7 +105,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         If a time, a reading or a rate is not finite.
 
     """
-    detector = StillDetector(settings, units)
+    detector = StillDetector(settings, units, keep=None)
     spans: list[tuple[float, float]] = []
     recorded = 0
     for part in [recording] if isinstance(recording, Recording) else recording:

@@ -22,15 +22,10 @@ a dwell of days takes no more memory than one of a minute.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from .chunks import Chunks
-from .dwell import Candidate, Dwell
-from .noise import excess_of_mean
-from .sliding import line
-from .sums import CONTEXT, CONTEXT_COUNT, CONTEXT_SUM, COUNT, FIRST, ROW, SECOND, TIME
+from .sums import COUNT, FIRST, ROW
 from ..table import Floats
 
 CELLS = 256
@@ -57,17 +52,27 @@ class Run:
     orientation : int
         Number of the dwell.
 
+    Attributes
+    ----------
+    begin, end : float
+        First and last stamp [s].
+    cells : (DWELL_ROW, n) array
+        Sums over `size` chunks each.
+    beside_slope : bool
+        Whether the reading sloped just before or after: it is suspected of going on.
+
     """
 
     def __init__(self, chunks: Chunks, orientation: int) -> None:
-        self._epoch = chunks.epoch
-        self._origin = chunks.origin
-        self._length = chunks.length
-        self._cells: Floats = np.empty((DWELL_ROW, 0))
+        self.epoch = chunks.epoch
+        self.origin = chunks.origin
+        self.length = chunks.length
+        self.cells: Floats = np.empty((DWELL_ROW, 0))
         self._partial: Floats = np.empty((DWELL_ROW, 0))
-        self._size = 1
-        self._begin = self._end = 0.0
+        self.size = 1
+        self.begin = self.end = 0.0
         self.chunks = 0
+        self.beside_slope = False
         self.orientation = orientation
 
     def add(self, rows: Floats, begin: Floats, end: Floats) -> None:
@@ -75,70 +80,34 @@ class Run:
         count = rows.shape[1]
         if not count:
             return
-        self._begin = self._begin if self.chunks else float(begin[0])
-        self._end = float(end[-1])
+        self.begin = self.begin if self.chunks else float(begin[0])
+        self.end = float(end[-1])
         self.chunks += count
         while rows.shape[1]:
-            room = ((2 * CELLS - self._cells.shape[1]) * self._size - self._partial.shape[1])
+            room = ((2 * CELLS - self.cells.shape[1]) * self.size - self._partial.shape[1])
             self._append(rows[:, :room])
             rows = rows[:, room:]
 
     def _append(self, rows: Floats) -> None:
-        if self._size > 1:
+        if self.size > 1:
             rows = np.concatenate([self._partial, rows], axis=1)
-            whole = rows.shape[1] // self._size * self._size
+            whole = rows.shape[1] // self.size * self.size
             self._partial = rows[:, whole:]
-            rows = rows[:, :whole].reshape(DWELL_ROW, -1, self._size).sum(axis=2)
-        cells = rows if not self._cells.size else np.concatenate([self._cells, rows], axis=1)
-        self._cells = cells
+            rows = rows[:, :whole].reshape(DWELL_ROW, -1, self.size).sum(axis=2)
+        cells = rows if not self.cells.size else np.concatenate([self.cells, rows], axis=1)
+        self.cells = cells
         if cells.shape[1] == 2 * CELLS:
-            self._cells = cells[:, 0::2] + cells[:, 1::2]
-            self._size *= 2
+            self.cells = cells[:, 0::2] + cells[:, 1::2]
+            self.size *= 2
 
-    def _total(self) -> Floats:
-        return np.asarray(self._cells.sum(axis=1) + self._partial.sum(axis=1))
+    def total(self) -> Floats:
+        """Give the sum of what was added."""
+        return np.asarray(self.cells.sum(axis=1) + self._partial.sum(axis=1))
 
     def continued_by(self, rows: Floats, scale: float) -> bool:
         """Tell whether these chunks have the same mean reading as the dwell so far."""
-        old = self._total()
+        old = self.total()
         new = rows.sum(axis=1)
         level = np.maximum(old[LEVEL] / max(old[WINDOWS], 1.0), new[LEVEL] / new[WINDOWS])
         apart = np.abs(old[FIRST] / old[COUNT] - new[FIRST] / new[COUNT])[:3]
         return bool(np.all(apart <= np.sqrt(level[:3]) + _AGREE_G * scale))
-
-    def candidate(self, beside_slope: bool = False) -> Candidate:
-        """Give the average of what was added; beside a slope, it is suspected of going on."""
-        total = self._total()
-        count = total[COUNT]
-        shift = total[FIRST] / count
-        square = np.maximum(total[SECOND] - total[FIRST] * shift, 0.0)
-        variance = square[:3] / max(count - 1.0, 1.0)
-        level = total[LEVEL] / max(total[WINDOWS], 1.0)
-        excess, slope = self._noise(variance, level[:3])
-        mean = shift + self._origin
-        dwell = Dwell(self._begin, self._end, self._epoch + float(total[TIME] / count),
-                      mean[:3], np.sqrt(variance), count / max(excess, 1.0), int(count),
-                      _context(total, mean[3:]), self.orientation)
-        spread = math.sqrt((1.0 + max(excess, 1.0)) / count)
-        levels = np.concatenate([level * math.exp(-2.0 * spread), level, mean, slope])
-        return Candidate(dwell, levels, excess, beside_slope)
-
-    def _noise(self, variance: Floats, level: Floats) -> tuple[float, Floats]:
-        """Give the excess of the noise of the mean, and the slope as `dwell.SLOPE` has it."""
-        cells = self._cells[FIRST.start:FIRST.start + 3] / self._cells[COUNT]
-        per_cell = float(self._cells[COUNT].sum()) / cells.shape[1]
-        found = line(cells)
-        spacing = self._size * self._length
-        return (excess_of_mean(cells, variance / per_cell),
-                np.concatenate([found.slope, found.square, found.neighbours, level / per_cell,
-                                [found.time_square, cells.shape[1], spacing]]))
-
-
-def _context(total: Floats, rate: Floats) -> dict[str, float | Floats]:
-    context: dict[str, float | Floats] = {}
-    for name, count, value in zip(CONTEXT, total[CONTEXT_COUNT], total[CONTEXT_SUM]):
-        if count > 0.0:
-            context[name] = float(value / count)
-    if math.isfinite(rate.sum()):
-        context['rate'] = rate
-    return context

@@ -93,16 +93,26 @@ def lines(values: Floats, length: int) -> Line:
                 length)
 
 
-def line(values: Floats) -> Line:
-    """Give the line through one window, (axes, length), by its residuals."""
-    length = values.shape[1]
-    time = np.arange(length) - 0.5 * (length - 1)
-    time_square = float(time @ time)
-    centred = values - values.mean(axis=1, keepdims=True)
-    slope = centred @ time / time_square
-    left = centred - slope[:, np.newaxis] * time
-    return Line(slope, np.einsum('ak,ak->a', left, left),
-                np.einsum('ak,ak->a', left[:, 1:], left[:, :-1]), time_square, length)
+def lines_through(centred: Floats, sizes: Floats) -> Line:
+    """
+    Give one line through each series, by its residuals.
+
+    Parameters
+    ----------
+    centred : (axes, k, K) array
+        Values less their mean, and 0 after the end of a series.
+    sizes : (k,) array
+        Lengths of the series.
+
+    """
+    index = np.arange(centred.shape[2])
+    inside = index < sizes[:, np.newaxis]
+    time = (index - 0.5 * (sizes[:, np.newaxis] - 1.0)) * inside
+    time_square = np.einsum('kt,kt->k', time, time)
+    slope = np.einsum('akt,kt->ak', centred, time) / time_square
+    left = centred - slope[:, :, np.newaxis] * time
+    return Line(slope, np.einsum('akt,akt->ak', left, left),
+                np.einsum('akt,akt->ak', left[:, :, 1:], left[:, :, :-1]), time_square, sizes)
 
 
 def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats]) -> Floats:

@@ -38,7 +38,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .dwell import Candidate
 from .rule import HORIZON, Judged, Rule
 from .run import DWELL_ROW, LEVEL, Run, WINDOWS
 from .settings import CaptureSettings
@@ -72,26 +71,26 @@ class Tracker:
         self._shortest = math.ceil(shortest / chunks.length - 1e-9)
         longest = settings.max_dwell / chunks.length
         self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
-        self._waiting = _Rows.none()
-        self._lead = _Rows.none()
-        self._held = _Rows.none()
+        self._waiting = _NO_ROWS
+        self._lead = _NO_ROWS
+        self._held = _NO_ROWS
         self._run: Run | None = None
         self._pause = 0
         self._beside_slope = False
         self.number = number
 
-    def feed(self, judged: Judged) -> list[Candidate]:
+    def feed(self, judged: Judged) -> list[Run]:
         """Give the dwells that end with these chunks."""
         self._waiting = self._waiting.then(_Rows.of(judged))
         return self._decide(last=False)
 
-    def close(self) -> list[Candidate]:
+    def close(self) -> list[Run]:
         """Give the dwell that ends because no chunk follows."""
         done = self._decide(last=True)
         done += self._end()
         return done
 
-    def current(self) -> Candidate | None:
+    def current(self) -> Run | None:
         """Give the running dwell as it would be if it ended now."""
         if not len(self._waiting) or not self._waiting.still[-1]:
             return None
@@ -101,10 +100,10 @@ class Tracker:
         del ended
         return twin._finished()
 
-    def _decide(self, last: bool) -> list[Candidate]:
+    def _decide(self, last: bool) -> list[Run]:
         rows = self._waiting
         verdict = rows.verdict(last)
-        done: list[Candidate] = []
+        done: list[Run] = []
         edges = np.flatnonzero(np.diff(verdict)) + 1
         for start, stop in zip([0, *edges], [*edges, len(verdict)]):
             if stop > start:
@@ -113,27 +112,27 @@ class Tracker:
         self._waiting = rows.part(len(verdict), len(rows))
         return done
 
-    def _skip(self, rows: _Rows) -> list[Candidate]:
+    def _skip(self, rows: _Rows) -> list[Run]:
         self._pause += len(rows)
-        self._lead = self._lead.then(rows).tail(_LEAD)
-        self._held = _Rows.none()
+        self._lead = self._lead.then(rows.tail(_LEAD)).tail(_LEAD)
+        self._held = _NO_ROWS
         sloping = rows.sloping
         self._beside_slope |= sloping
         done = self._end() if self._pause > KNOCK or sloping else []
         self._beside_slope = sloping or (self._beside_slope and self._run is not None)
         return done
 
-    def _extend(self, rows: _Rows) -> list[Candidate]:
-        done: list[Candidate] = []
+    def _extend(self, rows: _Rows) -> list[Run]:
+        done: list[Run] = []
+        before = self._held
         if self._pause or self._run is None:
-            first = self._lead.without_windows().then(rows.part(0, 1))
-            if self._run is None or not self._goes_on(first):
+            before = self._lead.without_windows()
+            if self._run is None or not self._goes_on(before.then(rows.part(0, 1))):
                 done = self._end()
                 self._run = Run(self._chunks, self.number)
-            rows = first.then(rows.part(1, len(rows)))
             self._pause = 0
-        rows = self._held.then(rows)
-        self._lead = _Rows.none()
+        rows = before.then(rows)
+        self._lead = _NO_ROWS
         self._held = rows.tail(1)
         return done + self._add(rows.part(0, len(rows) - 1))
 
@@ -141,13 +140,13 @@ class Tracker:
         return (self._run is not None and self._run.chunks > 0
                 and self._run.continued_by(first.sums, self._rule.scale))
 
-    def _add(self, rows: _Rows) -> list[Candidate]:
+    def _add(self, rows: _Rows) -> list[Run]:
         assert self._run is not None
-        done: list[Candidate] = []
+        done: list[Run] = []
         while self._longest and self._run.chunks + len(rows) >= self._longest:
             room = self._longest - self._run.chunks
             self._append(rows.part(0, room))
-            done.append(self._run.candidate())
+            done.append(self._run)
             self._run = Run(self._chunks, self.number)
             rows = rows.part(room, len(rows))
         self._append(rows)
@@ -157,18 +156,19 @@ class Tracker:
         assert self._run is not None
         self._run.add(rows.sums, rows.table[_BEGIN], rows.table[_END])
 
-    def _end(self) -> list[Candidate]:
+    def _end(self) -> list[Run]:
         found = self._finished()
         if self._run is not None:
             self.number += 1
         self._run = None
-        self._held = _Rows.none()
+        self._held = _NO_ROWS
         return [] if found is None else [found]
 
-    def _finished(self) -> Candidate | None:
+    def _finished(self) -> Run | None:
         if self._run is None or self._run.chunks < self._shortest:
             return None
-        return self._run.candidate(self._beside_slope)
+        self._run.beside_slope = self._beside_slope
+        return self._run
 
 
 class _Rows:
@@ -176,11 +176,6 @@ class _Rows:
 
     def __init__(self, table: Floats) -> None:
         self.table = table
-
-    @classmethod
-    def none(cls) -> _Rows:
-        """Give no chunks."""
-        return cls(np.empty((_TRENDING + 1, 0)))
 
     @classmethod
     def of(cls, judged: Judged) -> _Rows:
@@ -218,15 +213,14 @@ class _Rows:
 
     def then(self, other: _Rows) -> _Rows:
         """Give these chunks and the others after them."""
-        if not len(self):
+        if not self.table.size:
             return other
         return _Rows(np.concatenate([self.table, other.table], axis=1))
 
     def without_windows(self) -> _Rows:
         """Give the chunks with their windows left out of the sums."""
         table = self.table.copy()
-        table[LEVEL] = 0.0
-        table[WINDOWS] = 0.0
+        table[LEVEL.start:WINDOWS + 1] = 0.0
         return _Rows(table)
 
     def verdict(self, last: bool) -> NDArray[np.bool_]:
@@ -246,3 +240,6 @@ class _Rows:
             verdict &= ~(level[:count] > most[due])
         over = np.append(self.table[_TRENDING], 0.0)[np.minimum(ended, size)]
         return np.asarray(verdict & ~(ended - index[:count] < over))
+
+
+_NO_ROWS = _Rows(np.empty((_TRENDING + 1, 0)))

@@ -115,9 +115,9 @@ class PoseBook:
         entries = self._held or self._dwells or self._earlier
         return bool(entries and entries.pop())
 
-    def keep_only(self, starts: Container[float]) -> int:
-        """Take back those that began at none of these times; give how many they were."""
-        kept = [dwell for dwell in self._dwells if dwell.start in starts]
+    def take_back(self, starts: Container[float]) -> int:
+        """Take back those that began at these times; give how many they were."""
+        kept = [dwell for dwell in self._dwells if dwell.start not in starts]
         count = len(self._dwells) - len(kept)
         self._dwells = kept
         return count

@@ -235,7 +235,7 @@ class Watch:
         if threshold > _NOISE_FELL * self._judged_at:
             return 0
         self._judged_at = threshold
-        return self.book.keep_only({dwell.start for dwell in self.detector.dwells()})
+        return self.book.take_back(self.detector.withdrawn())
 
 
 def _pieces(samples: Floats) -> list[Floats]:

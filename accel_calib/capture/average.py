@@ -1,0 +1,86 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Runs that ended to one column of figures each, many at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .noise import excess_of_means
+from .run import LEVEL, Run, WINDOWS
+from .sliding import lines_through
+from .sums import CONTEXT_COUNT, CONTEXT_SUM, COUNT, FIRST, SECOND, TIME
+from ..table import Floats
+
+# Rows of the figures of dwells; reading and rate, or the reading alone.
+LOWEST = slice(0, 6)      # lower end of the mean variance of the windows
+AVERAGE = slice(6, 12)    # mean variance of the windows
+MEAN = slice(12, 18)
+STD = slice(18, 21)       # of the samples
+SLOPE = slice(21, 36)     # slope, residuals, neighbours, white; time_square, length, spacing
+SPAN = slice(36, 39)      # first, last and mean stamp
+SAMPLES = 39
+EXCESS = 40               # variance of the mean over that of independent samples
+BESIDE = 41               # whether the reading sloped just before or after
+ORIENTATION = 42
+AROUND = slice(43, 45)    # temperature and supply voltage
+FIGURES = 45
+
+
+def figures(runs: Sequence[Run]) -> Floats:
+    """Give what runs come to, (FIGURES, k)."""
+    found = np.empty((FIGURES, len(runs)))
+    if not runs:
+        return found
+    total = np.array([run.total() for run in runs]).T
+    count = total[COUNT]
+    shift = total[FIRST] / count
+    square = np.maximum(total[SECOND] - total[FIRST] * shift, 0.0)
+    variance = square[:3] / np.maximum(count - 1.0, 1.0)
+    level = total[LEVEL] / np.maximum(total[WINDOWS], 1.0)
+    found[MEAN] = shift + np.array([run.origin for run in runs]).T
+    found[STD] = np.sqrt(variance)
+    found[SLOPE], found[EXCESS] = _noise(runs, variance, level[:3])
+    spread = np.sqrt((1.0 + np.maximum(found[EXCESS], 1.0)) / count)
+    found[LOWEST] = level * np.exp(-2.0 * spread)
+    found[AVERAGE] = level
+    found[SPAN] = np.array([(run.begin, run.end, run.epoch) for run in runs]).T
+    found[SPAN.stop - 1] += total[TIME] / count
+    found[SAMPLES] = count
+    found[BESIDE] = [run.beside_slope for run in runs]
+    found[ORIENTATION] = [run.orientation for run in runs]
+    known = total[CONTEXT_COUNT]
+    found[AROUND] = np.where(known > 0.0, total[CONTEXT_SUM], np.nan) / np.maximum(known, 1.0)
+    return found
+
+
+def _noise(runs: Sequence[Run], variance: Floats, level: Floats) -> tuple[Floats, Floats]:
+    """Give `SLOPE` and `EXCESS`, from the means of cells."""
+    sizes = np.array([run.cells.shape[1] for run in runs], dtype=float)
+    cells = np.zeros((4, len(runs), int(sizes.max())))
+    for k, run in enumerate(runs):
+        cells[0, k, :run.cells.shape[1]] = run.cells[COUNT]
+        cells[1:, k, :run.cells.shape[1]] = run.cells[FIRST][:3]
+    per_cell = cells[0].sum(axis=1) / sizes
+    means = cells[1:] / np.maximum(cells[0], 1.0)
+    inside = cells[0] > 0.0
+    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * inside
+    line = lines_through(centred, sizes)
+    spacing = [run.size * run.length for run in runs]
+    slope = np.vstack([line.slope, line.square, line.neighbours, level / per_cell,
+                       line.time_square, sizes, spacing])
+    return slope, excess_of_means(centred, sizes, variance / per_cell)
