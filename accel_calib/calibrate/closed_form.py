@@ -68,6 +68,11 @@ class _Form:
     second: NDArray[np.intp]
 
     @cached_property
+    def pairs(self) -> NDArray[np.intp]:
+        """(2 k,) array, all i and then all j."""
+        return np.concatenate([self.first, self.second])
+
+    @cached_property
     def twice(self) -> Floats:
         """(k,) array, how often each stands in rᵀ A r."""
         return np.where(self.first == self.second, 1.0, 2.0)
@@ -111,7 +116,7 @@ def fit_4(reading: Floats) -> tuple[Floats, Floats]:
     """
     mean, r = _centred(reading)
     third = (r @ np.sum(r * r, axis=-2)[..., np.newaxis])[..., 0]
-    centre, radius = _sphere(r @ np.swapaxes(r, -1, -2), third, r.shape[-1])
+    centre, radius = _sphere(r @ r.swapaxes(-1, -2), third, r.shape[-1])
     return radius[..., np.newaxis, np.newaxis] * _IDENTITY, mean + centre
 
 
@@ -171,7 +176,7 @@ def _checked(mat_w: Floats, vec_v: Floats) -> tuple[Floats, Floats]:
 
 def _centred(reading: Floats) -> tuple[Floats, Floats]:
     """Give the mean (..., 3), and the readings from there on, (..., 3, n)."""
-    transposed = np.swapaxes(reading, -1, -2)
+    transposed = reading.swapaxes(-1, -2)
     mean = transposed.sum(axis=-1) / reading.shape[-2]
     return mean, transposed - mean[..., np.newaxis]
 
@@ -200,7 +205,7 @@ def _quadric(reading: Floats, form: _Form) -> tuple[Floats, Floats]:
     centre, radius = _sphere(moments[..., size:-1, size:-1],
                              moments[..., :3, size:-1].sum(axis=-2), r.shape[-1])
     change = _to_sphere(form, centre, radius[..., np.newaxis])
-    beta = np.linalg.eigh(np.swapaxes(change, -1, -2) @ moments @ change)[1][..., 0]
+    beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
     mat_w, offset = _ellipsoid(form, beta)
     radius = radius[..., np.newaxis]
     return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
@@ -211,8 +216,9 @@ def _moments(form: _Form, r: Floats) -> Floats:
     size = len(form.twice)
     monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
     monomials[..., size:-1, :] = r
-    np.multiply(r[..., form.first, :], r[..., form.second, :], out=monomials[..., :size, :])
-    return monomials @ np.swapaxes(monomials, -1, -2)
+    pairs = r[..., form.pairs, :]
+    np.multiply(pairs[..., :size, :], pairs[..., size:, :], out=monomials[..., :size, :])
+    return monomials @ monomials.swapaxes(-1, -2)
 
 
 def _to_sphere(form: _Form, centre: Floats, radius: Floats) -> Floats:
@@ -224,7 +230,8 @@ def _to_sphere(form: _Form, centre: Floats, radius: Floats) -> Floats:
     diagonal[..., :size] = twice
     diagonal[..., size:] = 1.0 / radius
     change[..., size:-1, :size] = ((moved / radius) @ form.linear).reshape(*lead, 3, size)
-    change[..., -1, :size] = form.twice * moved[..., form.first] * moved[..., form.second]
+    pairs = moved[..., form.pairs]
+    change[..., -1, :size] = form.twice * pairs[..., :size] * pairs[..., size:]
     change[..., -1, size:-1] = moved
     change[..., -1, -1] = 1.0
     return change
@@ -242,7 +249,7 @@ def _ellipsoid(form: _Form, beta: Floats) -> tuple[Floats, Floats]:
         field_squared = ((along * along * values).sum(axis=-1, keepdims=True) / 4.0
                          - beta[..., -1:] * sign)  # B²
         gain = np.sqrt(field_squared) / np.sqrt(values)
-        mat_w = (vectors * gain[..., np.newaxis, :]) @ np.swapaxes(vectors, -1, -2)
+        mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
         return mat_w, (vectors @ along[..., np.newaxis])[..., 0] / -2.0
 
 
