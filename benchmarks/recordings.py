@@ -186,8 +186,9 @@ def _page(lines: str, before: str, arguments: Sequence[str] | None) -> str:
     return (f'# Figures of recordings\n\nMade by `python benchmarks/recordings.py {given}`. '
             'Medians over the repeats\n(sets); processes that are compared take turns. A rate '
             'is that of the whole work: opening the bag,\nreading, poses, or writing the '
-            f'corrected copy. Memory is bounded where ten times the messages take less than 3 % of '
-            f'their bytes more.\n\nMachine: {before}.\n\n{lines}\n')
+            'corrected copy; of rosbags it is that of the messages alone. Memory is\nbounded '
+            'where ten times the messages take less than 3 % of their bytes more.\n\n'
+            f'Machine: {before}.\n\n{lines}\n')
 
 
 if __name__ == '__main__':
