@@ -107,6 +107,12 @@ def first_of(client: subprocess.Popen[str]) -> int:
     return int(client.stdout.readline())
 
 
+def end(running: subprocess.Popen[str]) -> None:
+    """End a process that has not ended yet."""
+    if running.poll() is None:
+        running.communicate(timeout=60)
+
+
 @contextmanager
 def process(command: list[str], environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
     """Run a Python program; end it by the end of its input, or by SIGTERM."""
@@ -117,7 +123,7 @@ def process(command: list[str], environment: dict[str, str]) -> Iterator[subproc
     finally:
         if command[0] == '-m':
             running.send_signal(signal.SIGTERM)
-        running.communicate(timeout=20)
+        end(running)
 
 
 def trial(command: list[str], rate: float, during: Callable[[], object], *,
@@ -143,7 +149,7 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         environment = {**os.environ, 'ROS_LOG_DIR': folder, 'ROS_HOME': folder}
         sent_file, heard_file = Path(folder) / 'sent.npy', Path(folder) / 'heard.npy'
         listen = ([str(CLIENTS), 'listen', '--file', str(heard_file)] if listened
-                  else ['-c', 'input()'])
+                  else ['-c', 'import sys; sys.stdin.read()'])
         drive = [str(CLIENTS), 'drive', f'--rate={rate}', '--file', str(sent_file)]
         with process(listen, environment) as user, process(drive, environment) as driver:
             first_of(driver)
@@ -155,6 +161,7 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
                 during()
                 cpu, last = cpu_seconds(measured.pid) - cpu, time.monotonic_ns()
                 time.sleep(0.3)
+                end(driver)  # first, for what is flooded may not see that it is to end
         sent = np.load(sent_file)
         heard = np.load(heard_file) if listened else np.empty((0, 2), np.int64)
     return Trial(cpu, start, first, last, sent, heard).between(first, last)
