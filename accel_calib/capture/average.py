@@ -12,7 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Runs that ended to one column of figures each, many at a time."""
+"""
+Runs that ended to one column of figures each, many at a time.
+
+The noise of a mean is taken along the mean where that is known to be the vertical: a sensor that
+settles tilts, which moves its reading across; its mean is right for its mean attitude, and the
+fit asks for the noise along the force only.
+
+"""
 
 from __future__ import annotations
 
@@ -38,11 +45,12 @@ EXCESS = 40               # variance of the mean over that of independent sample
 BESIDE = 41               # whether the reading sloped just before or after
 ORIENTATION = 42
 AROUND = slice(43, 45)    # temperature and supply voltage
-FIGURES = 45
+ALONG = 45                # as EXCESS, along the mean reading where that is the vertical
+FIGURES = 46
 
 
-def figures(runs: Sequence[Run]) -> Floats:
-    """Give what runs come to, (FIGURES, k)."""
+def figures(runs: Sequence[Run], *, known_units: bool) -> Floats:
+    """Give what runs come to, (FIGURES, k); `known_units` if 0 is no force, but for the offset."""
     found = np.empty((FIGURES, len(runs)))
     if not runs:
         return found
@@ -54,7 +62,8 @@ def figures(runs: Sequence[Run]) -> Floats:
     level = total[LEVEL] / np.maximum(total[WINDOWS], 1.0)
     found[MEAN] = shift + np.array([run.origin for run in runs]).T
     found[STD] = np.sqrt(variance)
-    found[SLOPE], found[EXCESS] = _noise(runs, variance, level[:3])
+    found[SLOPE], found[EXCESS], found[ALONG] = _noise(runs, variance, level[:3],
+                                                       found[MEAN][:3] if known_units else None)
     spread = np.sqrt((1.0 + np.maximum(found[EXCESS], 1.0)) / count)
     found[LOWEST] = level * np.exp(-2.0 * spread)
     found[AVERAGE] = level
@@ -68,8 +77,9 @@ def figures(runs: Sequence[Run]) -> Floats:
     return found
 
 
-def _noise(runs: Sequence[Run], variance: Floats, level: Floats) -> tuple[Floats, Floats]:
-    """Give `SLOPE` and `EXCESS`, from the means of cells."""
+def _noise(runs: Sequence[Run], variance: Floats, level: Floats, mean: Floats | None
+           ) -> tuple[Floats, Floats, Floats]:
+    """Give `SLOPE`, `EXCESS` and `ALONG`, from the means of cells."""
     sizes = np.array([run.cells.shape[1] for run in runs], dtype=float)
     cells = np.zeros((4, len(runs), int(sizes.max())))
     for k, run in enumerate(runs):
@@ -83,4 +93,10 @@ def _noise(runs: Sequence[Run], variance: Floats, level: Floats) -> tuple[Floats
     spacing = [run.size * run.length for run in runs]
     slope = np.vstack([line.slope, line.square, line.neighbours, level / per_cell,
                        line.time_square, sizes, spacing])
-    return slope, excess_of_means(centred, sizes, variance / per_cell)
+    white = variance / per_cell
+    excess = excess_of_means(centred, sizes, white)
+    if mean is None:
+        return slope, excess, excess
+    up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
+    along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
+    return slope, excess, excess_of_means(along, sizes, np.sum(up**2 * white, axis=0)[np.newaxis])

@@ -153,7 +153,7 @@ class StillDetector:
     def current(self) -> Dwell | None:
         """Give the running dwell so far, if it makes a pose already."""
         run = None if self._tracker is None else self._tracker.current()
-        told = [] if run is None else self._beside(figures([run]), list(self._figures))
+        told = [] if run is None else self._beside(figures([run], known_units=self._rule.known), list(self._figures))
         return told[0] if told else None
 
     def dwells(self) -> list[Dwell]:
@@ -209,7 +209,7 @@ class StillDetector:
     def _keep(self, found: list[Run]) -> int:
         """Keep what these come to, and give their number."""
         if found:
-            self._figures.extend(figures(found).T.copy())
+            self._figures.extend(figures(found, known_units=self._rule.known).T.copy())
         return len(found)
 
     def _judged(self) -> list[Dwell | None]:

@@ -121,13 +121,19 @@ def judged(table: Floats, rule: Rule, first: int = 0) -> list[Dwell | None]:
     """
     slopes = _slopes(table[row.SLOPE])
     quiet = _quiet(table, slopes, rule)
-    common = float(np.median(table[row.EXCESS, quiet])) if quiet.any() else 1.0
-    excess = np.maximum(max(1.0, common), table[row.EXCESS] / _OWN_EXCESS)
+    across, along = (_excess(table[each], quiet) for each in (row.EXCESS, row.ALONG))
+    excess = np.minimum(across, along)
     turned, sure = _by_gyro(table, quiet, rule)
-    good = quiet & ~turned & (sure | rule.rests(slopes, excess))
+    good = quiet & ~turned & (sure | rule.rests(slopes, across))
     std, count = _counts(table[:, first:], excess[first:], rule)
     return [_dwell(*each) if fine else None
             for fine, *each in zip(good[first:], table.T[first:], std.T.copy(), count.tolist())]
+
+
+def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
+    """Give the excess of the noise of each mean, by all of them."""
+    common = float(np.median(own[quiet])) if quiet.any() else 1.0
+    return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
 
 
 def _slopes(parts: Floats) -> Trend:
@@ -151,12 +157,12 @@ def _by_gyro(table: Floats, quiet: NDArray[np.bool_], rule: Rule
     Tell by the gyro which dwells were turned, and which surely were not.
 
     Its bias is the median over the dwells that are quiet, and a rate about the vertical turns no
-    pose.
+    pose. Beside native units it may be in counts too, and is not asked.
 
     """
     up, rates = table[row.MEAN][:3], table[row.MEAN][3:]
     known = quiet & np.isfinite(rates).all(axis=0)
-    if not rule.si_rates or known.sum() < _BIAS_DWELLS:
+    if not rule.known or known.sum() < _BIAS_DWELLS:
         return np.zeros_like(quiet), np.zeros_like(quiet)
     off = rates - np.median(rates[:, known], axis=1, keepdims=True)
     spread = _MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))

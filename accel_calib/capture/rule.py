@@ -128,7 +128,7 @@ class Rule:
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings = settings
-        self._known = units.name != 'native'
+        self.known = units.name != 'native'
         self._per_g = units.per_g
         self._lowest = np.full(3, np.inf)
         self._highest = np.full(3, -np.inf)
@@ -140,14 +140,9 @@ class Rule:
     @property
     def scale(self) -> float:
         """Give the reading of 1 g; for native units half the range of the readings at rest."""
-        if self._known:
+        if self.known:
             return self._per_g
         return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
-
-    @property
-    def si_rates(self) -> bool:
-        """Tell whether rates are taken to be in rad/s: not beside readings in native units."""
-        return self._known
 
     def noise_of(self, mean: Floats) -> Floats:
         """
@@ -179,7 +174,7 @@ class Rule:
         """Give the (3 or 6, n) largest variances of a still window at this noise."""
         limit = noise * ratio
         limit[3:] = noise[3:] * rate_ratio
-        if self._known:
+        if self.known:
             most = np.minimum(noise[:3] + (SHAKING_G * self._per_g)**2,
                               (STD_CAP_G * self._per_g)**2)
             np.minimum(limit[:3], most, out=limit[:3])
@@ -232,7 +227,7 @@ class Rule:
 
         """
         drift = drift_g * scale
-        if not self._known:
+        if not self.known:
             drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=0)))
         large = np.sum(found.slope**2, axis=0) > drift**2
         return np.asarray(large & (found.strength > strength))
@@ -246,7 +241,7 @@ class Rule:
         quiet = np.all(level[:3] <= limit[:3], axis=0)
         if len(level) > 3:
             quiet &= ~np.any(level[3:] > limit[3:], axis=0)
-        if self._known:
+        if self.known:
             norm = np.sqrt(np.sum(mean[:3]**2, axis=0)) / self._per_g
             quiet &= np.abs(norm - 1.0) <= self._settings.still_norm_tolerance
         if self._settings.still_gyro_max > 0.0 and len(mean) > 3:
@@ -254,7 +249,7 @@ class Rule:
         return np.asarray(quiet)
 
     def _scales(self, mean: Floats, quiet: NDArray[np.bool_]) -> Floats:
-        if self._known:
+        if self.known:
             return np.asarray(self._per_g)
         at_rest = np.where(quiet, mean[:3], np.nan)
         low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
