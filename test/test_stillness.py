@@ -164,6 +164,16 @@ def test_slow_turning_of_a_noisy_sensor_leaves_no_pose(speed):
     assert np.all(result.poses['time'] < 14.0)
 
 
+def test_a_slow_turn_within_a_long_rest_of_a_noisy_sensor_is_found():
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        time = np.arange(1400) / 100.0
+        angle = np.radians(np.clip(time - 4.0, 0.0, 6.0) * np.where(seed % 2, 1.0, -1.0))
+        angle -= 0.7 * np.radians(np.clip(time, 0.0, 4.0) + np.maximum(time - 10.0, 0.0))
+        force = np.column_stack([np.sin(angle), np.zeros(1400), np.cos(angle)])
+        assert len(captured(time, force + 0.05 * rng.normal(size=force.shape)).poses) == 0
+
+
 def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
     """Give a sensor put down again and again; one rest is turned at 1 °/s. Its gyro tells."""
     rng = np.random.default_rng(3)
@@ -298,7 +308,7 @@ def test_a_detector_keeps_only_the_last_dwells_and_those_are_as_they_would_be():
 
 
 def test_a_dwell_that_turned_out_not_to_be_still_is_withdrawn():
-    time, reading, _ = turned(2, noise=2e-3, poses=4)
+    reading = turned(2, noise=2e-3, poses=4)[1]
     first, held = still(8, 5.0)
     held = held + 0.01 * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
     reading = np.concatenate([held, [[0.0, 0.0, 3.0]] * 100, reading])

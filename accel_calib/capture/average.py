@@ -27,7 +27,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .noise import excess_of_means
+from .noise import excess_of_means, strength_of
 from .run import LEVEL, Run, WINDOWS
 from .sliding import lines_through
 from .sums import CONTEXT_COUNT, CONTEXT_SUM, COUNT, FIRST, SECOND, TIME
@@ -46,7 +46,8 @@ BESIDE = 41               # whether the reading sloped just before or after
 ORIENTATION = 42
 AROUND = slice(43, 45)    # temperature and supply voltage
 ALONG = 45                # as EXCESS, along the mean reading where that is the vertical
-FIGURES = 46
+PARTS = slice(46, 52)     # slopes over halves of the dwell [1/s], and their strengths
+FIGURES = 52
 
 
 def figures(runs: Sequence[Run], *, known_units: bool) -> Floats:
@@ -62,8 +63,8 @@ def figures(runs: Sequence[Run], *, known_units: bool) -> Floats:
     level = total[LEVEL] / np.maximum(total[WINDOWS], 1.0)
     found[MEAN] = shift + np.array([run.origin for run in runs]).T
     found[STD] = np.sqrt(variance)
-    found[SLOPE], found[EXCESS], found[ALONG] = _noise(runs, variance, level[:3],
-                                                       found[MEAN][:3] if known_units else None)
+    found[SLOPE], found[PARTS], found[EXCESS], found[ALONG] = _noise(
+        runs, variance, level[:3], found[MEAN][:3] if known_units else None)
     spread = np.sqrt((1.0 + np.maximum(found[EXCESS], 1.0)) / count)
     found[LOWEST] = level * np.exp(-2.0 * spread)
     found[AVERAGE] = level
@@ -78,8 +79,8 @@ def figures(runs: Sequence[Run], *, known_units: bool) -> Floats:
 
 
 def _noise(runs: Sequence[Run], variance: Floats, level: Floats, mean: Floats | None
-           ) -> tuple[Floats, Floats, Floats]:
-    """Give `SLOPE`, `EXCESS` and `ALONG`, from the means of cells."""
+           ) -> tuple[Floats, Floats, Floats, Floats]:
+    """Give `SLOPE`, `PARTS`, `EXCESS` and `ALONG`, from the means of cells."""
     sizes = np.array([run.cells.shape[1] for run in runs], dtype=float)
     cells = np.zeros((4, len(runs), int(sizes.max())))
     for k, run in enumerate(runs):
@@ -95,8 +96,29 @@ def _noise(runs: Sequence[Run], variance: Floats, level: Floats, mean: Floats | 
                        line.time_square, sizes, spacing])
     white = variance / per_cell
     excess = excess_of_means(centred, sizes, white)
+    parts = _parts(centred, sizes, level / per_cell, np.array(spacing))
     if mean is None:
-        return slope, excess, excess
+        return slope, parts, excess, excess
     up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
     along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
-    return slope, excess, excess_of_means(along, sizes, np.sum(up**2 * white, axis=0)[np.newaxis])
+    white = np.sum(up**2 * white, axis=0)[np.newaxis]
+    return slope, parts, excess, excess_of_means(along, sizes, white)
+
+
+def _parts(centred: Floats, sizes: Floats, white: Floats, spacing: Floats) -> Floats:
+    """
+    Give slopes over the first, the middle and the last half, and their strengths, (6, k).
+
+    A turn that begins or ends within a dwell shows there better than over the whole.
+
+    """
+    half = sizes // 2
+    inside = np.arange(int(half.max())) < half[:, np.newaxis]
+    found = []
+    for start in (0.0 * half, (sizes - half) // 2, sizes - half):
+        index = start[:, np.newaxis] + np.arange(inside.shape[1])
+        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
+        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
+        found.append(strength_of(lines_through(part, half), spacing, white, slice(0, 3)))
+    return np.array([*(np.sqrt(np.sum(each.slope**2, axis=0)) for each in found),
+                     *(each.strength for each in found)])

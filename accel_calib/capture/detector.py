@@ -153,7 +153,10 @@ class StillDetector:
     def current(self) -> Dwell | None:
         """Give the running dwell so far, if it makes a pose already."""
         run = None if self._tracker is None else self._tracker.current()
-        told = [] if run is None else self._beside(figures([run], known_units=self._rule.known), list(self._figures))
+        if run is None:
+            return None
+        found = figures([run], known_units=self._rule.known)
+        told = self._beside(found, list(self._figures))
         return told[0] if told else None
 
     def dwells(self) -> list[Dwell]:

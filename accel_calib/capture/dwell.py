@@ -17,19 +17,20 @@ A dwell: the sums of the chunks of a still stretch, and what they come to.
 
 Mean and standard deviation are those of all samples. The number of samples is divided by the
 excess of the noise of the mean over that of independent samples (see `noise`), so that
-std/√count is the noise of the mean. One short dwell tells the excess badly, and it belongs to
-the sensor: the median over its dwells is used, unless a dwell shows clearly more. Samples that
-are rounded to steps of q leave an error in the mean that no averaging removes when their own
-noise σ is less than a step: its variance is (q²/12) exp(-4π² σ²/q²) [1]_. The quietest
-stretch seen tells σ; samples that flip between two steps do not.
+std/√count is the noise of the mean, along the force (see `average`). One short dwell tells the
+excess badly, and it belongs to the sensor: the median over its dwells is used, unless a dwell
+shows clearly more. Samples that are rounded to steps of q leave an error in the mean that no
+averaging removes when their own noise σ is less than a step: its variance is
+(q²/12) exp(-4π² σ²/q²) [1]_. The quietest stretch seen tells σ; samples that flip between two
+steps do not.
 
 A dwell is refused when its windows vary on average more than `DWELL_RATIO` times the sensor's
 noise, by more than the uncertainty of that average: a tremor that the threshold of a single
 window let pass. The noise may become known after the dwell ended, so dwells are judged again
-when they are asked for. And it is refused when the reading moved steadily through it, or when
-its noise would hide that: it must show that it was not turned (see `rule.TURN_G`), which takes
-the longer the noisier the sensor is. Once five dwells have told the bias of the gyro, the gyro
-decides.
+when they are asked for. And it is refused when the reading moved steadily through it or through
+half of it, or when its noise would hide that: it must show that it was not turned (see
+`rule.TURN_G`), which takes the longer the noisier the sensor is. Once five dwells have told the
+bias of the gyro, the gyro decides.
 
 References
 ----------
@@ -59,6 +60,12 @@ DWELL_RATIO = 3.2
 
 DWELL_RATE_RATIO = 1600.0
 """The same for the rate: what the accelerometer does not feel does no harm."""
+
+PART_SLOPE_G = 5e-3
+"""Slope through half of a dwell that is let pass [g/s]."""
+
+PART_STRENGTH = 20.0
+"""It stands out if the sum of its squared scores is above: p about 2e-4."""
 
 _OWN_EXCESS = 1.5   # an estimate of one dwell is that uncertain
 _BIAS_DWELLS = 5    # that tell the bias of the gyro
@@ -148,6 +155,9 @@ def _quiet(table: Floats, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
     strength = np.where(table[row.BESIDE] > 0.0, WEAK_STRENGTH, STRENGTH)
     moved = rule.moved(slopes, np.asarray(rule.scale), table[row.AVERAGE][:3], strength,
                        DWELL_SLOPE_G)
+    parts = table[row.PARTS].reshape(2, 3, -1)
+    turned = np.any((parts[0] > PART_SLOPE_G * rule.scale) & (parts[1] > PART_STRENGTH), axis=0)
+    moved |= turned & (rule.scale > 0.0)
     return np.asarray(~moved & ~np.any(table[row.LOWEST] > limit, axis=0))
 
 
