@@ -71,6 +71,6 @@ def _fitted(poses: Sequence[Pose], unit: str) -> str:
         quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit),  # type: ignore
                             model='10', method='algebraic').quality
     except (AccelCalibError, ValueError) as error:
-        return f'{type(error).__name__} | '
+        return f'no fit ({type(error).__name__}) | '
     chi2 = quality.chi2_per_dof
     return f'{quality.rms_after_mg:.3f} | {"" if chi2 is None else f"{chi2:.1f}"}'
