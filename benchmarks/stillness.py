@@ -223,8 +223,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     noisy = measured(given.sets, given.seed, noisy=True)
     lines = lines_of(usual, 'noise 0.3 to 5 mg', given.sets)
     lines += lines_of(noisy, 'noise 50 mg', given.sets)
-    parts = [ABOUT.format(command=f'--sets {given.sets} --seed {given.seed}'), table(lines), NOT_REACHED,
-             '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg', compared(noisy)]
+    parts = [ABOUT.format(command=f'--sets {given.sets} --seed {given.seed}'), table(lines),
+             NOT_REACHED, '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg', compared(noisy)]
     if given.data:
         parts += ['## Real recordings', ABOUT_REAL, table_of_real(given.data, RULES)]
     text = '\n\n'.join(parts) + '\n'
