@@ -59,7 +59,7 @@ lint: $(VENV)/extra-dev
 
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
-	@for name in imu_path recordings fits; do \
+	@for name in imu_path recordings stillness_speed fits; do \
 		$(BIN)/python benchmarks/$$name.py --markdown docs/figures/$$name.md || exit 1; done
 
 clean:

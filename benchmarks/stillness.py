@@ -37,6 +37,8 @@ from stillness_case import Case, case_of, KINDS
 from stillness_real import table_of_real
 import stillness_rules as rules
 
+DATA = Path(__file__).parents[2] / 'shared' / 'data'
+
 RULES: dict[str, Callable[[Case], list[rules.Pose]]] = {
     'ours': lambda case: rules.ours(case, gyro=False),
     'ours, gyro': lambda case: rules.ours(case, gyro=True),
@@ -49,7 +51,7 @@ WHAT = {'plain': 'hand-turned only', 'tremor': 'and held in the hand, tremor of 
 
 ABOUT = """# Figures of the stillness detector
 
-Made by `python benchmarks/stillness.py {command} --data FOLDER --markdown FILE`.
+Made by `python benchmarks/stillness.py {command} --markdown FILE`.
 Each recording has ten rests of 2.5 to 8 s, 50 to 1000 Hz, noise that is white or has a
 correlation time of 20 or 200 ms, and a gyro with 2 mrad/s of noise and a bias. *variance* (three
 times the standard deviation of the first two seconds, as imu_tk and others do) and *gyro* (mean
@@ -216,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--sets', type=int, default=60, help='recordings of each kind')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--data', type=Path, help='folder of the real recordings')
+    parser.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
     parser.add_argument('--markdown', type=Path, help='write the tables to this file')
     given = parser.parse_args(arguments)
     usual = measured(given.sets, given.seed, noisy=False)
@@ -224,8 +226,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = lines_of(usual, 'noise 0.3 to 5 mg', given.sets)
     lines += lines_of(noisy, 'noise 50 mg', given.sets)
     parts = [ABOUT.format(command=f'--sets {given.sets} --seed {given.seed}'), table(lines),
-             NOT_REACHED, '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg', compared(noisy)]
-    if given.data:
+             NOT_REACHED, '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg',
+             compared(noisy)]
+    if given.data.is_dir():
         parts += ['## Real recordings', ABOUT_REAL, table_of_real(given.data, RULES)]
     text = '\n\n'.join(parts) + '\n'
     print(text)

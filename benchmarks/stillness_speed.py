@@ -38,6 +38,7 @@ from accel_calib.units import units_of
 from figures import Line, table
 import numpy as np
 
+DATA = Path(__file__).parents[2] / 'shared' / 'data'
 SIZES = (10**5, 10**6, 10**7, 3 * 10**7)
 RATES_HZ = (100.0, 1000.0)
 G = units_of('g')
@@ -46,7 +47,7 @@ _STREAMED = 60_000
 
 ABOUT = """# Speed of the stillness detector
 
-Made by `python benchmarks/stillness_speed.py --seed {seed} --data FOLDER --markdown FILE`. CPU
+Made by `python benchmarks/stillness_speed.py --seed {seed} --markdown FILE`. CPU
 time of one core, arrays in memory, the least of some repeats; a machine shared with others. The
 sensor rests for 4 s and is shaken for one. Memory grows with the poses only, 2 kB each."""
 
@@ -154,13 +155,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--largest', type=int, default=SIZES[-1], help='samples, at most')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--data', type=Path, help='folder of the real recordings')
+    parser.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args(arguments)
     sizes = [size for size in SIZES if size <= given.largest]
     capture(recording_of(SIZES[0], RATES_HZ[0], given.seed), G)
     lines, each = of_arrays(sizes, given.seed)
-    if given.data:
+    if given.data.is_dir():
         lines += of_xsens(given.data)
     lines += of_stream(given.seed)
     resting = recording_of(10**6, 100.0, given.seed, rest=1e5)
