@@ -119,6 +119,6 @@ def _parts(centred: Floats, sizes: Floats, white: Floats, spacing: Floats) -> Fl
         index = start[:, np.newaxis] + np.arange(inside.shape[1])
         part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
         part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
-        found.append(strength_of(lines_through(part, half), spacing, white, slice(0, 3)))
+        found.append(strength_of(lines_through(part, half), spacing, white))
     return np.array([*(np.sqrt(np.sum(each.slope**2, axis=0)) for each in found),
                      *(each.strength for each in found)])

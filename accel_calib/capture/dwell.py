@@ -145,8 +145,7 @@ def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
 
 def _slopes(parts: Floats) -> Trend:
     slope, square, neighbours, white = parts[:12].reshape(4, 3, -1)
-    return strength_of(Line(slope, square, neighbours, parts[12], parts[13]), parts[14], white,
-                       slice(0, 3))
+    return strength_of(Line(slope, square, neighbours, parts[12], parts[13]), parts[14], white)
 
 
 def _quiet(table: Floats, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:

@@ -72,27 +72,25 @@ class Trend(NamedTuple):
     error: Floats
 
 
-def strength_of(line: Line, spacing: float | Floats, white: Floats, axes: slice) -> Trend:
+def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     """
     Give slopes with how they stand to their noise.
 
     Parameters
     ----------
     line : Line
-        Lines through cells, (3 or more, n).
-    spacing : float or (n,) array
+        Lines through cells, (3, ...): three axes are taken together.
+    spacing : float or array
         Time from cell to cell [s].
-    white : (3 or more, n) array
+    white : (3, ...) array
         Variance of a cell mean, were the samples independent.
-    axes : slice
-        The three axes to take together.
 
     """
     size = line.length
-    white = white[axes] + _TINY
-    slope, weight = line.slope[axes] / spacing, 1.0 / white
-    square = _over_axes(line.square[axes] * weight)
-    neighbours = _over_axes(line.neighbours[axes] * weight)
+    white = white + _TINY
+    slope, weight = line.slope / spacing, 1.0 / white
+    square = _over_axes(line.square * weight)
+    neighbours = _over_axes(line.neighbours * weight)
     correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
     power = np.maximum(square / (3.0 * (size - 2)), 1.0)
     excess = power * (1.0 + correlation) / (1.0 - correlation)

@@ -73,7 +73,10 @@ def sliding_max(values: Floats, length: int) -> Floats:
 
 
 def lines(values: Floats, length: int) -> Line:
-    """Give the lines through all windows of this length."""
+    """Give the lines through all windows of this length, (axes, n - length + 1)."""
+    if values.shape[-1] == length:
+        centred = values - values.sum(axis=1, keepdims=True) / length
+        return lines_through(centred[:, np.newaxis], np.array([length]))
     total, weighted = _weighted(values, length)
     first, last = values[..., :1 - length], values[..., length - 1:]
     square = sliding_sum(values * values, length)

@@ -87,10 +87,16 @@ def stretch(rows: Floats, level: Floats, length: int, size: int, spacing: float)
     square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
     white += _DIGITS * square.repeat(3, axis=0)
     line = lines(cells, length)
-    trends = [strength_of(line, spacing, white, slice(first, first + 3))
-              for first in range(0, axes, 3)]
-    return Stretch(trends[0], np.array([each.excess for each in trends]), variance,
-                   sliding_max(level[:3], inner), count)
+    line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
+                         neighbours=_grouped(line.neighbours))
+    found = strength_of(line, spacing, _grouped(white))
+    reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
+    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count)
+
+
+def _grouped(values: Floats) -> Floats:
+    """Give (3, groups, n) of (axes, n)."""
+    return values.reshape(-1, 3, values.shape[-1]).swapaxes(0, 1)
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
