@@ -143,8 +143,8 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         Whether there is a user.
 
     """
-    os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT),
-                      ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
+    os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, 'ROS_LOG_DIR': folder, 'ROS_HOME': folder}
         sent_file, heard_file = Path(folder) / 'sent.npy', Path(folder) / 'heard.npy'
