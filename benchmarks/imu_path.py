@@ -282,9 +282,9 @@ def main() -> int:
     text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py '
             f'--markdown FILE`. {words}\nThe node has a levelled 10-parameter calibration, and '
             'the messages have covariances, which makes the most work.\n'
-            'Driver and user are rclpy processes too; a set is a turn of all trials. A start waits for\n'
-            'DDS to find the others, which here takes 0.2 s or, as often, the 3 s to its next '
-            'announcement.\n\n'
+            'Driver and user are rclpy processes too; a set is a turn of all trials. A start\n'
+            'waits for DDS to find the others, which here takes 0.2 s or, as often, the 3 s to its\n'
+            'next announcement.\n\n'
             f'{table(lines)}\n\n{plain}\n')
     print(text)
     if given.markdown:
