@@ -24,6 +24,7 @@ import struct
 from typing import Any
 
 from accel_calib import imu
+from accel_calib.errors import InputError
 from accel_calib.files import read_calibration, write_calibration
 from accel_calib.model import Model
 from accel_calib.ros import conversion
@@ -141,6 +142,25 @@ def test_rewritten_messages_are_the_typed_ones(
         np.testing.assert_allclose(
             [motion.vector.x, motion.vector.y, motion.vector.z],
             np.array(conversion.reading_of(expected)) - gravity, atol=1e-11)
+
+
+def test_each_message_is_corrected_at_its_own_temperature(stored: Stored) -> None:
+    calibration = calibration_of(stored(), levelled=False, effects=False)
+    values = {**calibration.model.values, 'offset_temperature': np.array([1e-3, 2e-3, -1e-3])}
+    calibration = replace(calibration, model=Model(values), covariance=np.eye(12) * 1e-8)
+    rng = np.random.default_rng(7)
+    message = random_message(rng)
+    data = serialized(message, rng)
+    layout = layout_of(data)
+    assert layout is not None
+    rewriter = Rewriter(layout, calibration, 1.0, '')
+    for temperature in (20.0, 20.0, 35.0, 20.0):
+        corrected = rewriter(data, temperature)
+        assert corrected is not None
+        check_equal(deserialize_message(corrected, Imu), conversion.corrected_message(
+            message, calibration, 1.0, {'temperature': np.array([temperature])}, ''))
+    with pytest.raises(InputError, match='temperature'):
+        rewriter(data, float('nan'))
 
 
 def test_samples_for_the_watch_are_those_of_typed_messages() -> None:
