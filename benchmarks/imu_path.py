@@ -283,7 +283,7 @@ def main() -> int:
             f'--markdown FILE`. {words}\nThe node has a levelled 10-parameter calibration, and '
             'the messages have covariances, which makes the most work.\n'
             'Driver and user are rclpy processes too; a set is a turn of all trials. A start\n'
-            'waits for DDS to find the others: 0.2 s or, as often, the 3 s to its next announcement.\n\n'
+            'waits for DDS to find the others: 0.2 s or, as often, 3 s.\n\n'
             f'{table(lines)}\n\n{plain}\n')
     print(text)
     if given.markdown:
