@@ -21,8 +21,8 @@ the median over the sets. Poor geometry has a page of its own, [geometry](geomet
 
 What is not reached: of 12 poses three residuals are left. Without the noise they have to tell it
 and a knocked pose at once; where the noise is stated too small, the pose that looks worst may be
-left out, and what remains looks quiet. Of 6 poses of a sensor that needs 10 parameters model 7 fits
-all exactly, so that nothing shows the cross-axis gains that it lacks: any model is 15 mg off.
+left out, and what remains looks quiet. Of 6 poses of a sensor that needs 10 parameters model 7
+fits all exactly, so that nothing shows the cross-axis gains that it lacks: any model is 15 mg off.
 
 """
 

@@ -37,7 +37,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .likelihood import believable
+from .likelihood import believable, LEAST_NOISE
 from .norm_fit import form_of
 from ..effects import EFFECTS
 from ..model import MODELS, parameter_names
@@ -86,8 +86,9 @@ def pose_noise(noise: Floats | None, directions: Floats) -> Floats:
     believed = None if noise is None or not len(noise) else believable(noise)
     if believed is None:
         return np.ones(len(directions))
-    along: Floats = np.linalg.norm(directions * believed, axis=1)
-    return along
+    along = np.linalg.norm(directions * believed, axis=1)
+    median = np.median(along)
+    return np.maximum(along, LEAST_NOISE * median) if median > 0.0 else np.ones(len(directions))
 
 
 def relative_weights(noise: Floats | None, count: int) -> Floats:
