@@ -46,10 +46,10 @@ MEMORY = 6
 _FEWEST = 3
 """Rests that a change must have lasted."""
 
-SURE = float(np.exp(14.0))
-"""Ratio of the likelihoods from which a change is believed: one in 1.2 million."""
+SURE = float(np.exp(13.0))
+"""Ratio of the likelihoods from which a change is believed: one in 440,000."""
 
-_KNOCKED, _KNOCK = 0.01, 0.05
+_KNOCKED, _KNOCK = 0.003, 0.05
 _SIZES = (0.005, 0.05)   # [g]
 _WANDER = 0.1            # part of a change by which it goes on to move from rest to rest
 _CLEAR = 20.0              # ratio from which one way is told from the other
