@@ -263,7 +263,8 @@ def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
             for name, each in flood.items():
                 each.append(trial(commands[name], 0.0, pause))
             calls = Calls(seconds)
-            runs.append((trial(node(linear, 'auto_capture:=false'), 1000.0, calls), calls))
+            with stored() as (own, _):  # they store what they find
+                runs.append((trial(node(own, 'auto_capture:=false'), 1000.0, calls), calls))
             print(f'turn {turn + 1} of {turns}', file=sys.stderr, flush=True)
         many = {name: [trial(commands[name], 8000.0, lambda: time.sleep(long))]
                 for name in flood}
@@ -274,17 +275,18 @@ def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
 def main() -> int:
     """Print the table, and write it where that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--turns', type=int, default=5)
     parser.add_argument('--quick', action='store_true', help='one short turn')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args()
     words = machine()
-    lines, plain = run(*((1, 2.0, 5.0) if given.quick else (5, 6.0, 60.0)))
-    text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py '
-            f'--markdown FILE`. {words}\nThe node has a levelled 10-parameter calibration, and '
-            'the messages have covariances, which makes the most work.\n'
-            'Driver and user are rclpy processes too; a set is a turn of all trials. A start\n'
-            'waits for DDS to find the others: 0.2 s or, as often, 3 s.\n\n'
-            f'{table(lines)}\n\n{plain}\n')
+    lines, plain = run(*((1, 2.0, 5.0) if given.quick else (given.turns, 6.0, 60.0)))
+    text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py --turns '
+            f'{given.turns} --markdown FILE`. {words}\n'
+            'The node has a levelled 10-parameter calibration, and the messages have covariances,\n'
+            'which makes the most work. Driver and user are rclpy processes too; a set is a turn\n'
+            'of all trials. A start waits for DDS to find the others: 0.2 s or, as often, 3 s.\n'
+            f'`~/fit` and `~/refine` are called back to back.\n\n{table(lines)}\n\n{plain}\n')
     print(text)
     if given.markdown:
         given.markdown.write_text(text, encoding='utf-8')

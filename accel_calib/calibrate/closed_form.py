@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ _RIDGE = 1e-12
 _BLOCK = 8192
 """Poses at a time: their monomials stay in the cache."""
 
-_IDENTITY = np.eye(3)
+_IDENTITY, _ONES = np.eye(3), np.ones(3)
 _TURN_MORE = 'take poses with each side of the sensor up and down, and some edges'
 
 
@@ -169,7 +170,7 @@ def fit_10(reading: Floats) -> tuple[Floats, Floats]:
 
 def _checked(mat_w: Floats, vec_v: Floats) -> tuple[Floats, Floats]:
     """Give the result as it is, but for an only sensor make sure that there is one."""
-    if mat_w.ndim == 2 and not np.isfinite(mat_w[0, 0]):
+    if mat_w.ndim == 2 and not isfinite(mat_w[0, 0]):
         raise RefusedFitError('the poses lie on no ellipsoid', _TURN_MORE)
     return mat_w, vec_v
 
@@ -191,7 +192,7 @@ def _sphere(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
     trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
     kept_apart = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
     centre = np.linalg.solve(second + kept_apart, third[..., np.newaxis])[..., 0] / 2.0
-    squared = trace / count + (centre * centre).sum(axis=-1)
+    squared = trace / count + (centre * centre) @ _ONES
     return centre, np.sqrt(squared + (squared == 0.0))
 
 
@@ -203,7 +204,7 @@ def _quadric(reading: Floats, form: _Form) -> tuple[Floats, Floats]:
     for start in range(_BLOCK, r.shape[-1], _BLOCK):
         moments = moments + _moments(form, r[..., start:start + _BLOCK])
     centre, radius = _sphere(moments[..., size:-1, size:-1],
-                             moments[..., :3, size:-1].sum(axis=-2), r.shape[-1])
+                             _ONES @ moments[..., :3, size:-1], r.shape[-1])
     change = _to_sphere(form, centre, radius[..., np.newaxis])
     beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
     mat_w, offset = _ellipsoid(form, beta)
@@ -246,8 +247,8 @@ def _ellipsoid(form: _Form, beta: Floats) -> tuple[Floats, Floats]:
     values = values * sign
     with np.errstate(invalid='ignore', divide='ignore'):
         along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] * sign / values
-        field_squared = ((along * along * values).sum(axis=-1, keepdims=True) / 4.0
-                         - beta[..., -1:] * sign)  # B²
+        field_squared = (along * along * values) @ _ONES[:, np.newaxis] / 4.0
+        field_squared -= beta[..., -1:] * sign  # B²
         gain = np.sqrt(field_squared) / np.sqrt(values)
         mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
         return mat_w, (vectors @ along[..., np.newaxis])[..., 0] / -2.0
