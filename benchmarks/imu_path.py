@@ -283,8 +283,8 @@ def main() -> int:
     lines, plain = run(*((1, 2.0, 5.0) if given.quick else (given.turns, 6.0, 60.0)))
     text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py --turns '
             f'{given.turns} --markdown FILE`. {words}\n'
-            'The node has a levelled 10-parameter calibration, and the messages have covariances,\n'
-            'which makes the most work. Driver and user are rclpy processes too; a set is a turn\n'
+            'The node has a levelled 10-parameter calibration, and the messages have\n'
+            'covariances, which makes the most work. Driver and user are rclpy processes too; a set is a turn\n'
             'of all trials. A start waits for DDS to find the others: 0.2 s or, as often, 3 s.\n'
             f'`~/fit` and `~/refine` are called back to back.\n\n{table(lines)}\n\n{plain}\n')
     print(text)
