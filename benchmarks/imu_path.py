@@ -284,8 +284,9 @@ def main() -> int:
     text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py --turns '
             f'{given.turns} --markdown FILE`. {words}\n'
             'The node has a levelled 10-parameter calibration, and the messages have\n'
-            'covariances, which makes the most work. Driver and user are rclpy processes too; a set is a turn\n'
-            'of all trials. A start waits for DDS to find the others: 0.2 s or, as often, 3 s.\n'
+            'covariances, which makes the most work. Driver and user are rclpy processes\n'
+            'too; a set is a turn of all trials. A start waits for DDS to find\n'
+            'the others: 0.2 s or, as often, 3 s.\n'
             f'`~/fit` and `~/refine` are called back to back.\n\n{table(lines)}\n\n{plain}\n')
     print(text)
     if given.markdown:
