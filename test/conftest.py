@@ -66,7 +66,8 @@ class Bench:
         from rclpy.node import Node
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=self._domain)
-        self.node = Node('bench', context=self._context)
+        # Its log goes nowhere: rcl keeps one publisher of /rosout by name for all contexts.
+        self.node = Node('bench', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._clients: dict[str, Any] = {}
