@@ -38,6 +38,11 @@ def spread_directions(count: int) -> Floats:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
+def unit(vectors: Floats) -> Floats:
+    """Give (n, 3) vectors at length 1; zeros stay zeros."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """
     Draw directions evenly over the sphere.
@@ -48,8 +53,7 @@ def random_directions(count: int, rng: np.random.Generator) -> Floats:
         Unit vectors.
 
     """
-    drawn = rng.normal(size=(count, 3))
-    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return unit(rng.normal(size=(count, 3)))
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:

@@ -14,7 +14,7 @@
 
 """Poses to calibration: known sensors recovered inside the stated uncertainty, or refused."""
 
-from accel_calib.calibrate import fit_poses, in_g, level, sensing_axes, verify
+from accel_calib.calibrate import fit_poses, in_g, level, outlook, sensing_axes, verify
 from accel_calib.calibrate.sensing_axes import gain_of, lower_triangular
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.model import predict
@@ -345,3 +345,20 @@ def test_poses_are_left_as_they_were():
     for key, values in poses.columns.items():
         np.testing.assert_array_equal(values, before[key])
     assert list(poses.row) == list(numbered(poses.columns))
+
+
+@pytest.mark.parametrize('model', ['4', '7', '10', 'auto'])
+def test_readings_without_any_noise_are_fitted(model):
+    edges = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)
+                      if abs(i) + abs(j) + abs(k) == 2])
+    units = units_of('m/s2')
+    columns = {'reading': edges * (units.per_g / 2 ** 0.5) + [0.3, 0.0, 0.0]}
+    calibration = fit_poses(Poses(columns, numbered(columns)), units, model=model)
+    np.testing.assert_allclose(calibration.offset, [0.3, 0.0, 0.0], atol=1e-12)
+    assert outlook(calibration, model).uncertainty_mg == pytest.approx(0.0, abs=1e-9)
+
+
+def test_auto_with_as_many_poses_as_parameters_says_that_nothing_is_left():
+    calibration = fit_poses(simulated(9, 9)[1], G, model='10')
+    assert 'just as many poses as free parameters' in ' '.join(calibration.warnings)
+    assert fit_poses(simulated(9, 9)[1], G).name in ('4', '7', '10')

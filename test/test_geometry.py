@@ -276,7 +276,7 @@ def test_following_ends_when_a_pose_more_no_longer_pays(model):
 def test_how_well_the_poses_determine_is_told_in_mg():
     directions = follow(40)
     expected = identifiability('10', directions).mean_dilution * 0.4
-    words = next_pose(directions, '10', np.full(len(directions), 0.0004)).words
+    words = next_pose(directions, noise_g=0.0004).words
     assert words.endswith(f'determine |a| to {expected:.2g} mg')
 
 

@@ -17,7 +17,7 @@
 from .agreement import LEVEL
 from .calibration import Calibration, level, Quality, Rejected
 from .comparison import compare, Comparison
-from .fit import fit_poses, METHODS, MODEL_NAMES
+from .fit import fit_poses, MODEL_NAMES
 from .geometry import coverage
 from .identifiability import Identifiability, identifiability
 from .many import fit_many, Fleet
@@ -27,7 +27,7 @@ from .outlook import Outlook, outlook
 from .quality import in_g, Verification, verify
 from .sensing_axes import sensing_axes, SensingAxes
 from .unit_check import check_units
-from .unknown import directions_of
+from .unknown import directions_of, METHODS
 from .wiring import FLAT
 
 __all__ = [

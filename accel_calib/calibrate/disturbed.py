@@ -119,11 +119,12 @@ def extreme(weighted: Floats, jacobian: Floats, kept: NDArray[np.bool_], noise_k
     """
     from scipy.special import chdtrc
 
-    if kept.shape[1] > _MANY:
-        return _far_out(weighted * kept, jacobian * kept[..., np.newaxis], kept, noise_known)
     count, free = np.sum(kept, axis=1), jacobian.shape[2]
     most = np.minimum(int(_LARGEST_SHARE * total), (total - free) // 2)
     limit = np.maximum(most - (total - count), 0)
+    if kept.shape[1] > _MANY:
+        return _far_out(weighted * kept, jacobian * kept[..., np.newaxis], kept, noise_known,
+                        limit)
     order = _one_after_another(weighted * kept, jacobian * kept[..., np.newaxis], kept,
                                int(np.max(limit)))
     found = order.extreme(belief_in(noise_known), limit)
@@ -146,8 +147,8 @@ def _fitted_to(residual: Floats, rows: Floats) -> tuple[Floats, Floats, Floats]:
     return left, np.sum(onto * rows, axis=2), spread
 
 
-def _far_out(residual: Floats, rows: Floats, kept: NDArray[np.bool_], noise_known: bool
-             ) -> NDArray[np.bool_]:
+def _far_out(residual: Floats, rows: Floats, kept: NDArray[np.bool_], noise_known: bool,
+             limit: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Find extreme poses among many: all at once, against the median of the absolute residuals."""
     residual, own, _ = _fitted_to(residual, rows)
     squared = np.where(kept, residual ** 2 / np.maximum(1.0 - own, _TOLD_BY_OTHERS), np.nan)
@@ -155,9 +156,9 @@ def _far_out(residual: Floats, rows: Floats, kept: NDArray[np.bool_], noise_know
     belief = belief_in(noise_known)
     scale = np.nanmedian(squared, axis=1, keepdims=True) / _MEDIAN_OF_CHI2
     size = np.sqrt(np.nan_to_num(squared) * (belief + dof) / (belief + scale * dof))
-    at_most = np.quantile(size, 1.0 - _LARGEST_SHARE, axis=1, keepdims=True)
+    first_left = np.take_along_axis(np.sort(size, axis=1)[:, ::-1], limit[:, np.newaxis], axis=1)
     count = np.sum(kept, axis=1, keepdims=True)
-    out: NDArray[np.bool_] = (size > _critical(size, belief + dof, count)) & (size > at_most)
+    out: NDArray[np.bool_] = (size > _critical(size, belief + dof, count)) & (size > first_left)
     return out
 
 
@@ -176,9 +177,10 @@ def _one_after_another(residual: Floats, rows: Floats, left: NDArray[np.bool_], 
         at = np.argmax(squared, axis=1)
         largest, alone = squared[sensor, at], np.maximum(1.0 - own[sensor, at], _TOLD_BY_OTHERS)
         poses, sizes, rss = [*poses, at], [*sizes, largest], [*rss, rss[-1] - largest]
-        moved = (spread @ rows[sensor, at][..., np.newaxis])[..., 0] / np.sqrt(alone)[:, None]
+        root = np.sqrt(alone)[:, np.newaxis]
+        moved = (spread @ rows[sensor, at][..., np.newaxis])[..., 0] / root
         along = (rows @ moved[..., np.newaxis])[..., 0]
-        residual = residual + along * (residual[sensor, at] / np.sqrt(alone))[:, np.newaxis]
+        residual = residual + along * residual[sensor, at][:, np.newaxis] / root
         own = own + along ** 2
         spread = spread + moved[:, :, np.newaxis] * moved[:, np.newaxis]
         left = left & (np.arange(left.shape[1]) != at[:, np.newaxis])

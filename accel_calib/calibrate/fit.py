@@ -28,12 +28,11 @@ from dataclasses import replace
 from .calibration import Calibration
 from .known import fit_known
 from .unit_check import check_units
-from .unknown import fit_unknown, Method
+from .unknown import fit_unknown, Method, METHODS
 from .wiring import wiring_warnings
 from ..table import Poses
 from ..units import Units
 
-METHODS = ('ml', 'algebraic')
 MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
 
 

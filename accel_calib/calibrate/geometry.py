@@ -81,14 +81,14 @@ def rows_of(name: str, directions: Floats) -> Floats:
     return (by_entry @ form_of('10' if name == '9' else name).linear)[:, np.newaxis]
 
 
-def pose_noise(noise: Floats | None, directions: Floats) -> Floats:
-    """Give the (n,) noise of |reading| from that of (n, 3) pose means; ones if it is unknown."""
-    believed = None if noise is None or not len(noise) else believable(noise)
+def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
+    """Give the (n,) noise of |reading| from that of (n, 3) pose means; None if it is unknown."""
+    believed = believable(noise) if len(directions) else None
     if believed is None:
-        return np.ones(len(directions))
+        return None
     along = np.linalg.norm(directions * believed, axis=1)
     median = np.median(along)
-    return np.maximum(along, LEAST_NOISE * median) if median > 0.0 else np.ones(len(directions))
+    return np.maximum(along, LEAST_NOISE * median) if median > 0.0 else None
 
 
 def relative_weights(noise: Floats | None, count: int) -> Floats:

@@ -46,6 +46,7 @@ from .unknown import (
 )
 from ..errors import RefusedFitError
 from ..model import force_slope, MODELS, parameter_basis, sensor_force
+from ..sphere import unit
 from ..table import Floats, Poses
 from ..units import Units
 
@@ -71,7 +72,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     if units.name == 'native':
         mat_x = closed_form.fit_12(poses.reading, poses['reference'])[0]
         units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
-    directions = _unit(poses['reference'])
+    directions = unit(poses['reference'])
     refuse_if_unfit('12', directions)
     poses_g = in_g(poses, units)
     noise = poses_g.noise if method == 'ml' else None
@@ -96,11 +97,6 @@ def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
     return poses.with_columns(reference=force), 'the poses are the six faces'
 
 
-def _unit(vectors: Floats) -> Floats:
-    """Give (n, 3) vectors at length 1."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     """Fit by |force| = 1 g alone, if that shows that the poses were not placed as they say."""
     units, directions = own_scale(poses, units), directions_of(poses, units)
@@ -112,11 +108,11 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     except RefusedFitError:  # without the disturbed poses they do not carry it
         return None
     seen = poses_g.take(found.kept)
-    u, known = sensor_force(found.fit.model, seen.reading, {}), _unit(seen['reference'])
-    rotation = _turned_onto(_unit(u), known)
+    u, known = sensor_force(found.fit.model, seen.reading, {}), unit(seen['reference'])
+    rotation = _turned_onto(unit(u), known)
     if np.linalg.det(rotation) < 0.0:  # mirrored axes: W alone can tell
         return None
-    away = _unit(u) - known @ rotation.T
+    away = unit(u) - known @ rotation.T
     if not _is_placement(away, _tangential_variance(found.fit, u), found.fit.variance_dof):
         return None
     angle = np.degrees(np.linalg.norm(away, axis=1))
@@ -156,7 +152,7 @@ def _tangential_variance(fit: Fit, u: Floats) -> Floats:
     """Give the (n,) variance across the force u that noise and the fit itself leave [g²]."""
     moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
     spread = moved @ fit.covariance @ np.swapaxes(moved, 1, 2)
-    along = np.einsum('ni,nij,nj->n', _unit(u), spread, _unit(u))
+    along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
     return 2.0 * fit.sigma ** 2 * fit.variance + np.trace(spread, axis1=1, axis2=2) - along
 
 

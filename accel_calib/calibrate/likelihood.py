@@ -37,7 +37,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .norm_fit import form_of, noise_along, solution_at, solve
+from .norm_fit import form_of, noise_along, solution_at, solve, USUAL_NOISE_G
 from .uncertainty import belief_in, variance_factor
 from ..effects import Context
 from ..errors import RefusedFitError
@@ -57,9 +57,6 @@ _NO_NOISE_G = 1e-9
 
 LEAST_NOISE = 0.1
 """A pose that claims less than this part of the median noise is not believed."""
-
-USUAL_NOISE_G = 5e-4
-"""Noise of a pose of a common MEMS sensor, where it was not measured."""
 
 
 @dataclass(frozen=True)
@@ -141,10 +138,28 @@ def norm_jacobian(model: Model, u: Floats, context: Context) -> Floats:
     return -np.einsum('ni,nip->np', norm_rows(model, u, context), basis)
 
 
-def believable(noise: Floats) -> Floats | None:
-    """Raise noise that is far below the others'; None where most claim to have none at all."""
-    median = np.median(noise)
-    return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
+def believable(noise: Floats | None) -> Floats | None:
+    """
+    Raise noise that is far below that of the other poses of a sensor.
+
+    Parameters
+    ----------
+    noise : (..., n, 3) array or None
+        Standard deviation of pose means [g]; leading axes are sensors.
+
+    Returns
+    -------
+    (..., n, 3) array or None
+        None where it is not known, or most poses claim to have none at all; among several
+        sensors such a one has `USUAL_NOISE_G`.
+
+    """
+    if noise is None:
+        return None
+    median = np.median(noise, axis=(-1, -2), keepdims=True)
+    has = median > _NO_NOISE_G
+    return np.where(has, np.maximum(noise, LEAST_NOISE * median), USUAL_NOISE_G) if np.any(
+        has) else None
 
 
 def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Floats | None
@@ -177,11 +192,9 @@ def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Fl
 
     """
     form = form_of(name)
-    believed = None if noise is None else believable(noise)
     start = form.free(mat_w, vec_v)
     # The weights hardly depend on the model: those of the start will do.
-    sigma = (np.full(len(reading), USUAL_NOISE_G) if believed is None
-             else noise_along(form, start, reading, believed))
+    sigma = noise_along(form, start, reading, believable(noise))
     solution, converged = solve(form, start, reading, sigma)
     if not converged:
         raise RefusedFitError('the fit does not converge',
@@ -191,11 +204,8 @@ def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Fl
 
 def norm_fit_at(name: str, free: Floats, reading: Floats, noise: Floats | None) -> Fit:
     """Say what poses of unknown orientation tell of these (q,) free values; as `fit_norm`."""
-    form = form_of(name)
-    sigma = np.full(len(reading), USUAL_NOISE_G)
-    believed = None if noise is None else believable(noise)
-    if believed is not None:
-        sigma = noise_along(form, free, reading, believed)
+    form, believed = form_of(name), believable(noise)
+    sigma = noise_along(form, free, reading, believed)
     end = solution_at(form, free, reading, sigma)
     dof = len(reading) - end.jacobian.shape[1]
     spread = np.linalg.inv(end.jacobian.T @ end.jacobian) * variance_factor(
@@ -221,7 +231,7 @@ def judge(model: Model, reading: Floats, context: Context, noise: Floats | None)
 
     """
     u = sensor_force(model, reading, context)
-    believed = None if noise is None else believable(noise)
+    believed = believable(noise)
     sigma = np.full(len(u), USUAL_NOISE_G)
     if believed is not None:
         sigma = np.linalg.norm(norm_rows(model, u, context) * believed, axis=1)
@@ -258,7 +268,7 @@ def fit_reference(effects: tuple[str, ...], reading: Floats, reference: Floats, 
         If the known orientations do not determine the effects.
 
     """
-    noise = None if noise is None else believable(noise)
+    noise = believable(noise)
     sigma = np.full(reading.size, USUAL_NOISE_G) if noise is None else noise.ravel()
     zero = with_vector(effects, np.zeros(len(parameter_names(effects))))
     basis = parameter_basis(zero, reference, context)
@@ -293,7 +303,8 @@ def covariance_of(jacobian: Floats, weighted: Floats, noise_known: bool,
     Returns
     -------
     (q, q) array
-        By the pseudo-inverse: what the residuals do not determine has no part in it.
+        By the pseudo-inverse: what the residuals do not determine has no part in it. NaN where
+        nothing tells the noise.
 
     """
     dof = len(weighted) - jacobian.shape[1] if dof is None else dof

@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 from . import closed_form
 from .disturbed import extreme, ROUNDS
 from .geometry import dilution_of, LARGEST_DILUTION, NORM_MODELS, poses_needed
-from .likelihood import LEAST_NOISE, USUAL_NOISE_G
+from .likelihood import believable
 from .norm_fit import Form, form_of, noise_along, Solution, solution_at, solve
 from .uncertainty import variance_factor
-from .unknown import CLOSED_FORMS, Method
+from .unknown import CLOSED_FORMS, Method, METHODS
 from ..errors import RefusedFitError
 from ..table import Floats
 from ..units import MG, Units
@@ -105,9 +105,8 @@ def fit_many(reading: Floats, units: Units, *, model: str = '10', method: Method
         If there are fewer poses than the model needs.
 
     """
-    if model not in NORM_MODELS or method not in ('ml', 'algebraic'):
-        raise ValueError(f'model {model!r}, method {method!r}; expected one of {NORM_MODELS}, and '
-                         'ml or algebraic')
+    if model not in NORM_MODELS or method not in METHODS:
+        raise ValueError(f'model {model!r}, method {method!r}; expected {NORM_MODELS}, {METHODS}')
     if reading.ndim != 3 or reading.shape[2] != 3:
         raise ValueError(f'readings have shape {reading.shape}, expected (m, n, 3)')
     if reading.shape[1] < poses_needed(model):
@@ -127,45 +126,32 @@ def _fit_block(reading: Floats, units: Units, model: str, method: Method, noise:
     if units.name == 'native':
         per_g = closed_form.fit_4(reading)[0][:, :1, :1]
     reading_g = reading / per_g
-    known = None if noise is None else _believable(noise / per_g)
+    known = believable(None if noise is None else noise / per_g)
     form = form_of(model)
     start = form.free(*CLOSED_FORMS[model](reading_g))
     sound = np.isfinite(start.sum(axis=1))
     start = np.where(sound[:, np.newaxis], start, form.free(np.eye(3), np.zeros(3)))
-    sigma = _sigma(form, start, reading_g, known)
+    sigma = noise_along(form, start, reading_g, known)
     found = solution_at(form, start, reading_g, sigma)
     middle = np.median(sigma, axis=1)[:, np.newaxis, np.newaxis]
     stretched = np.where(sound, dilution_of(model, found.jacobian * middle), np.inf)
     fitted = stretched <= LARGEST_DILUTION
     kept = np.ones(reading.shape[:2], bool)
     if method == 'ml':
-        found, kept, converged = _likeliest(form, found, reading_g, known, fitted)
+        found, kept, converged = _likeliest(form, found.free, reading_g, known, fitted)
         fitted = fitted & converged
     return _fleet(form, found, kept, fitted, stretched, per_g, units, known is not None)
 
 
-def _believable(noise: Floats) -> Floats:
-    """Raise noise that is far below the others' of its sensor; as `likelihood.believable`."""
-    median = np.median(noise, axis=(1, 2), keepdims=True)
-    return np.where(median > 0.0, np.maximum(noise, LEAST_NOISE * median), USUAL_NOISE_G)
-
-
-def _sigma(form: Form, free: Floats, reading: Floats, noise: Floats | None) -> Floats:
-    """Give the (m, n) noise of |force|."""
-    if noise is None:
-        return np.full(reading.shape[:2], USUAL_NOISE_G)
-    return noise_along(form, free, reading, noise)
-
-
-def _likeliest(form: Form, start: Solution, reading: Floats, noise: Floats | None,
+def _likeliest(form: Form, start: Floats, reading: Floats, noise: Floats | None,
                fitted: NDArray[np.bool_]) -> tuple[Solution, NDArray[np.bool_],
                                                    NDArray[np.bool_]]:
     """Find the likeliest values and leave disturbed poses out; which are kept, what converged."""
-    free, kept, converged = start.free.copy(), np.ones(reading.shape[:2], bool), fitted.copy()
+    free, kept, converged = start.copy(), np.ones(reading.shape[:2], bool), fitted.copy()
     todo = np.flatnonzero(fitted)
     for _ in range(ROUNDS + 1):
         at, now = reading[todo], None if noise is None else noise[todo]
-        sigma = np.where(kept[todo], _sigma(form, free[todo], at, now), np.inf)
+        sigma = np.where(kept[todo], noise_along(form, free[todo], at, now), np.inf)
         found, converged[todo] = solve(form, free[todo], at, sigma)
         free[todo] = found.free
         out = extreme(found.weighted, found.jacobian, kept[todo], noise is not None,
@@ -174,7 +160,7 @@ def _likeliest(form: Form, start: Solution, reading: Floats, noise: Floats | Non
         todo = todo[out.any(axis=1)]
         if not len(todo):
             break
-    sigma = np.where(kept, _sigma(form, free, reading, noise), np.inf)
+    sigma = np.where(kept, noise_along(form, free, reading, noise), np.inf)
     return solution_at(form, free, reading, sigma), kept, converged
 
 

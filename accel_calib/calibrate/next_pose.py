@@ -41,6 +41,7 @@ from .geometry import (
     relative_weights,
     rows_of,
 )
+from ..sphere import unit
 from ..table import Floats
 from ..units import MG
 
@@ -94,13 +95,8 @@ def _attitudes() -> Floats:
     return signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')]
 
 
-def _unit(vectors: Floats) -> Floats:
-    """Give (n, 3) vectors at length 1."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
-              in_g: bool = True) -> NextPose:
+              noise_g: float | None = None) -> NextPose:
     """
     Find the pose that would help the fit most.
 
@@ -111,9 +107,9 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     name : {'4', '7', '9', '10', '12'}
         The model that is to be fitted; for 12 the six faces are asked for.
     noise : (n,) array, optional
-        Noise of each pose; equal and unknown where it is not given.
-    in_g : bool
-        Whether that noise is in g, and not of a unit of its own.
+        Noise of each pose in any unit; equal where it is not given.
+    noise_g : float, optional
+        Median noise of the poses [g], for the words.
 
     Returns
     -------
@@ -123,12 +119,11 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     """
     information = information_of(name, directions, relative_weights(noise, len(directions)))
     error = _error(name, information, len(directions))
-    noise_g = float(np.median(noise)) if noise is not None and in_g and len(noise) else None
     best = _best(name, directions, information)
     if best is None:
         return NextPose(None, _enough(len(directions), error, noise_g), error)
     signs = _attitudes()[best]
-    up = _unit(signs[np.newaxis])
+    up = unit(signs[np.newaxis])
     after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
     if after > (1.0 - _LEAST_GAIN) * error and not _stretched(name, information):
         return NextPose(None, _enough(len(directions), error, noise_g), error)
@@ -159,7 +154,7 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
         if best is None:
             break
         signs = _attitudes()[best]
-        directions = np.vstack([directions, _unit(signs[np.newaxis])])
+        directions = np.vstack([directions, unit(signs[np.newaxis])])
         weights = np.append(weights, 1.0)
         named.append(f'{words_of(signs)} ({_axes(signs)})')
     return named
@@ -177,7 +172,7 @@ def _stretched(name: str, information: Floats) -> bool:
 def _best(name: str, directions: Floats, information: Floats) -> int | None:
     """Give the attitude that adds most to det M, among those that have not been taken."""
     attitudes = _attitudes()[:6] if name == '12' else _attitudes()
-    up = _unit(attitudes)
+    up = unit(attitudes)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
     if not np.any(free):
         return None

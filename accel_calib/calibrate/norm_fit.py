@@ -33,6 +33,9 @@ from .sensing_axes import TIES
 from ..model import Model, MODELS, parameter_names, with_vector
 from ..table import Floats
 
+USUAL_NOISE_G = 5e-4
+"""Noise of a pose of a common MEMS sensor, where it was not measured."""
+
 _MOST_STEPS = 50
 _SMALL_FALL = 1e-12
 _SMALL_STEP_G = 1e-13
@@ -121,8 +124,10 @@ def _forces(form: Form, free: Floats, reading: Floats) -> tuple[Floats, Floats, 
     return u, length, u / length @ inverse
 
 
-def noise_along(form: Form, free: Floats, reading: Floats, noise: Floats) -> Floats:
-    """Give the (..., n) noise of |u| from the (..., n, 3) noise of the readings [g]."""
+def noise_along(form: Form, free: Floats, reading: Floats, noise: Floats | None) -> Floats:
+    """Give the (..., n) noise of |u| from the (..., n, 3) noise of the readings, if known [g]."""
+    if noise is None:
+        return np.full(reading.shape[:-1], USUAL_NOISE_G)
     a = _forces(form, free, reading)[2]
     return np.sqrt(np.sum((a * noise) ** 2, axis=-1))
 

@@ -73,13 +73,11 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     if asked in ('auto', '12'):  # where the orientations turned out wrong, 12 became a norm model
         planned = '12' if calibration.name == '12' else '10'
     fitted = identifiability(calibration.name, directions, noise).mean_dilution
-    known = None
-    if np.isfinite(uncertainty) and np.isfinite(fitted):
-        known = noise / np.median(noise) * (uncertainty / fitted)
+    known = np.isfinite(uncertainty)
+    noise_g = uncertainty / fitted if known and np.isfinite(fitted) else None
     return Outlook(identifiability(planned, directions, noise),
-                   next_pose(directions, planned, noise if known is None else known,
-                             in_g=known is not None),
-                   uncertainty * MG if np.isfinite(uncertainty) else None)
+                   next_pose(directions, planned, noise, noise_g=noise_g),
+                   uncertainty * MG if known else None)
 
 
 def _uncertainty(calibration: Calibration) -> float:

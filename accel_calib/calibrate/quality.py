@@ -101,7 +101,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
 
 def _noise_floor_mg(calibration: Calibration, poses_g: Poses, vectors: bool) -> float | None:
     """Give the gap that the noise of the pose means alone would leave [mg]."""
-    noise = None if poses_g.noise is None else believable(poses_g.noise)
+    noise = believable(poses_g.noise)
     if noise is None:
         return None
     if vectors:

@@ -79,14 +79,15 @@ def variance_factor(chi2: Floats | float, dof: Floats | int, noise_known: bool) 
     Returns
     -------
     (...) array
-        The factor; 1 where nothing is left to judge by.
+        The factor. Where nothing is left to judge by it is 1 for noise that was measured, and
+        otherwise NaN.
 
     """
     chi2, dof = np.broadcast_arrays(np.asarray(chi2, float), np.asarray(dof, float))
     factor = _of_residuals(chi2, np.maximum(dof, 1.0))
     if noise_known:
         factor = np.where(chi2 > _BEYOND * dof, factor, _of_mixture(chi2, dof))
-    return np.where(dof > 0, factor, 1.0)
+    return np.where(dof > 0, factor, 1.0 if noise_known else np.nan)
 
 
 def _of_residuals(chi2: Floats, dof: Floats) -> Floats:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,12 @@ from .quality import in_g, quality_of
 from .refusal import carries, refuse_if_unfit, unseen
 from .selection import choose
 from .sensing_axes import lower_triangular
+from ..sphere import unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
 Method = Literal['ml', 'algebraic']
+METHODS = get_args(Method)
 
 CLOSED_FORMS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
     '4': closed_form.fit_4, '7': closed_form.fit_7,
@@ -61,15 +63,10 @@ def directions_of(poses: Poses, units: Units) -> Floats:
         plain.
 
     """
-    raw = _unit(poses.reading)
+    raw = unit(poses.reading)
     if units.name != 'native' and dilution('4', raw) > WEAK_DILUTION:
         return raw
-    return _unit(poses.reading - closed_form.fit_4(poses.reading)[1])
-
-
-def _unit(vectors: Floats) -> Floats:
-    """Give (n, 3) vectors at length 1."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+    return unit(poses.reading - closed_form.fit_4(poses.reading)[1])
 
 
 @dataclass(frozen=True)
@@ -158,8 +155,9 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
     if method == 'ml':
         kept, fit = _undisturbed(poses_g, list(carried)[-1])
         fits[list(carried)[-1]] = fit
-    left, directions, noise = poses_g.take(kept), directions[kept], noise[kept]
+    left, directions = poses_g.take(kept), directions[kept]
     if len(kept) < len(poses_g):
+        noise = pose_noise(left.noise, directions)
         carried = _carried(model, directions, noise)
     fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in carried}
     if model != 'auto':
@@ -171,7 +169,7 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
     return NormFit(choice.name, choice.reason, fits[choice.name], kept, warnings)
 
 
-def _carried(model: str, directions: Floats, noise: Floats) -> dict[str, float]:
+def _carried(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
     """Give the dilution of each model to look at that the poses carry, the smallest first."""
     first, *others = NORM_MODELS if model == 'auto' else (model,)
     found = {first: dilution(first, directions, noise)}

@@ -86,7 +86,7 @@ class Equations:
 
 def noise_of(poses_g: Poses) -> Floats | None:
     """Give the (n, 3) noise of the pose means [g], or None where it is not known."""
-    return None if poses_g.noise is None else believable(poses_g.noise)
+    return believable(poses_g.noise)
 
 
 def kinds(poses: Poses) -> tuple[NDArray[np.intp], list[NDArray[np.intp]], NDArray[np.intp]]:

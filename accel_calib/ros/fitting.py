@@ -148,10 +148,11 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
     """Give the pose that would help most next, or that none does."""
     up = poses_up(poses, units)
-    known = poses.noise is not None and len(up) > 0
-    return next_pose(up, '10' if model == 'auto' else model,
-                     units.to_g(pose_noise(poses.noise, up)) if known else None,
-                     in_g=units.name != 'native')
+    noise = pose_noise(poses.noise, up)
+    noise_g = None
+    if noise is not None and units.name != 'native':
+        noise_g = float(np.median(units.to_g(noise)))
+    return next_pose(up, '10' if model == 'auto' else model, noise, noise_g=noise_g)
 
 
 def then(asked: NextPose) -> str:

@@ -1,0 +1,65 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Disturbed poses are found, clean ones are kept."""
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+G = units_of('g')
+
+
+def knocked(seed, count, bad):
+    """Give poses of which the first `bad` are knocked by 50 mg, outwards or inwards."""
+    rng = np.random.default_rng(seed)
+    poses = simulate_poses(sensor(rng), spread_directions(count), rng)
+    reading = poses.reading.copy()
+    reading[:bad] *= 1.0 + rng.choice([-0.05, 0.05], (bad, 1))
+    return poses.with_columns(reading=reading)
+
+
+def left_out(poses, **settings):
+    return {each.row for each in fit_poses(poses, G, model='10', **settings).rejected}
+
+
+def test_two_knocked_of_twelve_cost_hardly_a_clean_pose():
+    clean = [len(left_out(knocked(seed, 12, 2)) - {1, 2}) for seed in range(40)]
+    assert np.count_nonzero(clean) <= 6
+
+
+@pytest.mark.parametrize('count', [36, 400])
+def test_noise_stated_too_small_throws_nothing_out(count):
+    thrown = []
+    for seed in range(10):
+        poses = knocked(seed, count, 0)
+        thrown.append(len(left_out(poses.with_columns(std=poses['std'] / 3.0))))
+    assert sum(thrown) <= 1
+
+
+@pytest.mark.parametrize('count', [100, 400])
+def test_a_fifth_knocked_is_found_whole(count):
+    bad = count // 5
+    poses = knocked(7, count, bad)
+    assert left_out(poses) == set(poses.row[:bad].tolist())
+
+
+@pytest.mark.parametrize('count', [40, 400])
+def test_no_more_than_a_quarter_is_ever_left_out(count):
+    poses = knocked(8, count, 2 * count // 5)
+    assert len(left_out(poses)) <= count // 4

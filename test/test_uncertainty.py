@@ -1,0 +1,55 @@
+# Copyright 2026 The accel_calib authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Stated variances hold 95 % whatever the noise is beside what it is said to be."""
+
+from accel_calib.calibrate.uncertainty import variance_factor
+import numpy as np
+import pytest
+
+SETS = 20000
+
+
+def share_held(ratio, dof, noise_known):
+    """Give the share of values within 1.96 standard deviations, of noise of this variance."""
+    rng = np.random.default_rng(dof)
+    chi2 = ratio * rng.chisquare(dof, SETS)
+    value = np.sqrt(ratio) * rng.normal(size=SETS)
+    return np.mean(np.abs(value) < 1.96 * np.sqrt(variance_factor(chi2, dof, noise_known)))
+
+
+@pytest.mark.parametrize('ratio', [1.0, 9.0])
+@pytest.mark.parametrize('dof', [27, 91])
+def test_intervals_hold_where_residuals_can_tell_the_noise(ratio, dof):
+    assert share_held(ratio, dof, noise_known=True) == pytest.approx(0.95, abs=0.02)
+
+
+def test_right_noise_holds_even_with_few_residuals():
+    assert share_held(1.0, 3, noise_known=True) == pytest.approx(0.95, abs=0.02)
+
+
+@pytest.mark.parametrize('ratio', [0.04, 1.0, 25.0])
+@pytest.mark.parametrize('dof', [3, 27])
+def test_unknown_noise_comes_from_the_residuals_alone(ratio, dof):
+    assert share_held(ratio, dof, noise_known=False) == pytest.approx(0.95, abs=0.01)
+
+
+def test_poses_that_repeat_better_than_stated_are_believed():
+    assert variance_factor(0.04 * 91, 91, True) < 0.1
+    assert share_held(0.04, 91, noise_known=True) > 0.93
+
+
+def test_without_residuals_only_stated_noise_tells_anything():
+    assert variance_factor(0.0, 0, True) == 1.0
+    assert np.isnan(variance_factor(0.0, 0, False))
