@@ -31,7 +31,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/config', sorted(glob('config/*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
         # Where ros2 run and launch look. Under colcon the entry points below land there too,
         # see setup.cfg; pip puts those into bin/ alone.

@@ -127,7 +127,7 @@ def process(command: list[str], environment: dict[str, str]) -> Iterator[subproc
 
 
 def trial(command: list[str], rate: float, during: Callable[[], object], *,
-          listened: bool = True) -> Trial:
+          listened: bool = True, lead: float = 0.0) -> Trial:
     """
     Run a relay, or the node, between a driver and a user.
 
@@ -141,6 +141,8 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         Takes as long as is to be measured.
     listened : bool
         Whether there is a user.
+    lead : float
+        So long the driver has run before [s].
 
     """
     os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT))
@@ -153,6 +155,7 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         drive = [str(CLIENTS), 'drive', f'--rate={rate}', '--file', str(sent_file)]
         with process(listen, environment) as user, process(drive, environment) as driver:
             first_of(driver)
+            time.sleep(lead)
             began = time.monotonic()
             with process(command, environment) as measured:
                 start = first_of(user) * 1e-9 - began if listened else np.nan

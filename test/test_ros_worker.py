@@ -113,7 +113,15 @@ def test_computing_apart_gives_what_it_gives_here(apart: Apart, stored: Callable
     np.testing.assert_array_equal(found.model.vector, here.model.vector)
     np.testing.assert_array_equal(found.covariance, here.covariance)
     assert apart.call(os.getpid) != os.getpid()
-    assert apart.call(os.nice, 0) > os.nice(0)
+    assert apart.call(os.sched_getscheduler, 0) == os.SCHED_IDLE
+
+
+def test_what_waits_too_long_for_the_processor_gets_its_share(
+        apart: Apart, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('accel_calib.ros.apart._PATIENCE', 0.5)
+    apart.call(time.sleep, 0.7)
+    assert apart.call(os.sched_getscheduler, 0) == os.SCHED_OTHER
+    apart.call(time.sleep, 0.7)
 
 
 def test_errors_of_computing_apart_are_those_of_computing_here(

@@ -13,10 +13,14 @@
 # limitations under the License.
 
 """
-A process beside the node for what computes: fits, refinements, the next pose.
+A process beside the node for what computes: fits with their files, refinements, the next pose.
 
 In a thread of the node they would share its interpreter with the stream, and a message would wait
-up to 5 ms for each piece of them. Here they have an interpreter of their own, at a lower priority.
+up to 5 ms for each piece of them. Here they have an interpreter of their own, and the processor
+only where nobody else wants it: being nice is not enough, for the scheduler lets a nice process
+that was asleep end its slice of 3 ms. Where others leave it too little it starts anew as one of
+them.
+
 Functions and what they take and give are pickled from process to process and never stored. The
 process ends when the node does, however that ends, for then its standard input does; where it
 cannot be started or dies, the node computes for itself.
@@ -28,6 +32,7 @@ from __future__ import annotations
 import os
 import pickle
 from queue import SimpleQueue
+from select import select
 import signal
 import subprocess
 import sys
@@ -41,8 +46,11 @@ if TYPE_CHECKING:
 
 Found = TypeVar('Found')
 
-_NICE = 10
-"""By how much the priority is lower."""
+_PATIENCE = 10.0
+"""After so long without an answer the process is to have its share of a busy machine [s]."""
+
+_LAST = 'last'
+"""Argument of a process that has the processor last."""
 
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 """Arrays here are small: more threads would only wait for each other."""
@@ -54,18 +62,20 @@ class Apart:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
+        self._last = True
 
     def start(self) -> None:
         """Start the process, if it is not there, and do not wait for it."""
         if self._closed or (self._process is not None and self._process.poll() is None):
             return
+        command = [sys.executable, '-m', __name__, *([_LAST] if self._last else [])]
         path = os.pathsep.join(filter(None, sys.path))
         environment = {**os.environ, 'PYTHONPATH': path, **dict.fromkeys(_ONE_THREAD, '1')}
         try:
             # In a session of its own a Ctrl-C is not for it.
             self._process = subprocess.Popen(
-                [sys.executable, '-m', __name__], env=environment, stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE, start_new_session=True)
+                command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                start_new_session=True)
         except OSError:
             self._process = None
 
@@ -109,6 +119,11 @@ class Apart:
             raise EOFError
         process.stdin.write(pickle.dumps((function, given)))
         process.stdin.flush()
+        if self._last and not select([process.stdout], [], [], _PATIENCE)[0]:
+            self._last = False  # without privileges it could not be changed while it runs
+            self._end()
+            self.start()
+            return self._ask(function, given)
         answer: tuple[bool, Any] = pickle.load(process.stdout)
         return answer
 
@@ -126,7 +141,8 @@ class Apart:
 def main() -> None:
     """Answer calls until standard input ends, in the process itself."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICE)
+    if _LAST in sys.argv:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     answers = os.fdopen(os.dup(sys.stdout.fileno()), 'wb')
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is no answer
     calls: SimpleQueue[Any] = SimpleQueue()

@@ -132,7 +132,7 @@ class Commands:
         def job() -> tuple[Calibration, OSError | None]:
             calibration = node.worker.apart.call(fitted, poses, units, settings, sensor, before,
                                                  context)
-            return calibration, _stored(store, calibration)
+            return calibration, node.worker.apart.call(_stored, store, calibration)
 
         def finish(found: tuple[Calibration, OSError | None]) -> str:
             self._use(*found)
@@ -149,7 +149,7 @@ class Commands:
 
         def job() -> tuple[Refinement, OSError | None]:
             refinement = node.worker.apart.call(refined, poses, units, sensor, before)
-            return refinement, _stored(store, refinement.calibration)
+            return refinement, node.worker.apart.call(_stored, store, refinement.calibration)
 
         def finish(found: tuple[Refinement, OSError | None]) -> str:
             self._use(found[0].calibration, found[1])

@@ -87,6 +87,11 @@ class PoseBook:
         """Put poses that were stored before in front."""
         self._earlier = [*dwells_of(poses), *self._earlier]
 
+    @property
+    def holding(self) -> bool:
+        """Whether a rest is held that may be going on."""
+        return bool(self._held)
+
     def holds(self, dwell: Dwell) -> bool:
         """Say whether this rest is held."""
         return any(overlap(dwell, each) for each in self._held)

@@ -172,7 +172,7 @@ class Watch:
 
     def refresh(self) -> None:
         """Bring the pose of the rest that is going on up to date."""
-        dwell = self.detector.current()
+        dwell = self.detector.current() if self.book.holding else None
         if dwell is not None and self.book.holds(dwell):
             self.book.hold(dwell)
 

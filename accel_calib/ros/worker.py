@@ -98,7 +98,7 @@ class Worker:
             self._node.get_logger().error(f'a fault in accel_calib:\n{format_exc()}')
 
     def close(self) -> None:
-        """Give up what is being computed, and finish what is being written."""
+        """Give up what is being computed and kept, and finish what else is being written."""
         self.apart.close()
         self._pool.shutdown(wait=True)
 
