@@ -41,7 +41,7 @@ from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import rotation_from_rpy, spread_directions  # noqa: E402
 from accel_calib.table import Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from shared import sensor  # noqa: E402
 
@@ -165,12 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sets = max(given.sets // 2 if case.runs > 5 else given.sets, 1)
         lines += lines_of(case, measured(case, sets, given.seed))
         print(case.words, file=sys.stderr, flush=True)
-    text = f'{table(lines)}\n'
-    print(text)
-    if given.markdown:
-        command = f'python benchmarks/compare.py --sets {given.sets} --seed {given.seed}'
-        given.markdown.write_text(f'# Figures of compare\n\nMade by `{command} --markdown FILE`.\n'
-                                  f'\n{_SAID}\n{text}', encoding='utf-8')
+    command = f'python benchmarks/compare.py --sets {given.sets} --seed {given.seed}'
+    publish(f'# Figures of compare\n\nMade by `{command} --markdown FILE`.\n\n{_SAID}\n'
+            f'{table(lines)}\n', given.markdown)
     return 0
 
 

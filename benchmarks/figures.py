@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -37,3 +38,10 @@ def table(lines: Sequence[Line]) -> str:
     words = {True: 'yes', False: '**no**', None: ''}
     rows += [f'| {x.what} | {x.measured} | {x.asked} | {x.sets} | {words[x.met]} |' for x in lines]
     return '\n'.join(rows)
+
+
+def publish(page: str, path: Path | None) -> None:
+    """Print a page, and write it where that is asked for."""
+    print(page)
+    if path is not None:
+        path.write_text(page, encoding='utf-8')

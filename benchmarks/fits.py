@@ -40,7 +40,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 from accel_calib.calibrate import closed_form, fit_many, fit_poses  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import Case, draw, draw_sensor, NOISE, spread  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
@@ -186,9 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text = (f'# Figures of fits\n\n{__doc__.strip()}\n\n{platform.machine()}, {os.cpu_count()} '
             f'cores, Python {platform.python_version()}, numpy {np.__version__}; load '
             f'{os.getloadavg()[0]:.1f} at the end.\n\n{table(lines)}\n{drawn}')
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

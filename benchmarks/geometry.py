@@ -32,16 +32,18 @@ from pathlib import Path
 import re
 import sys
 
-from accel_calib.calibrate import closed_form, fit_poses
-from accel_calib.calibrate.likelihood import fit_norm
-from accel_calib.errors import RefusedFitError
-from accel_calib.model import predict, sensor_force
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
-from accel_calib.table import Floats, numbered, Poses
-from accel_calib.units import MG, units_of
-from figures import Line, table
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from accel_calib.calibrate import closed_form, fit_poses  # noqa: E402
+from accel_calib.calibrate.likelihood import fit_norm  # noqa: E402
+from accel_calib.errors import RefusedFitError  # noqa: E402
+from accel_calib.model import predict, sensor_force  # noqa: E402
+from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
+from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
+from accel_calib.table import Floats, numbered, Poses  # noqa: E402
+from accel_calib.units import MG, units_of  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
+import numpy as np  # noqa: E402
 
 G = units_of('g')
 COUNT = 12
@@ -254,9 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f'benchmarks/geometry.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
             f'\n\n{table(lines + overall(everything))}\n\n' + '\n'.join(rows)
             + '\n\n' + '\n'.join(models) + '\n')
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

@@ -46,7 +46,7 @@ from accel_calib.model import Model  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import spread_directions  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 from imu_trial import node, relay, Trial, trial  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -326,9 +326,7 @@ def main() -> int:
             'the others, in some cases for an announcement that comes every 3 s.\n'
             'The caller of `~/fit` and `~/refine` is an rclpy process too, and back to back it\n'
             f'takes half a core.\n\n{table(lines)}\n\n{plain}\n')
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

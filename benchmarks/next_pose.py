@@ -30,16 +30,18 @@ from itertools import product
 from pathlib import Path
 import sys
 
-from accel_calib.calibrate import directions_of, fit_poses, next_pose
-from accel_calib.calibrate.geometry import pose_noise
-from accel_calib.errors import RefusedFitError
-from accel_calib.model import Model, predict
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions
-from accel_calib.table import Floats, Poses
-from accel_calib.units import MG, units_of
-from figures import Line, table
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E402
+from accel_calib.calibrate.geometry import pose_noise  # noqa: E402
+from accel_calib.errors import RefusedFitError  # noqa: E402
+from accel_calib.model import Model, predict  # noqa: E402
+from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
+from accel_calib.sphere import random_directions  # noqa: E402
+from accel_calib.table import Floats, Poses  # noqa: E402
+from accel_calib.units import MG, units_of  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
+import numpy as np  # noqa: E402
 
 G = units_of('g')
 AIM = 0.3
@@ -181,9 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text = (f'# Figures of the next pose\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/next_pose.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
             f'\n\n{table(lines)}\n\nMedian error of |a| [mg]:\n\n' + '\n'.join(rows) + '\n')
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

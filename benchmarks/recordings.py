@@ -47,7 +47,7 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', PYTHONPATH=str(ROOT))
 
 from accel_calib.cli.main import main as accel_calib  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from recordings_bags import serialized, write_bag  # noqa: E402
 
@@ -175,9 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for storage in ('mcap', 'sqlite3'):
             lines += bag_lines(folder, storage, count, repeats, calibration)
     text = _page(table(lines), before, arguments)
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 from generator import OUTSIDE  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import Case, Outcome, run, SHOWS  # noqa: E402
@@ -247,11 +247,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             lines += lines_of(row, outcomes)
             print(f'{row}: {len(outcomes)} sets', file=sys.stderr, flush=True)
     text = f'{table([x for x in lines if x.sets])}\n\n{by_effect(everything)}\n'
-    print(text)
     for error, count in Counter(o.error for o in everything if o.error).most_common(5):
         print(f'{count} times:\n{error}', file=sys.stderr)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

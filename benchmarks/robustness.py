@@ -47,7 +47,7 @@ from accel_calib.simulate import path  # noqa: E402
 from accel_calib.sphere import random_directions  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import (  # noqa: E402
     Case,
@@ -343,9 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(name, file=sys.stderr, flush=True)
     text = (f'# Figures of trust\n\n{__doc__.strip()}\n\nMade by `python benchmarks/robustness.py '
             f'--sets {given.sets} --seed {given.seed} --markdown FILE`.\n\n{table(lines)}\n')
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

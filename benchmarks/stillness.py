@@ -31,7 +31,7 @@ import sys
 from typing import NamedTuple
 
 from accel_calib.table import Floats
-from figures import Line, table
+from figures import Line, publish, table
 import numpy as np
 from stillness_case import Case, case_of, KINDS
 from stillness_real import table_of_real
@@ -231,9 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.data.is_dir():
         parts += ['## Real recordings', ABOUT_REAL, table_of_real(given.data, RULES)]
     text = '\n\n'.join(parts) + '\n'
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

@@ -35,7 +35,7 @@ from accel_calib.capture import capture, CaptureSettings, StillDetector
 from accel_calib.files import read_recording
 from accel_calib.table import Recording
 from accel_calib.units import units_of
-from figures import Line, table
+from figures import Line, publish, table
 import numpy as np
 
 DATA = Path(__file__).parents[2] / 'shared' / 'data'
@@ -169,9 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     told = LIMIT.format(fast=1e9 * fast, slow=1e9 * slow, long=1e-6 / still,
                         rest=1e6 * (slow - still) * 100.0 * (_REST + _SHAKEN))
     text = '\n\n'.join([ABOUT.format(seed=given.seed), table(lines), told]) + '\n'
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(text, encoding='utf-8')
+    publish(text, given.markdown)
     return 0
 
 

@@ -43,7 +43,7 @@ from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
-from figures import Line, table  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 Attitudes = Callable[[int, np.random.Generator], Floats]
@@ -222,10 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--markdown', type=Path, help='write the table here')
     given = parser.parse_args(arguments)
     text = table(lines(given.sets, given.long, given.rests, given.seed))
-    print(text)
-    if given.markdown:
-        given.markdown.write_text(f'{heading(given)}\n\n{text}\n\n{NOT_REACHED}\n',
-                                  encoding='utf-8')
+    publish(f'{heading(given)}\n\n{text}\n\n{NOT_REACHED}\n', given.markdown)
 
 
 if __name__ == '__main__':

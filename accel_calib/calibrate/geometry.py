@@ -37,8 +37,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from .likelihood import believable, LEAST_NOISE
 from .norm_fit import form_of
+from .uncertainty import believable, LEAST_NOISE
 from ..effects import EFFECTS
 from ..model import MODELS, parameter_names
 from ..sphere import spread_directions

@@ -37,8 +37,8 @@ from functools import cached_property
 
 import numpy as np
 
-from .norm_fit import form_of, noise_along, solution_at, solve, USUAL_NOISE_G
-from .uncertainty import belief_in, variance_factor
+from .norm_fit import form_of, noise_along, solution_at, solve
+from .uncertainty import belief_in, believable, USUAL_NOISE_G, variance_factor
 from ..effects import Context
 from ..errors import RefusedFitError
 from ..model import (
@@ -51,12 +51,6 @@ from ..model import (
     with_vector,
 )
 from ..table import Floats
-
-_NO_NOISE_G = 1e-9
-"""Samples that scatter less do not scatter at all."""
-
-LEAST_NOISE = 0.1
-"""A pose that claims less than this part of the median noise is not believed."""
 
 
 @dataclass(frozen=True)
@@ -136,30 +130,6 @@ def norm_jacobian(model: Model, u: Floats, context: Context) -> Floats:
     """Give the (n, p) derivative of |u| by the values of the model."""
     basis = parameter_basis(model, u, context)
     return -np.einsum('ni,nip->np', norm_rows(model, u, context), basis)
-
-
-def believable(noise: Floats | None) -> Floats | None:
-    """
-    Raise noise that is far below that of the other poses of a sensor.
-
-    Parameters
-    ----------
-    noise : (..., n, 3) array or None
-        Standard deviation of pose means [g]; leading axes are sensors.
-
-    Returns
-    -------
-    (..., n, 3) array or None
-        None where it is not known, or most poses claim to have none at all; among several
-        sensors such a one has `USUAL_NOISE_G`.
-
-    """
-    if noise is None:
-        return None
-    median = np.median(noise, axis=(-1, -2), keepdims=True)
-    has = median > _NO_NOISE_G
-    return np.where(has, np.maximum(noise, LEAST_NOISE * median), USUAL_NOISE_G) if np.any(
-        has) else None
 
 
 def fit_norm(name: str, mat_w: Floats, vec_v: Floats, reading: Floats, noise: Floats | None

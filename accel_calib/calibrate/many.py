@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 from . import closed_form
 from .disturbed import extreme, ROUNDS
 from .geometry import dilution_of, LARGEST_DILUTION, NORM_MODELS, poses_needed
-from .likelihood import believable
 from .norm_fit import Form, form_of, noise_along, Solution, solution_at, solve
-from .uncertainty import variance_factor
+from .uncertainty import believable, variance_factor
 from .unknown import CLOSED_FORMS, Method, METHODS
 from ..errors import RefusedFitError
 from ..table import Floats

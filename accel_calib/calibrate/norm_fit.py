@@ -30,11 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .sensing_axes import TIES
+from .uncertainty import USUAL_NOISE_G
 from ..model import Model, MODELS, parameter_names, with_vector
 from ..table import Floats
-
-USUAL_NOISE_G = 5e-4
-"""Noise of a pose of a common MEMS sensor, where it was not measured."""
 
 _MOST_STEPS = 50
 _SMALL_FALL = 1e-12

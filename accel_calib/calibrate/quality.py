@@ -29,7 +29,8 @@ import numpy as np
 from .approach import with_approach
 from .calibration import Calibration, Quality
 from .geometry import coverage
-from .likelihood import believable, Fit, norm_rows
+from .likelihood import Fit, norm_rows
+from .uncertainty import believable
 from ..model import correct, sensor_force
 from ..table import Floats, Poses
 from ..units import MG, Units

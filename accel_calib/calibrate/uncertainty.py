@@ -33,6 +33,15 @@ import numpy as np
 
 from ..table import Floats
 
+USUAL_NOISE_G = 5e-4
+"""Noise of a pose of a common MEMS sensor, where it was not measured."""
+
+_NO_NOISE_G = 1e-9
+"""Samples that scatter less do not scatter at all."""
+
+LEAST_NOISE = 0.1
+"""A pose that claims less than this part of the median noise is not believed."""
+
 _BELIEF = 8.0
 _BELIEF_IN_USUAL = 3.0
 """What measured noise, and the noise of a common sensor, count as in a test."""
@@ -47,6 +56,31 @@ _ONE = 40
 """λ looked at; the place of λ = 1."""
 
 _BEYOND = 1e3
+
+
+def believable(noise: Floats | None) -> Floats | None:
+    """
+    Raise noise that is far below that of the other poses of a sensor.
+
+    Parameters
+    ----------
+    noise : (..., n, 3) array or None
+        Standard deviation of pose means [g]; leading axes are sensors.
+
+    Returns
+    -------
+    (..., n, 3) array or None
+        None where it is not known, or most poses claim to have none at all; among several
+        sensors such a one has `USUAL_NOISE_G`.
+
+    """
+    if noise is None:
+        return None
+    median = np.median(noise, axis=(-1, -2), keepdims=True)
+    has = median > _NO_NOISE_G
+    if not np.any(has):
+        return None
+    return np.where(has, np.maximum(noise, LEAST_NOISE * median), USUAL_NOISE_G)
 
 
 def belief_in(noise_known: bool) -> float:

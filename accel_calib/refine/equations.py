@@ -39,7 +39,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibrate.likelihood import believable, norm_rows
+from ..calibrate.likelihood import norm_rows
+from ..calibrate.uncertainty import believable
 from ..effects import Context
 from ..model import force_slope, Model, reading_of, sensor_force
 from ..table import Floats, Poses
