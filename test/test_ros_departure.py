@@ -63,7 +63,8 @@ def test_third_rest_after_a_shift_of_5_mg_is_warned_of_and_a_knock_is_not(
         warm.publish(Temperature(temperature=38.2))
         for k in range(count):
             given = readings(TILTED[k:k + 2], dwell=1.4)
-            bench.feed(given[:105] + GRAVITY * offset)  # and a bit of the next rest
+            bench.feed(given[:90] + GRAVITY * offset)
+        bench.feed(np.tile(given[70:90], (3, 1)))  # until it is sure that the last one ended
 
     rests(2, 0.0 * OFFSET)
     rests(1, 10.0 * OFFSET)

@@ -108,7 +108,7 @@ def layout_of(data: bytes) -> Layout | None:
     return layout if whole and name[-1] == 0 else None
 
 
-def rows_of(messages: Sequence[bytes], layout: Layout, temperature: float) -> Floats:
+def rows_of(messages: Sequence[bytes], layout: Layout, temperature: Sequence[float]) -> Floats:
     """
     Give messages of one layout as the samples of the capture.
 
@@ -118,8 +118,8 @@ def rows_of(messages: Sequence[bytes], layout: Layout, temperature: float) -> Fl
         Messages.
     layout : Layout
         Of all of them.
-    temperature : float
-        The last one [°C]; NaN: not known.
+    temperature : sequence of float
+        The last one before each message [°C]; NaN: not known.
 
     Returns
     -------

@@ -60,11 +60,11 @@ if TYPE_CHECKING:
     from ..effects import Context
     from ..table import Floats
 
-_TOGETHER = 0.2
+_TOGETHER = 0.3
 """
 So long messages wait to be taken in by the watch [s]; listeners are counted as often.
 
-Taking in is some ms on a slow machine, and the message that comes meanwhile waits: at 5 a second
+Taking in is some ms on a slow machine, and the message that comes meanwhile waits: at 3 a second
 that is less than 1 in 100 from 1 kHz on.
 
 """
@@ -93,7 +93,7 @@ class Stream:
         self._node = node
         self._watch = watch
         self._layout = _NO_LAYOUT
-        self._waiting: list[bytes] = []
+        self._waiting: list[tuple[bytes, float]] = []
         self._due = 0.0
         self._temperature = math.nan
         self._listeners = self._motion_listeners = 0
@@ -110,7 +110,6 @@ class Stream:
 
     def heat(self, temperature: float) -> None:
         """Take the temperature [°C] of the messages that follow."""
-        self.take_in()
         self._temperature = temperature
 
     def on_serialized(self, data: bytes) -> None:
@@ -130,7 +129,7 @@ class Stream:
                 self._adopt(found)
             if self._listeners or self._motion_listeners:
                 self._send(data)
-            self._waiting.append(data)
+            self._waiting.append((data, self._temperature))
             if due:
                 self._due = now + _TOGETHER
                 self.take_in()
@@ -186,10 +185,11 @@ class Stream:
 
     def take_in(self) -> None:
         """Have the watch look at the messages that wait for it."""
-        messages, self._waiting = self._waiting, []
-        if not messages:
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
             return
-        rows = rows_of(messages, self._layout, self._temperature)
+        messages, temperatures = zip(*waiting)
+        rows = rows_of(messages, self._layout, temperatures)
         good = are_finite(rows[:, 1:4])
         if not np.all(good):
             for reading in rows[~good, 1:4].tolist():

@@ -45,7 +45,7 @@ LONG_REST = 300.0
 _LOOK_EVERY = 0.1
 """Between looks at a rest that is going on [s]."""
 
-_PIECE = 0.25
+_PIECE = 0.35
 """Samples that come together are looked at in pieces of this length, by their stamps [s]."""
 
 _NOISE_FELL = 0.9
