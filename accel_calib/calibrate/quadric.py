@@ -42,7 +42,7 @@ _RIDGE = 1e-12
 _BLOCK = 8192
 """Poses at a time: their monomials stay in the cache."""
 
-_IDENTITY, _ONES = np.eye(3), np.ones(3)
+_IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
 
 
 @dataclass(frozen=True)
@@ -151,10 +151,10 @@ def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
         moments = moments + _moments(form, r[..., start:start + _BLOCK])
     centre, radius = sphere_of(moments[..., size:-1, size:-1],
                                _ONES @ moments[..., :3, size:-1], r.shape[-1])
-    change = _to_sphere(form, centre, radius[..., np.newaxis])
+    radius = radius[..., np.newaxis]
+    change = _to_sphere(form, centre, radius)
     beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
     mat_w, offset = _ellipsoid(form, beta)
-    radius = radius[..., np.newaxis]
     return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
 
 
@@ -190,11 +190,10 @@ def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
     mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
     values, vectors = np.linalg.eigh(mat_a)
     sign = np.copysign(1.0, values[..., 1:2])  # AN5286: negate the whole vector
-    values = values * sign
     with np.errstate(invalid='ignore', divide='ignore'):
-        along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] * sign / values
-        field_squared = (along * along * values) @ _ONES[:, np.newaxis] / 4.0
-        field_squared -= beta[..., -1:] * sign  # B²
-        gain = np.sqrt(field_squared) / np.sqrt(values)
+        along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] / (-2.0 * values)
+        values = values * sign
+        field_squared = (along * along * values) @ _COLUMN - beta[..., -1:] * sign  # B²
+        gain = np.sqrt(field_squared / values)  # the middle value is positive: NaN where B² is not
         mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
-        return mat_w, (vectors @ along[..., np.newaxis])[..., 0] / -2.0
+        return mat_w, (vectors @ along[..., np.newaxis])[..., 0]
