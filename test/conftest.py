@@ -204,12 +204,12 @@ class Bench:
         return heard[0]
 
     def close(self) -> None:
-        """End all that was started."""
+        """Leave DDS, then end all that was started."""
+        self._leave()  # first: of shared memory a killed process leaves its part as it was
         for process in self._processes:
             if process.poll() is None:
                 process.kill()
             sys.stdout.write(process.communicate()[0])  # pytest shows it where a test failed
-        self._leave()
 
 
 def _yaml(value: Any) -> str:
