@@ -1,16 +1,5 @@
 # Copyright 2026 The accel_calib authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The rules of the house that no linter knows: licence headers, and the way of the imports."""
 
@@ -110,7 +99,7 @@ def test_only_the_nodes_import_ros(path: Path) -> None:
     assert part_of(path) == 'ros' or not ros
 
 
-@pytest.mark.parametrize('linter', ['ament_copyright', 'ament_flake8', 'ament_pep257'])
+@pytest.mark.parametrize('linter', ['ament_flake8', 'ament_pep257'])
 def test_linters_of_ament_find_nothing(linter: str) -> None:
     main = pytest.importorskip(f'{linter}.main', reason='not on PyPI').main
     paths = [ROOT / name for name in ('accel_calib', 'launch', 'setup.py', 'test')]
