@@ -4,6 +4,13 @@
 """
 Calibrate an accelerometer in place, from nothing but the fact that gravity is 1 g.
 
+>>> import accel_calib as ac
+>>> poses = ac.capture('recording.mcap')            # or ac.read_poses('poses.csv')
+>>> calibration = ac.fit(poses, flat=1)
+>>> calibration.apply(readings)
+>>> calibration.save('calibration.yaml')
+>>> ac.refine(poses, base=calibration)
+
 Two lines cross the package:
 
 1. Imu -> still pose -> fit -> stored calibration -> corrected Imu
@@ -22,10 +29,10 @@ cross-axis), ΔR the mounting: it takes a vector in the levelled frame to the se
 
 Units
 -----
-Specific force and readings are in units of local gravity (g) inside the package, as IEEE 1293
-and AN5286 have them, so that a still sensor measures |force| = 1 and a gain has no dimension.
-`accel_calib.units` converts at the edge (m/s2, g, or native counts and volts). All else is SI:
-seconds, rad/s, rad; temperature is in °C.
+Specific force and readings are in units of local gravity (g) inside the package, as in IEEE 1293
+and AN5286, so that a still sensor measures |force| = 1 and a gain has no dimension. The public
+functions and the files use the unit of the readings: m/s2, g, or native counts and volts
+(`accel_calib.units`). All else is SI: seconds, rad/s, rad; temperature is in °C.
 
 Sign and frames
 ---------------
@@ -33,9 +40,59 @@ Specific force, REP-145: a sensor lying flat and still reads +1 g on the axis th
 The default levelled frame is that of REP-103 (x forward, y left, z up); see
 `accel_calib.calibrate.mounting` for the others.
 
-Arrays are (n, 3): one row a pose or a sample, columns x, y, z. A vector in frame a is `vec_a`;
+Arrays are (n, 3): one row per pose or sample, columns x, y, z. A vector in frame a is `vec_a`;
 `mat_ab` takes frame b to a.
 
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+import sys
+from types import ModuleType
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .api import Calibration as Calibration
+    from .api import capture as capture
+    from .api import compare as compare
+    from .api import fit as fit
+    from .api import load as load
+    from .api import Poses as Poses
+    from .api import read_poses as read_poses
+    from .api import read_recording as read_recording
+    from .api import Recording as Recording
+    from .api import refine as refine
+    from .api import Refinement as Refinement
+    from .api import simulate as simulate
+    from .api import verify as verify
+
 __version__ = '0.1.0'
+
+__all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
+           'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+
+
+class _Package(ModuleType):
+    """
+    This module, with its public names imported when they are used first.
+
+    So ``accel-calib --help`` does not wait for numpy. Some functions have the name of a folder;
+    Python sets a folder as an attribute when it imports it, and the function must stay.
+
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f'module {self.__name__!r} has no attribute {name!r}')
+        return getattr(import_module('.api', self.__name__), name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in __all__ and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Package

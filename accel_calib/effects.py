@@ -2,26 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The catalogue of effects: each adds to the reading, in proportion to its parameters.
+The catalogue of effects: what each adds to the reading, and all else that is known of it.
 
-An effect is one entry in `EFFECTS`. Simulation, fit, correction and report all read it there,
-so that an entry added here works in each of them. For parameters k the reading grows by
-``basis(u, context, shape) @ k`` where u is the specific force in the axes of the sensor; how it
-grows with u itself is ``slope(u, context, shape, k)``, which the correction and the Jacobian of
-the fit need. The values of an effect are k followed by its shape, such as a time constant, in
-which it is not linear. Two effects of the output, `saturation` and `quantisation`, act on the
-whole reading instead and cannot be undone.
+An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
+all read it there, so an effect that is added here works in each of them. Its reading is a sum of
+terms
 
-Force, readings and the samples' standard deviation are in g, temperatures in °C. The names and
-terms are those of IEEE 1293 (model equation of a linear accelerometer) and of data sheets.
+    added to axis i = Σ k_p · factor(context) · weight · monomial(u)
+
+over the parameters k_p, with u the specific force in the sensor axes. The factor depends on the
+context alone and the monomial on the force alone: with the context fixed, a term of monomial 1
+belongs to the offset V, one of u_j to the gain W, and only the others bend with the force.
+Constants in which an effect is not linear, such as a time constant, are its shape.
+
+Force, readings and standard deviations are in g, temperatures in °C, times in s. Names and terms
+are those of IEEE 1293 (model equation of a linear accelerometer) and of data sheets.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +34,7 @@ from .table import Floats
 from .units import STANDARD_GRAVITY
 
 Context = Mapping[str, NDArray[Any]]
-Basis = Callable[[Floats, Context, Floats], Floats]
-Slope = Callable[[Floats, Context, Floats, Floats], Floats]
-Output = Callable[[Floats, Floats], Floats]
+"""What is known beside a reading: arrays of n rows, or one row without the first axis."""
 
 REFERENCE_TEMPERATURE = 25.0
 """Temperature at which temperature effects are zero [°C], as in data sheets."""
@@ -44,6 +46,101 @@ HOUR = 3600.0
 
 AXES = ('x', 'y', 'z')
 
+Family = Literal['', 'force', 'time']
+"""Effects of one family can look alike: nonlinearities on the 1 g sphere, trends in time."""
+
+TO_SEPARATE: dict[Family, str] = {
+    'force': 'on the 1 g sphere they overlap by up to 98 %; more poses between the faces would '
+             'separate them, or forces other than 1 g (a centrifuge)',
+    'time': 'let the temperature fall as well as rise, and visit the same orientations again at '
+            'other times',
+    '': 'vary the one while the other stays the same',
+}
+"""How to separate effects of one family, or of different ones."""
+
+
+class Monomial(NamedTuple):
+    """
+    A function of the components of the force, for floats and for arrays.
+
+    Parameters
+    ----------
+    value : callable
+        x, y, z -> value.
+    gradient : callable
+        x, y, z -> derivatives by x, y and z.
+
+    """
+
+    value: Callable[[Any, Any, Any], Any]
+    gradient: Callable[[Any, Any, Any], tuple[Any, Any, Any]]
+
+
+def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
+    """Return the monomial that applies a function of one variable to one component."""
+    def gradient(*u: Any) -> tuple[Any, Any, Any]:
+        found = [0.0, 0.0, 0.0]
+        found[axis] = slope(u[axis])
+        return found[0], found[1], found[2]
+
+    return Monomial(lambda *u: value(u[axis]), gradient)
+
+
+def _each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list[Monomial]:
+    return [_of_axis(axis, value, slope) for axis in range(3)]
+
+
+MONOMIALS: tuple[Monomial, ...] = (
+    Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
+    *_each_axis(lambda u: u, lambda u: 1.0),
+    *_each_axis(lambda u: u * u, lambda u: 2.0 * u),
+    *_each_axis(lambda u: u * u * u, lambda u: 3.0 * u * u),
+    *_each_axis(lambda u: u * abs(u), lambda u: 2.0 * abs(u)),
+    *_each_axis(abs, np.sign),
+    Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
+    Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
+    Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
+)
+"""1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z. The first four are affine."""
+
+ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT = 0, 1, 4, 7, 10, 13, 16
+"""First index of each kind in `MONOMIALS`; the kinds by axis have three."""
+
+AFFINE = 4
+"""Monomials below this index are 1, u_x, u_y, u_z."""
+
+_PRODUCTS = {(0, 1): PRODUCT, (0, 2): PRODUCT + 1, (1, 2): PRODUCT + 2}
+
+
+class Term(NamedTuple):
+    """
+    One term of an effect.
+
+    Parameters
+    ----------
+    parameter : int
+        Index of the parameter that it is proportional to.
+    axis : int
+        Axis of the reading that it is added to.
+    monomial : int
+        Index in `MONOMIALS`.
+    weight : float
+        Constant factor.
+
+    """
+
+    parameter: int
+    axis: int
+    monomial: int
+    weight: float = 1.0
+
+
+Factor = Callable[[Mapping[str, Any], Floats], Any]
+"""Context, shape -> (n,) or (t, n) array, the factor of all terms or of each; no n for one row."""
+
+Shapes = Callable[[Context], Iterator[Floats]]
+"""Context of the poses -> the shapes that a search tries."""
+
 
 @dataclass(frozen=True)
 class Effect:
@@ -53,28 +150,34 @@ class Effect:
     Parameters
     ----------
     words : str
-        What it is, for a person.
+        Description for a person.
     term : str
-        Its name in IEEE 1293 or in data sheets.
+        Name in IEEE 1293 or in data sheets.
     parameters : tuple of str
         Names of its p parameters.
     unit : str
         Unit of each parameter.
     typical : float
-        Size seen in common parts, in `unit`; ten times as much deserves a remark.
+        Size in common parts, in `unit`.
+    plausible_g : float
+        Largest contribution to the reading of a working accelerometer [g]; infinite: no limit.
+    terms : tuple of Term
+        What it adds.
+    factor : callable or None
+        Factor of the terms; None: 1.
     needs : tuple of str
-        Keys of the context without which it can be neither seen nor corrected.
-    linear : bool
-        Whether it belongs to V and W: linear in u, without context.
-    basis : callable
-        (n, 3) force, context, (s,) shape -> (n, 3, p), the reading that a parameter of 1 adds.
-    slope : callable
-        (n, 3) force, context, (s,) shape, (p,) values -> (n, 3, 3), derivative of the reading by
-        force.
+        Keys of the context that the factor uses.
     shape : tuple of str
-        Names of its s further values, in which it is not linear, with their units.
+        Names of the s constants in which it is not linear.
+    shapes : callable or None
+        Shapes that a search tries; None for an effect without shape.
+    family : {'', 'force', 'time'}
+        Effects that it can be mistaken for.
+    repeatable_g : float
+        Largest change between calibrations of one sensor [g]; beyond it, it is probably another.
     output : callable or None
-        (n, 3) readings, (p,) values -> (n, 3) readings, for effects of the output.
+        (n, 3) readings, (p,) values -> (n, 3) readings, for effects on the whole reading, which
+        cannot be undone.
 
     """
 
@@ -83,218 +186,219 @@ class Effect:
     parameters: tuple[str, ...]
     unit: str
     typical: float
-    needs: tuple[str, ...]
-    linear: bool
-    basis: Basis
-    slope: Slope
+    plausible_g: float
+    terms: tuple[Term, ...]
+    factor: Factor | None = None
+    needs: tuple[str, ...] = ()
     shape: tuple[str, ...] = ()
-    output: Output | None = None
+    shapes: Shapes | None = None
+    family: Family = ''
+    repeatable_g: float = np.inf
+    output: Callable[[Floats, Floats], Floats] | None = None
 
     @property
     def values(self) -> tuple[str, ...]:
-        """Give the names of all its values: parameters, then shape."""
+        """Names of all its values: parameters, then shape."""
         return self.parameters + self.shape
 
+    @property
+    def linear(self) -> bool:
+        """Whether it belongs to V and W whatever the context."""
+        return self.factor is None and self.output is None and not self.bends
+
+    @property
+    def bends(self) -> bool:
+        """Whether it is not affine in the force."""
+        return any(term.monomial >= AFFINE for term in self.terms)
+
     def split(self, values: Floats) -> tuple[Floats, Floats]:
-        """Part (p + s,) values into parameters and shape."""
+        """Split (p + s,) values into parameters and shape."""
         return values[:len(self.parameters)], values[len(self.parameters):]
 
 
-def _diagonal(values: Floats) -> Floats:
-    """Give (n, 3, 3) diagonal matrices of (n, 3) values."""
-    return values[:, :, np.newaxis] * np.eye(3)
+def _by_axis(first: int) -> tuple[Term, ...]:
+    """Return the terms of a parameter for each axis, with a monomial for each axis."""
+    step = 0 if first == ONE else 1
+    return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
 
 
-def _no_slope(u: Floats, context: Context, shape: Floats, values: Floats) -> Floats:
-    return np.zeros((len(u), 3, 3))
+def _matrix(*entries: tuple[int, int, int, float]) -> tuple[Term, ...]:
+    """Return the terms of a matrix times force, from (parameter, row, column, weight)."""
+    return tuple(Term(parameter, row, FORCE + column, weight)
+                 for parameter, row, column, weight in entries)
 
 
-def _constant(words: str, term: str, typical: float, needs: tuple[str, ...] = (),
-              factor: Callable[[Context, Floats], Floats] | None = None, unit: str = 'g',
-              shape_names: tuple[str, ...] = ()) -> Effect:
-    """Make an effect that adds the same whatever the force."""
-    def basis(u: Floats, context: Context, shape: Floats) -> Floats:
-        factors = 1.0 if factor is None else factor(context, shape)
-        return _diagonal(np.ones_like(u) * factors)
+_CROSS = _matrix((0, 0, 1, 1.0), (0, 1, 0, 1.0), (1, 0, 2, 1.0), (1, 2, 0, 1.0),
+                 (2, 1, 2, 1.0), (2, 2, 1, 1.0))
+_ROTATION = _matrix((0, 2, 1, 1.0), (0, 1, 2, -1.0), (1, 0, 2, 1.0), (1, 2, 0, -1.0),
+                    (2, 1, 0, 1.0), (2, 0, 1, -1.0))
+_COUPLED = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+_ALL = tuple(Term(0, axis, FORCE + axis) for axis in range(3))
+_SUPPLY = (*_ALL, *(Term(1 + axis, axis, ONE) for axis in range(3)))
+_LEVER = tuple(Term(parameter, axis, ONE) for axis in range(3) for parameter in range(3))
 
-    return Effect(words, term, AXES, unit, typical, needs, factor is None, basis, _no_slope,
-                  shape_names)
+_TAUS = 40
+"""Time constants that a search tries; a coarser grid makes up second effects."""
 
-
-def _matrix(words: str, term: str, typical: float, parameters: tuple[str, ...],
-            matrices: Any) -> Effect:
-    """Make an effect that adds a matrix times force; one (3, 3) matrix a parameter."""
-    mats = np.array(matrices, float)
-
-    def basis(u: Floats, context: Context, shape: Floats) -> Floats:
-        added: Floats = np.einsum('pij,nj->nip', mats, u)
-        return added
-
-    def slope(u: Floats, context: Context, shape: Floats, values: Floats) -> Floats:
-        return np.broadcast_to(np.tensordot(values, mats, 1), (len(u), 3, 3))
-
-    return Effect(words, term, parameters, 'g/g', typical, (), True, basis, slope)
+_LEAST_SIDE = 5
+"""Poses on each side of a step; with three it could absorb any single outlier."""
 
 
-def _by_axis(words: str, term: str, typical: float, unit: str,
-             bend: Callable[[Floats], Floats], derivative: Callable[[Floats], Floats],
-             needs: tuple[str, ...] = (),
-             factor: Callable[[Context], Floats] | None = None) -> Effect:
-    """Make an effect in which each axis bends by a function of its own force."""
-    def scale(context: Context) -> Floats | float:
-        return 1.0 if factor is None else factor(context)
-
-    def basis(u: Floats, context: Context, shape: Floats) -> Floats:
-        return _diagonal(bend(u) * scale(context))
-
-    def slope(u: Floats, context: Context, shape: Floats, values: Floats) -> Floats:
-        return _diagonal(values * derivative(u) * scale(context))
-
-    return Effect(words, term, AXES, unit, typical, needs, False, basis, slope)
+def _times(context: Context) -> Floats:
+    """Return the times of the poses, sorted; without those that are not known (NaN)."""
+    time: Floats = np.sort(context['time'])
+    return time[np.isfinite(time)]
 
 
-def _column(context: Context, key: str) -> Floats:
-    """Give a quantity of the context as (n, 1)."""
-    return np.asarray(context[key], float)[:, np.newaxis]
+def _from_start(context: Context) -> Iterator[Floats]:
+    """Yield the time of the first pose."""
+    time = _times(context)
+    if len(time) and time[-1] > time[0]:
+        yield time[:1]
 
 
-def _warming(context: Context) -> Floats:
-    """Give the (n, 1) temperature above the reference."""
-    return _column(context, 'temperature') - REFERENCE_TEMPERATURE
+def _taus(context: Context) -> Iterator[Floats]:
+    """Yield start and time constant, from a sixtieth of the time span to one and a half."""
+    time = _times(context)
+    span = time[-1] - time[0] if len(time) else 0.0
+    if span > 0.0:
+        for tau in np.geomspace(span / 60.0, span * 1.5, _TAUS):
+            yield np.array([time[0], tau])
 
 
-def _variance(context: Context, shape: Floats) -> Floats:
-    """Give the (n, 3) variance of the samples of each pose [g²]."""
-    return np.asarray(context['std'], float) ** 2
+def _instants(context: Context) -> Iterator[Floats]:
+    """Yield the instants between successive poses that leave enough poses on each side."""
+    time = _times(context)
+    middles = (time[1:] + time[:-1]) / 2.0
+    for instant in np.unique(middles[_LEAST_SIDE - 1:len(middles) - _LEAST_SIDE + 1]):
+        yield np.array([instant])
 
 
-def _since(context: Context, shape: Floats) -> Floats:
-    """Give the (n, 1) time since the start [h]."""
-    return (_column(context, 'time') - shape[0]) / HOUR
+def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
+    return context['temperature'] - REFERENCE_TEMPERATURE
 
 
-def _cooling(context: Context, shape: Floats) -> Floats:
-    """Give exp(-(t - start) / tau), (n, 1)."""
+def _supply_change(context: Mapping[str, Any], shape: Floats) -> Any:
+    return context['supply_voltage'] / NOMINAL_SUPPLY - 1.0
+
+
+def _since(context: Mapping[str, Any], shape: Floats) -> Any:
+    return (context['time'] - shape[0]) / HOUR
+
+
+def _settling(context: Mapping[str, Any], shape: Floats) -> Any:
+    """Return exp(-(t - start) / tau)."""
     start, tau = shape
-    return np.exp(-np.maximum(_column(context, 'time') - start, 0.0) / max(tau, 1e-9))
+    return np.exp(-np.maximum(context['time'] - start, 0.0) / max(tau, 1e-9))
 
 
-def _after(context: Context, shape: Floats) -> Floats:
-    """Give 1 from the instant on, (n, 1)."""
-    return (_column(context, 'time') >= shape[0]).astype(float)
+def _after(context: Mapping[str, Any], shape: Floats) -> Any:
+    return np.asarray(context['time'] >= shape[0], float)
 
 
-def _approach(context: Context, shape: Floats) -> Floats:
-    """Give the (n, 3) unit vector from the pose before, seen from this one."""
-    return np.asarray(context['approach'], float)
+def _columns_of(key: str, power: int = 1) -> Factor:
+    """Return the factor that is a vector of the context, by axis."""
+    return lambda context, shape: np.asarray(context[key], float).T ** power
 
 
-def _supply_basis(u: Floats, context: Context, shape: Floats) -> Floats:
-    change = _column(context, 'supply_voltage') / NOMINAL_SUPPLY - 1.0
-    return np.concatenate([(u * change)[:, :, np.newaxis], _diagonal(np.ones_like(u) * change)],
-                          axis=2)
-
-
-def _supply_slope(u: Floats, context: Context, shape: Floats, values: Floats) -> Floats:
-    change = _column(context, 'supply_voltage') / NOMINAL_SUPPLY - 1.0
-    return _diagonal(np.ones_like(u) * change * values[0])
-
-
-def _lever_basis(u: Floats, context: Context, shape: Floats) -> Floats:
-    """Give ω×(ω×r) per metre, in g."""
-    rate = np.asarray(context['rate'], float)
-    outer = rate[:, :, np.newaxis] * rate[:, np.newaxis, :]
-    squared = np.sum(rate ** 2, axis=1)[:, np.newaxis, np.newaxis]
-    return (outer - squared * np.eye(3)) / STANDARD_GRAVITY
-
-
-def _nothing(u: Floats, context: Context, shape: Floats) -> Floats:
-    return np.zeros((len(u), 3, 1))
+def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
+    """Return the (9, n) entries of ω×(ω×·) per metre [g], row by row."""
+    rate = np.asarray(context['rate'], float).T
+    squared = np.sum(rate ** 2, axis=0)
+    entries = [rate[i] * rate[j] - (squared if i == j else 0.0)
+               for i in range(3) for j in range(3)]
+    return np.array(entries) / STANDARD_GRAVITY
 
 
 def _clipped(reading: Floats, values: Floats) -> Floats:
     return np.clip(reading, -values[0], values[0])
 
 
-def _on_a_grid(reading: Floats, values: Floats) -> Floats:
+def _on_grid(reading: Floats, values: Floats) -> Floats:
     return np.round(reading / values[0]) * values[0]
 
 
-_COUPLED = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-
-
-def _coupling_basis(u: Floats, context: Context, shape: Floats) -> Floats:
-    basis = np.zeros((len(u), 3, len(_COUPLED)))
-    for k, (i, j) in enumerate(_COUPLED):
-        basis[:, i, k] = u[:, i] * u[:, j]
-    return basis
-
-
-def _coupling_slope(u: Floats, context: Context, shape: Floats, values: Floats) -> Floats:
-    slope = np.zeros((len(u), 3, 3))
-    for value, (i, j) in zip(values, _COUPLED, strict=True):
-        slope[:, i, i] += value * u[:, j]
-        slope[:, i, j] += value * u[:, i]
-    return slope
-
-
-def _unit(i: int, j: int, other: float = 0.0) -> Floats:
-    """Give a matrix with 1 at (i, j) and `other` at (j, i)."""
-    matrix = np.zeros((3, 3))
-    matrix[i, j] = 1.0
-    if i != j:
-        matrix[j, i] = other
-    return matrix
-
+_bending = partial(Effect, plausible_g=0.5, family='force')
+_in_time = partial(Effect, plausible_g=0.5, family='time')
 
 EFFECTS: dict[str, Effect] = {
-    'offset': _constant('zero-g offset', 'bias K0, zero-g offset', 0.1),
-    'gain': _matrix('one gain for all axes', 'scale factor K1, sensitivity', 0.03, ('all',),
-                    [np.eye(3)]),
-    'axis_gain': _matrix('gain of each axis', 'scale factor K1, sensitivity', 0.03, AXES,
-                         [_unit(i, i) for i in range(3)]),
-    'cross_axis': _matrix('cross-axis gain, symmetric', 'cross-axis sensitivity', 0.02,
-                          ('xy', 'xz', 'yz'),
-                          [_unit(0, 1, 1), _unit(0, 2, 1), _unit(1, 2, 1)]),
-    'misalignment': _matrix('rotation of the sensing axes', 'input-axis misalignment', 0.02, AXES,
-                            [_unit(2, 1, -1), _unit(0, 2, -1), _unit(1, 0, -1)]),
-    'quadratic': _by_axis('square of the force', 'second-order coefficient K2', 0.001, 'g/g²',
-                          np.square, lambda u: 2 * u),
-    'cubic': _by_axis('cube of the force', 'third-order coefficient K3', 0.001, 'g/g³',
-                      lambda u: u ** 3, lambda u: 3 * u ** 2),
-    'odd_quadratic': _by_axis('force times its size', 'odd quadratic coefficient Koq', 0.001,
-                              'g/g²', lambda u: u * np.abs(u), lambda u: 2 * np.abs(u)),
-    'gain_asymmetry': _by_axis('gain that differs by direction', 'scale-factor asymmetry', 0.002,
-                               'g/g', np.abs, np.sign),
-    'cross_coupling': Effect('product of two axes', 'cross-coupling coefficients Kip, Kio',
-                             tuple(f'{AXES[i]}_{AXES[i]}{AXES[j]}' for i, j in _COUPLED),
-                             'g/g²', 0.001, (), False, _coupling_basis, _coupling_slope),
-    'offset_temperature': _constant('offset that moves with temperature',
-                                    'zero-g offset temperature coefficient TCO', 0.001,
-                                    ('temperature',), lambda c, shape: _warming(c), 'g/°C'),
-    'gain_temperature': _by_axis('gain that moves with temperature',
-                                 'sensitivity temperature coefficient TCS', 0.0003, '1/°C',
-                                 lambda u: u, np.ones_like, ('temperature',), _warming),
-    'supply_ratio': Effect('offset and gain that follow the supply', 'ratiometric output',
-                           ('gain', *AXES), 'g/g', 1.0, ('supply_voltage',), False,
-                           _supply_basis, _supply_slope),
-    'offset_drift': _constant('offset that drifts with time', 'bias drift', 0.0005, ('time',),
-                              _since, 'g/h', ('start',)),
-    'warm_up': _constant('offset that settles after switching on', 'turn-on transient', 0.005,
-                         ('time',), _cooling, 'g', ('start', 'tau')),
-    'offset_step': _constant('offset that jumped at an instant', 'bias shift after shock', 0.005,
-                             ('time',), _after, 'g', ('instant',)),
-    'vibration_rectification': _constant('offset that grows with vibration',
-                                         'vibration rectification coefficient VRC', 0.002,
-                                         ('std',), _variance, 'g/g²'),
-    'hysteresis': _constant('offset that depends on the pose before', 'hysteresis', 0.001,
-                            ('approach',), _approach, 'g'),
-    'lever_arm': Effect('force of turning, away from the axis', 'size effect', AXES, 'm', 0.1,
-                        ('rate',), False, _lever_basis, _no_slope),
+    'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, 1.0,
+                     _by_axis(ONE), repeatable_g=0.03),
+    'gain': Effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
+                   0.5, _ALL, repeatable_g=0.015),
+    'axis_gain': Effect('gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
+                        0.5, _by_axis(FORCE), repeatable_g=0.015),
+    'cross_axis': Effect('cross-axis gain, symmetric', 'cross-axis sensitivity',
+                         ('xy', 'xz', 'yz'), 'g/g', 0.02, 0.5, _CROSS, repeatable_g=0.015),
+    'misalignment': Effect('rotation of the sensing axes', 'input-axis misalignment', AXES, 'g/g',
+                           0.02, np.inf, _ROTATION),
+    'quadratic': _bending('square of the force', 'second-order coefficient K2', AXES, 'g/g²',
+                          0.001, terms=_by_axis(SQUARE)),
+    'cubic': _bending('cube of the force', 'third-order coefficient K3', AXES, 'g/g³', 0.001,
+                      terms=_by_axis(CUBE)),
+    'odd_quadratic': _bending('force times its size', 'odd quadratic coefficient Koq', AXES,
+                              'g/g²', 0.001, terms=_by_axis(ODD_SQUARE)),
+    'gain_asymmetry': _bending('gain that differs by direction', 'scale-factor asymmetry', AXES,
+                               'g/g', 0.002, terms=_by_axis(SIZE)),
+    'cross_coupling': _bending(
+        'product of two axes', 'cross-coupling coefficients Kip, Kio',
+        tuple(f'{AXES[i]}_{AXES[i]}{AXES[j]}' for i, j in _COUPLED), 'g/g²', 0.001,
+        terms=tuple(Term(k, i, _PRODUCTS[min(i, j), max(i, j)])
+                    for k, (i, j) in enumerate(_COUPLED))),
+    'offset_temperature': _in_time(
+        'offset that changes with temperature', 'zero-g offset temperature coefficient TCO', AXES,
+        'g/°C', 0.001, terms=_by_axis(ONE), factor=_warming, needs=('temperature',)),
+    'gain_temperature': _in_time(
+        'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
+        '1/°C', 0.0003, terms=_by_axis(FORCE), factor=_warming, needs=('temperature',)),
+    'supply_ratio': Effect(
+        'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
+        'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',)),
+    'offset_drift': _in_time(
+        'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=_by_axis(ONE),
+        factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
+    'warm_up': _in_time(
+        'offset that settles after switching on', 'turn-on transient', AXES, 'g', 0.005,
+        terms=_by_axis(ONE), factor=_settling, needs=('time',), shape=('start', 'tau'),
+        shapes=_taus),
+    'offset_step': _in_time(
+        'offset that jumped at an instant', 'bias shift after shock', AXES, 'g', 0.005,
+        terms=_by_axis(ONE), factor=_after, needs=('time',), shape=('instant',),
+        shapes=_instants),
+    'vibration_rectification': Effect(
+        'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
+        'g/g²', 0.002, 0.5, _by_axis(ONE), _columns_of('std', 2), ('std',)),
+    'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
+                         0.001, 0.5, _by_axis(ONE), _columns_of('previous'), ('previous',)),
+    'lever_arm': Effect('centripetal force away from the axis of turning', 'size effect', AXES,
+                        'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
     'saturation': Effect('readings that end at a limit', 'full-scale range', ('limit',), 'g', 2.0,
-                         (), False, _nothing, _no_slope, output=_clipped),
-    'quantisation': Effect('readings on a grid', 'resolution', ('step',), 'g', 0.001, (), False,
-                           _nothing, _no_slope, output=_on_a_grid),
+                         np.inf, (), output=_clipped),
+    'quantisation': Effect('readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
+                           output=_on_grid),
 }
-"""`offset_wander`, a random walk, is no function of its context and so not here; see
-`accel_calib.refine`."""
+"""All effects that are functions of force and context."""
+
+WANDER = 'offset_wander'
+PROCESSES: dict[str, Effect] = {
+    WANDER: _in_time('offset that wanders in no known form', 'bias random walk', (), 'g', 0.001,
+                     terms=(), needs=('time',))}
+"""Random processes, which `accel_calib.refine` names and no model holds."""
+
+CHANGES: dict[str, Effect] = {
+    f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
+                              factor=lambda context, shape: context['new'], needs=('new',))
+    for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
+"""How a sensor differs from its stored calibration; see `accel_calib.refine`. ``new`` is 1 for
+poses taken since then and 0 for those of the calibration."""
+
+_ALL_EFFECTS = {**EFFECTS, **PROCESSES, **CHANGES}
+
+
+def effect_named(name: str) -> Effect:
+    """Return the effect of this name: of `EFFECTS`, `PROCESSES` or `CHANGES`; raises KeyError."""
+    return _ALL_EFFECTS[name]
+
+
+LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
+"""The effects of V and W, which every sensor has."""

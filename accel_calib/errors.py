@@ -1,12 +1,12 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors that a user can mend; each message says what was found, expected and what to do."""
+"""Errors that a user can fix; each message says what was found, expected and what to do."""
 
 
 class AccelCalibError(Exception):
     """
-    Something the user gave cannot be used.
+    Input of the user cannot be used.
 
     Parameters
     ----------
@@ -31,8 +31,12 @@ class InputError(AccelCalibError):
 
 
 class RefusedFitError(AccelCalibError):
-    """The poses cannot carry the fit that was asked for."""
+    """The poses do not determine what was asked for."""
 
 
 class StoredCalibrationError(AccelCalibError):
-    """A stored calibration is damaged, newer than this package, or not of this sensor."""
+    """A stored calibration is newer than this package, or not of this sensor."""
+
+
+class DamagedCalibrationError(StoredCalibrationError):
+    """A stored calibration is damaged, or not one that a sensor can have."""

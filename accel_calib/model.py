@@ -4,25 +4,28 @@
 """
 A model is a list of effects with their values: `predict` and `correct` undo each other.
 
-The equation is that of the package: the linear effects make up V and W,
+With the context fixed, the terms of all effects sum to an offset, a gain and bending terms,
 
-    reading = V + W u + sum of the other effects(u, context),   u = ΔR force
+    reading = V + W u + bend(u),   u = ΔR force
 
-and the correction solves it for u by the iteration u <- W⁻¹ (reading - V - others(u)), a
-contraction as long as the other effects are small against the gain.
+which is `Model.at`. The correction solves this for u by the iteration u <- W⁻¹ (reading - V -
+bend(u)), a contraction as long as the bending terms are small against the gain.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .effects import Context, EFFECTS
+from .effects import AFFINE, CHANGES, Context, Effect, effect_named, EFFECTS, FORCE, MONOMIALS, ONE
 from .errors import InputError
+from .sphere import unit
 from .table import COLUMNS, Floats
 
 MODELS: dict[str, tuple[str, ...]] = {
@@ -33,19 +36,251 @@ MODELS: dict[str, tuple[str, ...]] = {
     '10': ('offset', 'axis_gain', 'cross_axis'),
     '12': ('offset', 'axis_gain', 'cross_axis', 'misalignment'),
 }
-"""Effects of each model. 9 and 10 differ in their axes alone: 9 fixes them to the sensing axes
-(ESGI'95 report), 10 makes W symmetric (AN5286)."""
+"""Effects of each model. Models 9 and 10 differ in their axes alone: 9 fixes them to the sensing
+axes (ESGI'95 report), 10 makes W symmetric (AN5286)."""
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
 """The iteration ends when u changes by less [g]."""
 
 LARGEST_FORCE_G = 1e6
-"""It has run away when u is larger [g]."""
+"""The iteration has diverged when u is larger [g]."""
+
+FITTED_SHAPES = ('tau',)
+"""Shape constants that a fit changes; the others are taken from the data once."""
+
+_SHAPE_STEP = 1e-4
+"""Relative step of the derivative by a shape constant, the only one taken by difference."""
+
+
+_IDENTITY = np.eye(3)
 
 
 def _identity() -> Floats:
     return np.eye(3)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """
+    The terms of a list of effects as arrays, one entry per term.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        The effects.
+    monomials : tuple of int
+        Indices in `MONOMIALS` that occur.
+    place : (t,) array of int
+        Index of the term's monomial in `monomials`.
+    axis, value : (t,) array of int
+        Axis of the reading; index of the parameter among all p values.
+    weight : (t,) array
+        Constant factor.
+    count : (e,) array of int
+        Terms of each effect.
+    size : int
+        p, the number of values.
+
+    """
+
+    effects: tuple[Effect, ...]
+    monomials: tuple[int, ...]
+    place: NDArray[np.intp]
+    axis: NDArray[np.intp]
+    value: NDArray[np.intp]
+    weight: Floats
+    count: NDArray[np.intp]
+    size: int
+
+    @cached_property
+    def starts(self) -> NDArray[np.intp]:
+        """(e,) array, index of the first value of each effect."""
+        sizes = [len(effect.values) for effect in self.effects]
+        return np.cumsum([0, *sizes])[:-1].astype(np.intp)
+
+    @cached_property
+    def to_affine(self) -> Floats:
+        """(12, t) array that sums the affine terms into V and, row by row, W - I."""
+        monomial = np.array(self.monomials, np.intp)[self.place]
+        slot = np.where(monomial == ONE, self.axis, 3 + 3 * self.axis + monomial - FORCE)
+        return _sums(np.where(monomial < AFFINE, slot, -1), 12)
+
+    @cached_property
+    def to_value(self) -> Floats:
+        """(p, t) array that sums terms by value."""
+        return _sums(self.value, self.size)
+
+    @cached_property
+    def bending(self) -> NDArray[np.intp]:
+        """(b,) array, the terms that bend with the force."""
+        return np.flatnonzero(np.array(self.monomials, np.intp)[self.place] >= AFFINE)
+
+    @cached_property
+    def bends_to_axis(self) -> Floats:
+        """(3, b) array that sums the bending terms by axis."""
+        return _sums(self.axis[self.bending], 3)
+
+    @cached_property
+    def fixed(self) -> bool:
+        """Whether no factor depends on the context."""
+        return all(effect.factor is None for effect in self.effects)
+
+    def factors(self, shapes: list[Floats], context: Mapping[str, Any], rows: tuple[int, ...]
+                ) -> Floats:
+        """Return the (t, *rows) factors of the terms; what the context lacks (NaN) is 0."""
+        found = np.ones((len(self.weight), *rows))
+        start = 0
+        for effect, shape, count in zip(self.effects, shapes, self.count.tolist(), strict=True):
+            if effect.factor is not None:
+                found[start:start + count] = effect.factor(context, shape)
+            start += count
+        return np.nan_to_num(found, copy=False)
+
+    def monomials_at(self, u: Floats) -> Floats:
+        """Return the (m, n) monomials of (n, 3) forces."""
+        x, y, z = u.T
+        found = np.empty((len(self.monomials), len(u)))
+        for k, index in enumerate(self.monomials):
+            found[k] = MONOMIALS[index].value(x, y, z)
+        return found
+
+    def gradients_at(self, u: Floats) -> Floats:
+        """Return the (m, 3, n) derivatives of the monomials by the force."""
+        x, y, z = u.T
+        found = np.empty((len(self.monomials), 3, len(u)))
+        for k, index in enumerate(self.monomials):
+            for axis, part in enumerate(MONOMIALS[index].gradient(x, y, z)):
+                found[k, axis] = part
+        return found
+
+
+@lru_cache(maxsize=512)
+def terms_of(effects: tuple[str, ...]) -> Terms:
+    """Return the terms of the effects of these names."""
+    entries = [effect_named(name) for name in effects]
+    used = sorted({term.monomial for effect in entries for term in effect.terms} | {ONE})
+    rows, start = [], 0
+    for effect in entries:
+        rows += [(used.index(term.monomial), term.axis, start + term.parameter, term.weight)
+                 for term in effect.terms]
+        start += len(effect.values)
+    place, axis, value, weight = np.array(rows, float).reshape(-1, 4).T
+    return Terms(tuple(entries), tuple(used), place.astype(np.intp), axis.astype(np.intp),
+                 value.astype(np.intp), weight,
+                 np.array([len(effect.terms) for effect in entries], np.intp), start)
+
+
+def _sums(index: NDArray[np.intp], size: int) -> Floats:
+    """Return the (size, t) matrix that sums t numbers by their index."""
+    found: Floats = (index == np.arange(size)[:, np.newaxis]).astype(float)
+    return found
+
+
+@dataclass(frozen=True)
+class Basis:
+    """
+    Derivative of the reading by the values of a model, term by term.
+
+    Parameters
+    ----------
+    terms : (t, n) array
+        What each term adds to its axis for a value of 1.
+    axis : (t,) array of int
+        That axis.
+    to_value : (p, t) array
+        Sums the terms by value.
+
+    """
+
+    terms: Floats
+    axis: NDArray[np.intp]
+    to_value: Floats
+
+    @property
+    def full(self) -> Floats:
+        """(n, 3, p) array, the derivative."""
+        return np.stack([self.to_value[:, self.axis == axis] @ self.terms[self.axis == axis]
+                         for axis in range(3)]).T.swapaxes(1, 2)
+
+    def along(self, rows: Floats) -> Floats:
+        """Return its product with an (n, 3) row of each pose, (n, p)."""
+        found: Floats = (self.to_value @ (self.terms * rows.T[self.axis])).T
+        return found
+
+
+@dataclass(frozen=True)
+class AtContext:
+    """
+    A model with its context fixed, for n poses or for all poses alike.
+
+    Parameters
+    ----------
+    mat_w : (n, 3, 3) or (3, 3) array
+        W.
+    vec_v : (n, 3) or (3,) array
+        V [g].
+    terms : Terms
+        All terms of the model.
+    bend : (b, n) or (b, 1) array
+        Coefficients of the bending terms.
+
+    """
+
+    mat_w: Floats
+    vec_v: Floats
+    terms: Terms
+    bend: Floats
+
+    def _bend(self, u: Floats) -> Floats:
+        """Return the (n, 3) reading that the bending terms add."""
+        terms = self.terms
+        values = terms.monomials_at(u)[terms.place[terms.bending]] * self.bend
+        found: Floats = (terms.bends_to_axis @ values).T
+        return found
+
+    def reading(self, u: Floats) -> Floats:
+        """Return the (n, 3) reading under the (n, 3) force u in the sensor axes [g]."""
+        found = self.vec_v + times(self.mat_w, u)
+        return found + self._bend(u) if len(self.bend) else found
+
+    def slope(self, u: Floats) -> Floats:
+        """Return the (n, 3, 3) derivative of the reading by the force u."""
+        found = np.broadcast_to(self.mat_w, (len(u), 3, 3))
+        if not len(self.bend):
+            return found
+        terms = self.terms
+        parts = terms.gradients_at(u)[terms.place[terms.bending]] * self.bend[:, np.newaxis]
+        return found + np.einsum('it,tjn->nij', terms.bends_to_axis, parts)
+
+    def inverse_slope(self, u: Floats) -> Floats:
+        """Return the inverse of `slope`, (n, 3, 3), or (3, 3) where it is the same for all."""
+        return np.linalg.inv(self.slope(u) if len(self.bend) else self.mat_w)
+
+    def force(self, reading: Floats) -> Floats:
+        """Return the (n, 3) force u of a reading [g]; NaN where the iteration diverges."""
+        inverse = np.linalg.inv(self.mat_w)
+        affine = times(inverse, reading - self.vec_v)
+        if not len(self.bend):
+            return affine
+        u = affine
+        for _ in range(LARGEST_ITERATIONS):
+            before = u
+            u = affine - times(inverse, self._bend(u))
+            u[~(np.max(np.abs(u), axis=1) < LARGEST_FORCE_G)] = np.nan
+            change = np.max(np.abs(u - before), axis=1)
+            if not np.any(change > CONVERGED_G):
+                return u
+        u[change > CONVERGED_G] = np.nan
+        return u
+
+
+def times(matrix: Floats, vectors: Floats) -> Floats:
+    """Return matrix times vector for (n, 3) vectors and (3, 3) or (n, 3, 3) matrices."""
+    if matrix.ndim == 2:
+        return vectors @ matrix.T
+    found: Floats = (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
+    return found
 
 
 @dataclass(frozen=True)
@@ -58,7 +293,7 @@ class Model:
     values : mapping of str to (p,) array
         By name of `accel_calib.effects.EFFECTS`, in the order of the model.
     rotation : (3, 3) array
-        ΔR, from the levelled frame to the axes of the sensor.
+        ΔR, from the levelled frame to the sensor axes.
 
     """
 
@@ -67,64 +302,161 @@ class Model:
 
     def __post_init__(self) -> None:
         for name, values in self.values.items():
-            if name not in EFFECTS:
+            if name not in EFFECTS and name not in CHANGES:
                 raise ValueError(f'effect {name!r} is none of {", ".join(EFFECTS)}')
-            if np.shape(values) != (len(EFFECTS[name].values),):
+            effect = effect_named(name)
+            if np.shape(values) != (len(effect.values),):
                 raise ValueError(f'effect {name} has values of shape {np.shape(values)}, expected '
-                                 f'{len(EFFECTS[name].values)}')
+                                 f'{len(effect.values)}')
 
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
         return tuple(self.values)
 
-    @property
+    @cached_property
     def vector(self) -> Floats:
         """(p,) array of all values, in order."""
         return np.concatenate([np.zeros(0), *self.values.values()])
 
+    @cached_property
+    def terms(self) -> Terms:
+        """Terms of the effects."""
+        return terms_of(self.effects)
+
     @property
     def needs(self) -> tuple[str, ...]:
         """Keys of the context without which the model cannot correct."""
-        return tuple(dict.fromkeys(key for name in self.values for key in EFFECTS[name].needs))
+        return tuple(dict.fromkeys(key for effect in self.terms.effects for key in effect.needs))
 
     @cached_property
     def linear_part(self) -> tuple[Floats, Floats]:
-        """W (3, 3) and V (3,), both in g."""
-        at = np.vstack([np.zeros(3), np.eye(3)])
-        reading = at + self._added(at, {}, linear=True)
-        return (reading[1:] - reading[0]).T, reading[0]
+        """W (3, 3) and V (3,), from the effects that need no context [g]."""
+        kept = {name: values for name, values in self.values.items()
+                if effect_named(name).factor is None}
+        here = Model(kept).at({})
+        return here.mat_w, here.vec_v
 
     @cached_property
-    def _inverse_gain(self) -> Floats:
-        return np.linalg.inv(self.linear_part[0])
+    def _shapes(self) -> list[Floats]:
+        return [effect.split(values)[1]
+                for effect, values in zip(self.terms.effects, self.values.values(), strict=True)]
 
-    def _added(self, u: Floats, context: Context, *, linear: bool) -> Floats:
-        """Give the (n, 3) reading that the linear effects, or the others, add."""
-        total = np.zeros_like(u)
-        for name, values in self.values.items():
-            if EFFECTS[name].linear is linear:
-                parameters, shape = EFFECTS[name].split(values)
-                total = total + EFFECTS[name].basis(u, context, shape) @ parameters
-        return total
+    @cached_property
+    def _without_context(self) -> AtContext:
+        return self._at(np.ones((len(self.terms.weight), 1)))
 
-    def _leaves(self, reading: Floats) -> Floats:
-        """Give the (n, 3) reading that the output makes of this one."""
-        for name, values in self.values.items():
-            output = EFFECTS[name].output
-            if output is not None:
-                reading = output(reading, values)
-        return reading
+    def at(self, context: Context) -> AtContext:
+        """
+        Return the model with its context fixed.
+
+        Parameters
+        ----------
+        context : mapping of str to array
+            What the effects need beside the force; n rows each.
+
+        Raises
+        ------
+        InputError
+            If a column is missing.
+
+        """
+        if self.terms.fixed:
+            return self._without_context
+        return self._at(self._factors(context))
+
+    def _factors(self, context: Context) -> Floats:
+        check_context(self, context)
+        rows = len(np.asarray(context[self.needs[0]])) if self.needs else 1
+        return self.terms.factors(self._shapes, context, (rows,))
+
+    def _at(self, factors: Floats) -> AtContext:
+        """Sum the affine terms, given the (t, n) factors."""
+        terms = self.terms
+        sized = factors * (terms.weight * self.vector[terms.value])[:, np.newaxis]
+        affine = (terms.to_affine @ sized).T
+        mat_w = _IDENTITY + affine[:, 3:].reshape(-1, 3, 3)
+        bend = sized[terms.bending]
+        if terms.fixed:
+            return AtContext(mat_w[0], affine[0, :3], terms, bend)
+        return AtContext(mat_w, affine[:, :3], terms, bend)
+
+    def basis(self, u: Floats, context: Context, direction: Floats | None = None) -> Basis:
+        """
+        Return the derivative of the reading by each value.
+
+        Parameters
+        ----------
+        u : (n, 3) array
+            Force in the sensor axes [g].
+        context : mapping of str to array
+            What the effects need, n rows each.
+        direction : (n, 3) array, optional
+            If given, the derivative of the basis along this direction of the force instead.
+
+        Returns
+        -------
+        Basis
+            In the order of ``model.vector``.
+
+        """
+        terms = self.terms
+        if direction is None:
+            monomials = terms.monomials_at(u)
+        else:
+            monomials = np.einsum('mjn,nj->mn', terms.gradients_at(u), direction)
+        plain = monomials[terms.place] * terms.weight[:, np.newaxis]
+        if terms.fixed:
+            return Basis(plain, terms.axis, terms.to_value)
+        found = plain * self._factors(context)
+        moved, of, index = self._by_shape(plain, context)
+        return Basis(np.concatenate([found, moved]), np.concatenate([terms.axis, terms.axis[of]]),
+                     np.hstack([terms.to_value, _sums(index, terms.size)]))
+
+    def _by_shape(self, plain: Floats, context: Context
+                  ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+        """Return the terms of the derivative by shape constants that are fitted."""
+        moved, of, index = [plain[:0]], [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+        ends = np.cumsum(self.terms.count)
+        for k, effect in enumerate(self.terms.effects):
+            shape = self._shapes[k]
+            which = np.arange(ends[k] - self.terms.count[k], ends[k])
+            for place, name in enumerate(effect.shape):
+                if name in FITTED_SHAPES and effect.factor is not None:
+                    change = difference(effect.factor, context, shape, place)
+                    values = self.vector[self.terms.value[which]][:, np.newaxis]
+                    moved.append(plain[which] * values * np.nan_to_num(change))
+                    of.append(which)
+                    start = self.terms.starts[k] + len(effect.parameters) + place
+                    index.append(np.full(len(which), start, np.intp))
+        return np.concatenate(moved), np.concatenate(of), np.concatenate(index)
+
+
+def difference(factor: Callable[[Mapping[str, Any], Floats], Any], context: Context,
+               shape: Floats, place: int) -> Floats:
+    """Return the derivative of a factor by one shape constant."""
+    step = np.zeros(len(shape))
+    step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
+    change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
+        2.0 * step[place])
+    return change
 
 
 def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
-    """Name every parameter of these effects as ``effect.axis``, in the order of all vectors."""
-    return tuple(f'{name}.{part}' for name in effects for part in EFFECTS[name].values)
+    """Return the name of each value of these effects, ``effect.axis``, in the order of vectors."""
+    return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
+
+
+def fitted_values(effects: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Return which values of these effects a fit changes, (p,)."""
+    entries = [effect_named(name) for name in effects]
+    return np.array([part in effect.parameters or part in FITTED_SHAPES
+                     for effect in entries for part in effect.values], bool)
 
 
 def with_vector(effects: tuple[str, ...], vector: Floats, rotation: Floats | None = None) -> Model:
-    """Make a model of these effects from the (p,) vector of all values."""
-    sizes = [len(EFFECTS[name].values) for name in effects]
+    """Return the model of these effects with the (p,) vector of all values."""
+    sizes = [len(effect_named(name).values) for name in effects]
     parts = np.split(vector, np.cumsum(sizes)[:-1]) if sizes else []
     return Model(dict(zip(effects, parts, strict=True)),
                  np.eye(3) if rotation is None else rotation)
@@ -132,7 +464,7 @@ def with_vector(effects: tuple[str, ...], vector: Floats, rotation: Floats | Non
 
 def with_linear_part(mat_w: Floats, vec_v: Floats, rotation: Floats | None = None) -> Model:
     """
-    Make the model whose gain is W and whose offset is V.
+    Return the model whose gain is W and whose offset is V.
 
     Parameters
     ----------
@@ -152,9 +484,9 @@ def with_linear_part(mat_w: Floats, vec_v: Floats, rotation: Floats | None = Non
     return Model(values, np.eye(3) if rotation is None else rotation)
 
 
-def check_context(model: Model, context: Context) -> None:
+def check_context(model: Model, context: Mapping[str, Any]) -> None:
     """
-    Make sure that the context holds what the effects of the model need.
+    Check that the context holds what the effects of the model need.
 
     Raises
     ------
@@ -170,7 +502,7 @@ def check_context(model: Model, context: Context) -> None:
 
 def predict(model: Model, force: Floats, context: Context) -> Floats:
     """
-    Say what the sensor reads.
+    Compute what the sensor reads.
 
     Parameters
     ----------
@@ -187,19 +519,21 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
         Readings [g].
 
     """
-    check_context(model, context)
     return reading_of(model, force @ model.rotation.T, context)
 
 
 def reading_of(model: Model, u: Floats, context: Context) -> Floats:
-    """Say what the sensor reads under the (n, 3) force u, given in its own axes [g]."""
-    mat_w, vec_v = model.linear_part
-    return model._leaves(vec_v + u @ mat_w.T + model._added(u, context, linear=False))
+    """Return what the sensor reads under the (n, 3) force u in its own axes [g]."""
+    reading = model.at(context).reading(u)
+    for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+        if effect.output is not None:
+            reading = effect.output(reading, values)
+    return reading
 
 
 def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     """
-    Find the specific force in the axes of the sensor.
+    Find the specific force in the sensor axes.
 
     Parameters
     ----------
@@ -218,26 +552,17 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     Raises
     ------
     InputError
-        If the effects are so large that the reading belongs to no one force.
+        If the effects are so large that a reading belongs to no one force.
 
     """
-    check_context(model, context)
-    u = (reading - model.linear_part[1]) @ model._inverse_gain.T
-    if all(EFFECTS[name].linear for name in model.values):
-        return u
-    linear = u
-    for _ in range(LARGEST_ITERATIONS):
-        before = u
-        if np.max(np.abs(u), initial=0.0) > LARGEST_FORCE_G:
-            break
-        u = linear - model._added(u, context, linear=False) @ model._inverse_gain.T
-        if np.max(np.abs(u - before), initial=0.0) < CONVERGED_G:
-            return u
-    raise too_large()
+    u = model.at(context).force(reading)
+    if np.any(np.isnan(u) & ~np.isnan(reading)):
+        raise too_large()
+    return u
 
 
 def too_large() -> InputError:
-    """Make the error of a reading that belongs to no one force."""
+    """Return the error for a reading that belongs to no one force."""
     return InputError('the effects of the model are too large to be undone at this reading',
                       'calibrate again, with readings in the range in which the sensor is used')
 
@@ -263,50 +588,22 @@ def correct(model: Model, reading: Floats, context: Context) -> Floats:
     Raises
     ------
     InputError
-        As `sensor_force`.
+        If the effects are so large that a reading belongs to no one force.
 
     """
     return sensor_force(model, reading, context) @ model.rotation
 
 
 def parameter_basis(model: Model, u: Floats, context: Context) -> Floats:
-    """
-    Say what each value of a model does to the reading.
-
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    u : (n, 3) array
-        Force in the axes of the sensor [g].
-    context : mapping of str to array
-        What the effects need, n rows each.
-
-    Returns
-    -------
-    (n, 3, p) array
-        Derivative of the reading by each value, in the order of ``model.vector``.
-
-    """
-    parts: list[Floats] = [np.zeros((len(u), 3, 0))]
-    for name, values in model.values.items():
-        effect = EFFECTS[name]
-        parameters, shape = effect.split(values)
-        parts.append(effect.basis(u, context, shape))
-        for k in range(len(shape)):  # the one derivative that is taken by difference
-            step = np.zeros(len(shape))
-            step[k] = 1e-4 * max(abs(shape[k]), 1.0) if effect.shape[k] == 'tau' else 0.0
-            change = (effect.basis(u, context, shape + step)
-                      - effect.basis(u, context, shape - step)) @ parameters
-            parts.append((change / (2.0 * step[k] or 1.0))[:, :, np.newaxis])
-    return np.concatenate(parts, axis=2)
+    """Return the (n, 3, p) derivative of the reading by each value, at (n, 3) forces u [g]."""
+    return model.basis(u, context).full
 
 
 def force_slope(model: Model, u: Floats, context: Context) -> Floats:
-    """Give the (n, 3, 3) derivative of the reading by the force u in the axes of the sensor."""
-    slope = np.broadcast_to(model.linear_part[0], (len(u), 3, 3))
-    for name, values in model.values.items():
-        if not EFFECTS[name].linear:
-            parameters, shape = EFFECTS[name].split(values)
-            slope = slope + EFFECTS[name].slope(u, context, shape, parameters)
-    return slope
+    """Return the (n, 3, 3) derivative of the reading by the force u in the sensor axes."""
+    return model.at(context).slope(u)
+
+
+def length_rows(model: Model, u: Floats, context: Context) -> Floats:
+    """Return ûᵀA⁻¹, (n, 3): the derivative of |u| by the reading, with A its slope."""
+    return times(np.swapaxes(model.at(context).inverse_slope(u), -1, -2), unit(u))

@@ -4,8 +4,8 @@
 """
 Seeded poses and recordings from a model: the forward equation with noise.
 
-All readings are in g; `accel_calib.units` takes them to another unit. Directions are unit
-vectors of specific force in the levelled frame: the direction that points up.
+All readings are in g; `accel_calib.units` converts them. Directions are directions of up in the
+levelled frame, unit vectors of specific force.
 
 """
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .effects import Context, EFFECTS
 from .errors import InputError
@@ -38,29 +39,52 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     Raises
     ------
     InputError
-        If the name is not in the catalogue, or the values are not that many finite numbers.
+        As `model_with`, or if it is not of this form.
 
     """
-    name, equals, values_text = text.partition('=')
-    if name not in EFFECTS or not equals:
-        raise InputError(f'effect {text!r} is not NAME=VALUE,… with a NAME of the catalogue',
+    name, equals, values = text.partition('=')
+    if not equals:
+        raise InputError(f'effect {text!r} is not of the form NAME=VALUE,…',
                          f'use one of {", ".join(EFFECTS)}')
-    parameters = EFFECTS[name].values
     try:
-        values = np.array([float(part) for part in values_text.split(',')])
+        numbers = np.array([float(part) for part in values.split(',')])
     except ValueError:
-        values = np.array([np.nan])
-    if not np.all(np.isfinite(values)) or len(values) not in (1, len(parameters)):
-        raise InputError(f'effect {name} has values {values_text!r}, expected 1 or '
-                         f'{len(parameters)} numbers ({", ".join(parameters)}) in '
-                         f'{EFFECTS[name].unit}',
-                         f'write {name}={",".join(["0.001"] * len(parameters))}, for instance')
-    return name, np.broadcast_to(values, len(parameters)).copy()
+        numbers = np.array([np.nan])
+    return name, _values_of(name, numbers, repr(values))
 
 
-def model_with(effects: Mapping[str, Floats], rotation: Floats | None = None) -> Model:
-    """Make the model with these effects, in the order of the catalogue."""
-    ordered = {name: effects[name] for name in EFFECTS if name in effects}
+def _values_of(name: str, given: ArrayLike, shown: str = '') -> Floats:
+    """Return the values of an effect; one value serves all axes."""
+    if name not in EFFECTS:
+        raise InputError(f'effect {name!r} is not in the catalogue',
+                         f'use one of {", ".join(EFFECTS)}')
+    values, names = np.atleast_1d(np.asarray(given, float)), EFFECTS[name].values
+    if not np.all(np.isfinite(values)) or values.shape not in ((1,), (len(names),)):
+        raise InputError(f'effect {name} has values {shown or values.tolist()}, expected 1 or '
+                         f'{len(names)} numbers ({", ".join(names)}) in {EFFECTS[name].unit}',
+                         f'write {name}={",".join(["0.001"] * len(names))}, for instance')
+    return np.broadcast_to(values, len(names)).copy()
+
+
+def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None) -> Model:
+    """
+    Return the model with these effects, in the order of the catalogue.
+
+    Parameters
+    ----------
+    effects : mapping of str to array
+        Values by effect, in the units of the catalogue; one value serves all axes.
+    rotation : (3, 3) array, optional
+        ΔR.
+
+    Raises
+    ------
+    InputError
+        If an effect is not in the catalogue, or its values are not that many finite numbers.
+
+    """
+    values = {name: _values_of(name, given) for name, given in effects.items()}
+    ordered = {name: values[name] for name in EFFECTS if name in values}
     return Model(ordered, np.eye(3) if rotation is None else rotation)
 
 
@@ -81,7 +105,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     noise_g : float
         Standard deviation of a sample [g].
     samples : int
-        Independent samples a pose.
+        Independent samples per pose.
     context : mapping of str to array, optional
         What the effects need, n rows each.
 
@@ -99,7 +123,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
 
 
 def _between(start: Floats, end: Floats) -> Floats:
-    """Give the unit vector, normal to start, along which the arc to `end` sets out."""
+    """Return the unit vector, normal to `start`, in which the arc to `end` begins."""
     normal = end - start * (start @ end)
     if np.linalg.norm(normal) < 1e-9:
         normal = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
@@ -107,14 +131,14 @@ def _between(start: Floats, end: Floats) -> Floats:
 
 
 def _turn(start: Floats, end: Floats, seconds: float, count: int) -> tuple[Floats, Floats]:
-    """Turn along the shortest arc, at rest at both ends: force and angular rate, (count, 3)."""
+    """Return force and rate, (count, 3), of a turn along the shortest arc, at rest at its ends."""
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
     share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
     speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
     along = _between(start, end)
     arc = np.arctan2(np.linalg.norm(np.cross(start, end)), start @ end)
     force = np.cos(arc * share) * start + np.sin(arc * share) * along
-    # The direction of up turns against the body: df/dt = -ω × f.
+    # The direction of up turns opposite to the body: df/dt = -ω × f.
     change = arc * speed * (np.cos(arc * share) * along - np.sin(arc * share) * start)
     return force, np.cross(change, force)
 
@@ -128,7 +152,7 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
     directions : (n, 3) array
         Unit vectors.
     rate_hz : float
-        Samples a second.
+        Samples per second.
     dwell, turn : float
         Seconds of each rest and of each turn.
 
@@ -163,7 +187,7 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     model : Model
         The sensor.
     directions : (n, 3) array
-        Where up is in each pose, unit vectors in the levelled frame.
+        Direction of up in each pose, unit vectors in the levelled frame.
     rng : numpy.random.Generator
         Source of the noise.
     noise_g, gyro_noise : float

@@ -4,21 +4,26 @@
 """
 Readings with what is known beside them: poses and recordings.
 
-`COLUMNS` is the one list of columns: the files, the simulation, the effects and the help all
-take names, units and meanings from it.
+`COLUMNS` is the one list of columns: files, simulation, effects and help take names, units and
+meanings from it.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from .errors import InputError
+from .html_table import table
+from .units import Floats, UnitName
+
+__all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Recording', 'Table', 'check_values',
+           'columns_from', 'numbered', 'present']
 
 
 @dataclass(frozen=True)
@@ -26,18 +31,20 @@ class Column:
     """
     One quantity of a table: its names in a file, its unit and its meaning.
 
-    Three names make an (n, 3) array, one name an (n,) array.
+    Three names make an (n, 3) array, one name an (n,) array. Columns that are `made` are never in
+    a file.
 
     """
 
     names: tuple[str, ...]
     unit: str
     meaning: str
+    made: bool = False
 
 
 COLUMNS: dict[str, Column] = {
     'time': Column(('time',), 's', 'header stamp'),
-    'reading': Column(('ax', 'ay', 'az'), 'unit of the reading', 'what the sensor gave'),
+    'reading': Column(('ax', 'ay', 'az'), 'unit of the reading', 'what the sensor reads'),
     'std': Column(('std_x', 'std_y', 'std_z'), 'unit of the reading',
                   'standard deviation of the samples of a pose'),
     'count': Column(('count',), '', 'independent samples of a pose: std/√count is the noise '
@@ -47,16 +54,22 @@ COLUMNS: dict[str, Column] = {
     'rate': Column(('gx', 'gy', 'gz'), 'rad/s', 'angular rate'),
     'reference': Column(('ref_x', 'ref_y', 'ref_z'), 'unit of the reading',
                         'true specific force (known orientation); in g for native units'),
-    'approach': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the pose before; '
-                       'made from the order of the poses'),
+    'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
+                       'pose; made from the order of the poses'),
     'orientation': Column(('orientation',), '', 'rows that share it had the same orientation'),
     'label': Column(('label',), '', 'a word of the user'),
+    'doubtful': Column(('doubtful',), '', '1: the sensor may have moved, as later rests show'),
+    'new': Column(('new',), '', '1 for poses taken since a stored calibration, 0 for its own',
+                  made=True),
 }
 
 _Self = TypeVar('_Self', bound='Table')
 
+_SHOWN = 20
+"""Rows that a notebook shows."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Table:
     """
     Rows of readings and context, in order.
@@ -64,14 +77,20 @@ class Table:
     Parameters
     ----------
     columns : mapping of str to array
-        Keys of `COLUMNS`; each array has n rows. ``reading`` is always there.
+        Keys of `COLUMNS`; each array has n rows. ``reading`` is always present.
     row : (n,) array of int
         Row numbers in the source, from 1.
+    units : {'m/s2', 'g', 'native', ''}
+        Unit of the readings; empty if the source does not say it.
+    sensor : str
+        Name of the sensor; empty if the source does not say it.
 
     """
 
     columns: Mapping[str, NDArray[Any]]
     row: NDArray[np.int64]
+    units: UnitName | Literal[''] = ''
+    sensor: str = ''
 
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
@@ -91,23 +110,40 @@ class Table:
     def __getitem__(self, key: str) -> NDArray[Any]:
         return self.columns[key]
 
+    def __repr__(self) -> str:
+        about = [', '.join(self.columns), self.units, self.sensor]
+        return f'{type(self).__name__}({len(self)} rows: {"; ".join(filter(None, about))})'
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as a table, for notebooks."""
+        keys = [key for key in COLUMNS if key in self]
+        names = [name for key in keys for name in COLUMNS[key].names]
+        first = self.take(slice(_SHOWN))
+        cells = [[str(row)] for row in first.row]
+        for key in keys:
+            for line, values in zip(cells, np.atleast_2d(first[key].T).T.reshape(len(first), -1)):
+                line += [f'{each:.6g}' if first[key].dtype.kind in 'fi' else str(each)
+                         for each in values]
+        more = f'<p>{self!r}</p>' if len(self) > _SHOWN else ''
+        return table(['row', *names], cells) + more
+
     @property
     def reading(self) -> Floats:
         """(n, 3) array, the readings in their own unit."""
         return self.columns['reading']
 
     def take(self: _Self, which: NDArray[Any] | slice) -> _Self:
-        """Give the rows at these indices, or where this mask is true."""
+        """Return the rows at these indices, or where this mask is true."""
         columns = {key: values[which] for key, values in self.columns.items()}
-        return type(self)(columns, self.row[which])
+        return replace(self, columns=columns, row=self.row[which])
 
     def with_columns(self: _Self, **columns: NDArray[Any]) -> _Self:
-        """Give the same rows with these columns added or replaced."""
-        return type(self)({**self.columns, **columns}, self.row)
+        """Return the same rows with these columns added or replaced."""
+        return replace(self, columns={**self.columns, **columns})
 
 
 class Poses(Table):
-    """Averages of still stretches, one row a pose."""
+    """Averages of still stretches, one row per pose."""
 
     @property
     def noise(self) -> Floats | None:
@@ -118,7 +154,7 @@ class Poses(Table):
 
 
 class Recording(Table):
-    """Samples in the order of time, one row a sample."""
+    """Samples in the order of time, one row per sample."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,5 +163,73 @@ class Recording(Table):
 
 
 def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
-    """Give row numbers from 1 for these columns."""
+    """Return row numbers from 1 for these columns."""
     return np.arange(1, len(columns['reading']) + 1)
+
+
+def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
+                 ) -> dict[str, NDArray[Any]]:
+    """
+    Return columns by the keys of `COLUMNS` from columns by their names in a file.
+
+    Parameters
+    ----------
+    given : mapping of str to array
+        n values for each name; other names than those of `COLUMNS` are ignored.
+    needed : sequence of str
+        Keys that must be there.
+    source : str
+        What to call the source in errors.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, in part or whole, or holds what it cannot hold.
+
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    for key in present(list(given), needed, source):
+        parts = [np.asarray(given[name]) for name in COLUMNS[key].names]
+        values = np.column_stack(parts) if len(parts) > 1 else parts[0]
+        columns[key] = values.astype(str) if key == 'label' else values.astype(float)
+    check_values(columns, source)
+    return columns
+
+
+def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
+    """Return the keys of `COLUMNS` in a header; arguments and errors as `columns_from`."""
+    keys = []
+    for key, column in COLUMNS.items():
+        if column.made:
+            continue
+        missing = [name for name in column.names if name not in header]
+        if not missing:
+            keys.append(key)
+        elif key in needed or len(missing) < len(column.names):
+            raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
+                             f'{", ".join(missing)}',
+                             f'name the columns {", ".join(column.names)} in the header line')
+    return keys
+
+
+def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
+    """
+    Check the values of columns.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, a count not above 0, or a standard deviation below 0.
+
+    """
+    for key, values in columns.items():
+        if key != 'label' and not np.all(np.isfinite(values)):
+            bad = int(np.argmin(np.isfinite(values.reshape(len(values), -1)).all(axis=1)))
+            raise InputError(f'{source}: row {bad + 1} of {", ".join(COLUMNS[key].names)} holds a '
+                             'number that is not finite', 'correct the row or remove it')
+    if 'count' in columns and not np.all(columns['count'] > 0):
+        raise InputError(f'{source}: column count holds numbers that are not above 0',
+                         'give the number of samples of each pose')
+    if 'std' in columns and not np.all(columns['std'] >= 0):
+        raise InputError(f'{source}: column std_x, std_y or std_z holds negative numbers',
+                         'give standard deviations')

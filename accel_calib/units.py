@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args, Literal, TYPE_CHECKING
+from typing import Any, get_args, Literal
 
-if TYPE_CHECKING:
-    from .table import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
 
 UnitName = Literal['m/s2', 'g', 'native']
 UNIT_NAMES: tuple[str, ...] = get_args(UnitName)
@@ -29,7 +31,7 @@ class Units:
     Parameters
     ----------
     name : {'m/s2', 'g', 'native'}
-        Native is whatever the sensor gives: counts, volts.
+        Native is any other: counts, volts.
     per_g : float
         Readings in this unit that make 1 g of local gravity: the local gravity [m/s²] for
         ``m/s2``, 1 for ``g``, and for ``native`` the sensitivity, found by the fit.
@@ -46,17 +48,17 @@ class Units:
             raise ValueError(f'per_g is {self.per_g}, expected a positive number')
 
     def to_g(self, reading: Floats) -> Floats:
-        """Give readings of this unit in g."""
+        """Return readings of this unit in g."""
         return reading / self.per_g
 
     def from_g(self, reading_g: Floats) -> Floats:
-        """Give readings in g in this unit."""
+        """Return readings in g in this unit."""
         return reading_g * self.per_g
 
 
 def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:
     """
-    Give the unit of that name, with the sensitivity of native units still open (1).
+    Return the unit of a name; the sensitivity of native units is 1 until a fit finds it.
 
     Parameters
     ----------

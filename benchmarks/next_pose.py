@@ -159,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if order is asked:
             enough = np.array([count for _, count in found])
             there = [errors[int(min(count, MOST)) - FEWEST] for errors, count in found]
-            lines.append(Line(f'poses when more no longer pay, {name}',
+            lines.append(Line(f'poses when more no longer help, {name}',
                               f'{np.median(enough):.0f} ({np.min(enough):.0f} to '
                               f'{np.max(enough):.0f}), {np.median(there):.3f} mg', '',
                               given.sets, None))

@@ -167,9 +167,9 @@ def _held_out(case: Case, refined: Any, made: Simulated) -> tuple[float, float] 
         return None
     fresh = again(np.random.default_rng((*case.seed, 1)), made)
     poses = poses_of(fresh)
-    if 'approach' in refined.calibration.model.needs:
+    if 'previous' in refined.calibration.model.needs:
         basis = basis_of('hysteresis', fresh.around, fresh.traits)
-        poses = poses.with_columns(approach=np.einsum('nii->ni', basis))
+        poses = poses.with_columns(previous=np.einsum('nii->ni', basis))
     reference = true_form_gap_mg(made, fresh)
     if reference is None:
         return None

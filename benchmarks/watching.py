@@ -1,7 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 How soon a shift is told, and how often one is told that is none: watching, measured.
 

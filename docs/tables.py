@@ -25,6 +25,8 @@ def columns() -> Iterator[str]:
     yield '| columns | unit | meaning |'
     yield '|---|---|---|'
     for column in COLUMNS.values():
+        if column.made:
+            continue
         names = ', '.join(f'`{name}`' for name in column.names)
         yield f'| {names} | {column.unit} | {column.meaning} |'
 

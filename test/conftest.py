@@ -27,10 +27,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 collect_ignore_glob = [] if find_spec('rclpy') else ['test_ros_*.py']
-"""Without ROS all else is tested."""
+"""Without ROS the other tests run."""
 _DOMAINS = itertools.cycle(range(1, 102))
 for _ in range(os.getpid() % 101):
-    next(_DOMAINS)  # two runs on one machine shall not meet
+    next(_DOMAINS)  # two runs on one machine must not meet
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -38,7 +38,7 @@ _BATCH = 20
 
 
 class Bench:
-    """A node that drives and watches the nodes under test."""
+    """A node that drives and observes the nodes under test."""
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.home = folder / 'home'
@@ -55,7 +55,7 @@ class Bench:
         from rclpy.node import Node
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=self._domain)
-        # Its log goes nowhere: rcl keeps one publisher of /rosout by name for all contexts.
+        # Without a log: rcl keeps one publisher of /rosout by name for all contexts.
         self.node = Node('bench', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -68,7 +68,7 @@ class Bench:
         self._context.try_shutdown()
 
     def join_anew(self) -> None:
-        """Leave DDS and join it again: it takes killed processes for alive for 20 s."""
+        """Leave DDS and join it again, because it considers killed processes alive for 20 s."""
         self._leave()
         self._join()
 
@@ -94,24 +94,24 @@ class Bench:
         return process
 
     def end(self, process: subprocess.Popen[str], number: int) -> tuple[int, str]:
-        """Send a signal; give the exit status and all that was printed."""
+        """Send a signal; return the exit status and all that was printed."""
         process.send_signal(number)
         printed = process.communicate(timeout=10)[0]
         return process.returncode, printed
 
     def spin(self, until: Callable[[], Any], seconds: float = 15.0) -> None:
-        """Spin until something is so."""
+        """Spin until a condition holds."""
         ends = time.monotonic() + seconds
         while not until():
             late = time.monotonic() > ends
             assert not late, f'not so within {seconds} s'
-            # Looking takes time too: on a busy machine messages would pile up between looks.
+            # Checks take time too: on a busy machine messages would pile up between them.
             look_again = time.monotonic() + 0.02
             while time.monotonic() < look_again:
                 self._executor.spin_once(timeout_sec=0.02)
 
     def listen(self, kind: Any, topic: str, *, latched: bool = False) -> list[Any]:
-        """Give a list to which the messages of a topic are added."""
+        """Return a list to which the messages of a topic are added."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
         qos = QoSProfile(depth=100)
         if latched:
@@ -121,7 +121,7 @@ class Bench:
         return heard
 
     def client(self, name: str) -> Any:
-        """Give a client of a service of the calibrator that is there."""
+        """Return a client of a service of the calibrator, once it is there."""
         from diagnostic_msgs.srv import SelfTest
         from std_srvs.srv import SetBool, Trigger
         kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
@@ -131,14 +131,27 @@ class Bench:
         return self._clients[name]
 
     def call(self, name: str, **fields: Any) -> Any:
-        """Call a service of the calibrator and give its answer."""
+        """Call a service of the calibrator and return its answer."""
         client = self.client(name)
         future = client.call_async(client.srv_type.Request(**fields))
         self.spin(future.done)
         return future.result()
 
+    def call_while(self, name: str, make: Callable[[], Any]) -> Any:
+        """Call a service of the calibrator while messages go on; return its answer."""
+        client = self.client(name)
+        self.send(make())
+        future = client.call_async(client.srv_type.Request())
+
+        def answered() -> bool:
+            self.send(make())
+            return bool(future.done())
+
+        self.spin(answered)
+        return future.result()
+
     def imu(self, reading: Any, **fields: Any) -> Any:
-        """Make an Imu message with the next stamp."""
+        """Return an Imu message with the next stamp."""
         from geometry_msgs.msg import Vector3
         from rclpy.time import Time
         from sensor_msgs.msg import Imu
@@ -158,12 +171,12 @@ class Bench:
         """
         Publish readings in m/s², `RATE` a second by their stamps, and faster by the clock.
 
-        What comes out of the calibrator sets the pace, for sensor data are dropped where it is
-        busy: without a calibration it needs `passthrough`.
+        The output of the calibrator sets the pace, because sensor data are dropped while it is
+        busy; without a calibration it needs `passthrough`.
 
         """
         if not self._came_out:
-            rng = np.random.default_rng(1)  # moving, until both sides have found each other
+            rng = np.random.default_rng(1)  # moving, until both sides have discovered each other
             self.exchange(self._came_out, lambda: self.imu(readings[0] + 3.0 * rng.normal(size=3)))
             self.spin(lambda ends=time.monotonic() + 0.2: time.monotonic() > ends)
         for start in range(0, len(readings), _BATCH):
@@ -174,7 +187,7 @@ class Bench:
             self.spin(lambda batch=batch: len(self._came_out) >= len(batch), 5.0)
 
     def echo(self, messages: Iterable[Any], heard: list[Any]) -> list[Any]:
-        """Publish messages, each when the one before was heard again; give what was heard."""
+        """Publish messages, each after the output for the one before; return the output."""
         heard.clear()
         for k, message in enumerate(messages):
             self.send(message)
@@ -182,7 +195,7 @@ class Bench:
         return heard
 
     def exchange(self, heard: list[Any], make: Callable[[], Any]) -> Any:
-        """Publish what `make` gives, again and again, until something is heard; give that."""
+        """Publish what `make` returns, repeatedly, until something is heard; return that."""
         heard.clear()
 
         def sent() -> bool:
@@ -194,11 +207,11 @@ class Bench:
 
     def close(self) -> None:
         """Leave DDS, then end all that was started."""
-        self._leave()  # first: of shared memory a killed process leaves its part as it was
+        self._leave()  # first: a killed process leaves its part of shared memory as it was
         for process in self._processes:
             if process.poll() is None:
                 process.kill()
-            sys.stdout.write(process.communicate()[0])  # pytest shows it where a test failed
+            sys.stdout.write(process.communicate()[0])  # pytest shows it if a test fails
 
 
 def _yaml(value: Any) -> str:
@@ -207,7 +220,7 @@ def _yaml(value: Any) -> str:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    """Give a bench in a DDS domain of its own."""
+    """Yield a bench in a DDS domain of its own."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     made = Bench(tmp_path, next(_DOMAINS))
@@ -222,7 +235,7 @@ EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),
 
 @pytest.fixture
 def readings() -> Callable[..., Any]:
-    """Give a function that makes readings of a sensor that is turned through directions."""
+    """Return a function that simulates readings of a sensor that is turned."""
     from accel_calib.simulate import model_with, simulate_recording
 
     def make(directions: Any, *, dwell: float = 1.8, rotation: Any = None,
@@ -237,7 +250,7 @@ def readings() -> Callable[..., Any]:
 
 @pytest.fixture
 def stored(tmp_path: Path) -> Callable[..., Path]:
-    """Give a function that stores a calibration of known parameters."""
+    """Return a function that stores a calibration of known parameters."""
     from accel_calib.calibrate import fit_poses, level
     from accel_calib.files import write_calibration
     from accel_calib.simulate import model_with, simulate_poses

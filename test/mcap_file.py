@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A writer of MCAP files of every make, after the specification, with no code of the package."""
+"""A writer of MCAP files of every make, after the specification, without the package."""
 
 from pathlib import Path
 import struct

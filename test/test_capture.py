@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from accel_calib.capture import capture, CaptureSettings, is_new, merged, StillDetector
+from accel_calib.capture import capture, CaptureSettings, StillDetector
 from accel_calib.errors import InputError
 from accel_calib.table import Recording
 from accel_calib.units import units_of
@@ -74,9 +74,10 @@ def test_poses_of_real_recordings_are_found_without_the_gyro(name, unit, poses):
 def test_streaming_a_real_recording_gives_the_same_poses():
     samples = real('mpu9150_imu1.csv')
     detector = StillDetector(CaptureSettings(), units_of('m/s2'))
-    for time, reading, rate in zip(samples['time'].tolist(), samples.reading.tolist(),
-                                   samples['rate'].tolist()):
-        detector.push(time, reading, rate)
+    table = np.column_stack([samples['time'], samples.reading, samples['rate'],
+                             np.full((len(samples), 2), np.nan)])
+    for block in np.array_split(table, len(table) // 37):
+        detector.push(block)
     detector.close()
     poses = capture(samples, units_of('m/s2')).poses
     dwells = detector.dwells()
@@ -84,7 +85,7 @@ def test_streaming_a_real_recording_gives_the_same_poses():
     np.testing.assert_allclose([each.count for each in dwells], poses['count'], rtol=1e-6)
 
 
-def test_a_sensor_that_lay_still_for_days_gives_a_pose_an_orientation():
+def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation():
     result = capture(real('sensehat_lsm9ds1_temperature.csv'), G)
     assert 3 <= len(result.poses) <= 5
     assert result.samples > 24000
@@ -92,7 +93,7 @@ def test_a_sensor_that_lay_still_for_days_gives_a_pose_an_orientation():
     assert 'orientation' not in result.poses
 
 
-def test_max_dwell_cuts_a_dwell_that_temperature_moves():
+def test_max_dwell_cuts_a_dwell_of_changing_temperature():
     result = capture(real('sensehat_lsm9ds1_temperature.csv'), G, CaptureSettings(max_dwell=3600))
     poses = result.poses
     assert 60 < len(poses) < 80
@@ -123,16 +124,11 @@ def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
     assert np.all(poses.noise[:2] < kept.noise[:2])
 
 
-def test_whether_a_dwell_is_new_depends_on_min_pose_angle():
-    detector = StillDetector(CaptureSettings(), G)
-    samples = visited(AGAIN)
-    table = np.column_stack([samples['time'], samples.reading, np.full((len(samples), 5), np.nan)])
-    detector.push_block(table)
-    detector.close()
-    *earlier, last = detector.dwells()
-    assert not is_new(last, earlier, CaptureSettings(), G)
-    assert is_new(last, earlier, CaptureSettings(min_pose_angle=0.01), G)
-    assert merged(earlier[1], last, G).samples == earlier[1].samples + last.samples
+@pytest.mark.parametrize(('angle', 'poses'), [(0.1, 6), (0.01, 8)])
+def test_whether_a_pose_is_repeated_depends_on_min_pose_angle(angle, poses):
+    found = capture(visited(AGAIN), G, CaptureSettings(repeated='merge', min_pose_angle=angle))
+    assert len(found.poses) == poses
+    assert found.samples == capture(visited(AGAIN), G).samples
 
 
 def test_a_number_that_is_not_finite_is_refused_with_its_row():

@@ -70,7 +70,7 @@ def test_fit_tells_the_next_pose_until_more_no_longer_pay(model, tmp_path, capsy
     result = run_json(capsys, 'fit', many, '--model', model)[1]
     assert result['next_pose'] is None
     assert run('fit', many, '--model', model) == 0
-    assert (f'next pose: more poses no longer pay: 30 poses determine |a| to '
+    assert (f'next pose: more poses no longer help: 30 poses determine |a| to '
             f'{result["uncertainty_mg"]:.2g} mg' in capsys.readouterr().out) or model == 'auto'
 
 
@@ -237,10 +237,10 @@ def test_a_recording_that_never_rests_is_refused(tmp_path, capsys):
 
 
 def test_a_newer_calibration_is_refused(calibration, poses, capsys):
-    calibration.write_text(calibration.read_text().replace('version: 1\n', 'version: 7\n'))
+    calibration.write_text(calibration.read_text().replace('version: 2\n', 'version: 7\n'))
     capsys.readouterr()
     assert run('verify', poses, '-c', calibration) == 2
-    assert 'has version 7, this package reads up to 1' in capsys.readouterr().err
+    assert 'has version 7, this package reads up to 2' in capsys.readouterr().err
 
 
 def test_stored_calibration_says_whose_it_is(calibration):
@@ -273,7 +273,7 @@ def test_module_runs_as_a_process(poses):
     done = subprocess.run([sys.executable, '-m', 'accel_calib.cli.main', 'fit', str(poses)],
                           capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0
-    assert 'gap (RMS)' in done.stdout
+    assert 'RMS, mg' in done.stdout
 
 
 @pytest.mark.parametrize(('arguments', 'without'), [
@@ -314,4 +314,4 @@ def test_disturbed_row_is_named(poses, capsys):
     write_table(poses, table.with_columns(reading=reading))
     _, result = run_json(capsys, 'fit', poses)
     assert [rejected['row'] for rejected in result['poses_rejected']] == [7]
-    assert 'disturbed' in result['poses_rejected'][0]['reason']
+    assert 'outlier' in result['poses_rejected'][0]['reason']

@@ -6,12 +6,14 @@
 from dataclasses import replace
 import json
 
-from accel_calib.calibrate import compare, fit_poses, level
-from accel_calib.calibrate.rotation_free import NAMES, rotation_free
+from accel_calib.calibrate import fit_poses, level
 from accel_calib.cli.main import main
+from accel_calib.compare import compare
+from accel_calib.compare.rotation_free import NAMES, rotation_free
 from accel_calib.errors import InputError
+from accel_calib.estimate.fit import estimate
 from accel_calib.files import write_calibration
-from accel_calib.model import Model, sensor_force
+from accel_calib.model import Model
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
 from accel_calib.units import Units, units_of
@@ -218,13 +220,8 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
         warm = {'temperature': rng.uniform(middle - 10.0, middle + 10.0, 30)}
         poses = poses_of(model, rng, 30, context=warm)
         plain = fit_poses(poses, G, model='10')
-        from accel_calib.calibrate.likelihood import judge
-        fit = judge(model, poses.reading, poses.columns, poses.noise)
-        moved = sensor_force(model, poses.reading, poses.columns)
-        step = np.linalg.lstsq(-fit.jacobian, (np.linalg.norm(moved, axis=1) - 1.0) / fit.sigma,
-                               rcond=None)[0]
-        values = dict(zip(model.values, np.split(model.vector + step, [3, 6, 9]), strict=True))
-        return plain, replace(plain, model=Model(values), covariance=fit.covariance)
+        fit = estimate(model, poses)
+        return plain, replace(plain, model=fit.model, covariance=fit.covariance)
 
     cold, warm = run(15.0), run(35.0)
     assert compare([cold[1], warm[1]]).agree
@@ -259,7 +256,7 @@ def test_levelled_runs_are_compared_in_what_is_up():
 @pytest.mark.parametrize(('change', 'message'), [
     ({'sensor': 'other'}, 'of the sensors imu and other'),
     ({'units': Units('native', 400.0)}, 'run 2 is in native units, another in g'),
-    ({'covariance': np.full((9, 9), np.nan)}, 'run 2 does not say how sure it is')])
+    ({'covariance': np.full((9, 9), np.nan)}, 'run 2 has no uncertainty')])
 def test_what_cannot_be_compared_is_refused(change, message):
     rng = np.random.default_rng(13)
     run = replace(runs_of(sensor(rng), rng, 1)[0], sensor='imu')

@@ -17,7 +17,7 @@ from accel_calib.files import (
     write_calibration,
     write_table,
 )
-from accel_calib.files.atomic import before
+from accel_calib.files.atomic import previous
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.table import COLUMNS, numbered, Poses
@@ -38,7 +38,7 @@ def write(folder, text):
 def every_column(count=4):
     rng = np.random.default_rng(1)
     columns = {key: rng.uniform(1, 2, count if len(column.names) == 1 else (count, 3))
-               for key, column in COLUMNS.items()}
+               for key, column in COLUMNS.items() if not column.made}
     columns['label'] = np.array(['flat', 'left, side up', 'nose "down"', ''])
     columns['time'] = 1.7e9 + np.arange(count) * 0.0025
     return Poses(columns, numbered(columns))
@@ -48,7 +48,7 @@ def test_every_column_is_read_back_as_it_was_written(tmp_path):
     table = every_column()
     write_table(tmp_path / 'poses.csv', table)
     found = read_poses(tmp_path / 'poses.csv')
-    assert set(found.columns) == set(COLUMNS)
+    assert set(found.columns) == set(table.columns)
     for key, values in table.columns.items():
         if key == 'label':
             assert found[key].tolist() == values.tolist()
@@ -118,8 +118,8 @@ def test_the_calibration_before_is_kept(calibration, tmp_path):
     path = tmp_path / 'calibration.yaml'
     path.write_text('the one before')
     write_calibration(path, calibration)
-    assert before(path).read_text() == 'the one before'
-    assert sorted(item.name for item in tmp_path.iterdir()) == [path.name, before(path).name]
+    assert previous(path).read_text() == 'the one before'
+    assert sorted(item.name for item in tmp_path.iterdir()) == [path.name, previous(path).name]
 
 
 def test_a_calibration_that_cannot_be_written_leaves_what_was_there(calibration, tmp_path,
@@ -139,15 +139,18 @@ def test_a_calibration_that_cannot_be_written_leaves_what_was_there(calibration,
 
 
 @pytest.mark.parametrize(('old', 'new', 'says'), [
-    ('version: 1\n', 'version: 2\n', 'has version 2, this package reads up to 1'),
-    ('version: 1\n', 'version: x\n', 'not a whole calibration'),
+    ('version: 2\n', 'version: 3\n', 'has version 3, this package reads up to 2'),
+    ('version: 2\n', 'version: x\n', 'not a whole calibration'),
     ('format: accel_calib calibration', 'format: other', 'is not a calibration of accel_calib'),
-    ('frame: ros', 'frame: moon', "frame 'moon' is none of"),
+    ('frame: ros', 'frame: moon', "frame is 'moon', expected one of"),
     ('effects:', 'causes:', 'not a whole calibration'),
     ('offset: {', 'offste: {', 'not a whole calibration'),
     ('unit: g, x: ', 'unit: g, x: .nan #', 'not a whole calibration'),
-    ('[1.0, 0.0, 0.0]', '[2.0, 0.0, 0.0]', 'rotation is not a rotation matrix'),
+    ('[1.0, 0.0, 0.0]', '[2.0, 0.0, 0.0]', 'ΔR is not a rotation'),
     ('covariance:\n', 'covariance: [[1.0]]\nwas:\n', 'not a whole calibration'),
+    ('sensor: imu_link', 'sensor: 2001-99-99', 'not a whole calibration'),
+    ('rms_after_mg: ', 'rms_after_mg: soon, was: ', "rms_after_mg is 'soon', expected a finite"),
+    ('\nchecksum: ', '\n# checksum: ', 'the checksum, is missing'),
 ])
 def test_a_damaged_or_newer_calibration_is_refused_in_one_line(old, new, says, calibration):
     text = format_calibration(calibration)

@@ -4,12 +4,12 @@
 
 import re
 
-from accel_calib.calibrate import fit_poses, identifiability, next_pose
-from accel_calib.calibrate.geometry import dilution, poses_needed, rows_of
-from accel_calib.calibrate.identifiability import error_left_in
-from accel_calib.calibrate.next_pose import missing_poses
+from accel_calib.calibrate import fit_poses, next_pose
+from accel_calib.calibrate.pose_planning import missing_poses
 from accel_calib.calibrate.refusal import carries, refuse_if_unfit
 from accel_calib.errors import RefusedFitError
+from accel_calib.estimate.geometry import dilution, poses_needed, rows_of
+from accel_calib.estimate.identifiability import error_left_in, identifiability
 from accel_calib.model import predict
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
@@ -173,8 +173,8 @@ def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, ope
     with pytest.raises(RefusedFitError, match=f'left open: {re.escape(open_)}') as refusal:
         fit_poses(poses, G, model=model)
     if offer:
-        assert re.search(rf'or use {offer}, which these poses carry: it leaves out cross_axis, '
-                         r'which in a common sensor makes \|a\| wrong by 1\d mg$',
+        assert re.search(rf'or use {offer}, which these poses determine: it leaves out '
+                         r'cross_axis, which in a common sensor makes \|a\| wrong by 1\d mg$',
                          refusal.value.advice)
     else:
         assert refusal.value.advice.endswith('hold it still and go on')
@@ -257,7 +257,7 @@ def test_following_ends_when_a_pose_more_no_longer_pays(model):
     found = identifiability(model, directions)
     assert found.dilution < 1.5
     asked = next_pose(directions, model)
-    assert asked.words == (f'more poses no longer pay: {len(directions)} poses determine |a| to '
+    assert asked.words == (f'more poses no longer help: {len(directions)} poses determine |a| to '
                            f'{found.mean_dilution:.2g} times the noise of a pose')
     assert asked.error == pytest.approx(found.mean_dilution)
 

@@ -33,7 +33,7 @@ def context(rng):
     return {'temperature': rng.uniform(0, 50, 40), 'std': rng.uniform(0, 0.2, (40, 3)),
             'time': 1000.0 + np.sort(rng.uniform(0, 7200, 40)),
             'supply_voltage': rng.uniform(3, 3.6, 40), 'rate': rng.normal(size=(40, 3)),
-            'approach': random_directions(40, rng)}
+            'previous': random_directions(40, rng)}
 
 
 OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
@@ -96,7 +96,7 @@ def test_effects_by_hand():
     force = np.array([[0.5, -2.0, 3.0]])
     context = {'temperature': np.array([35.0]), 'std': np.array([[0.1, 0.2, 0.3]]),
                'time': np.array([7300.0]), 'supply_voltage': np.array([3.63]),
-               'rate': np.array([[0.0, 0.0, 2.0]]), 'approach': np.array([[0.6, 0.0, -0.8]])}
+               'rate': np.array([[0.0, 0.0, 2.0]]), 'previous': np.array([[0.6, 0.0, -0.8]])}
     cases = {
         'offset=1,2,3': (1, 2, 3), 'gain=0.1': (0.05, -0.2, 0.3),
         'axis_gain=0.1,0.2,0.3': (0.05, -0.4, 0.9), 'cross_axis=1,0,0': (-2.0, 0.5, 0),
@@ -154,5 +154,5 @@ def test_vector_and_names_go_together(name):
 @pytest.mark.parametrize('text', ['offset', 'offset=', 'offset=1,2', 'offset=1,2,x',
                                   'offset=1,2,nan', 'tilt=1'])
 def test_effect_text_that_cannot_be_read_is_refused(text):
-    with pytest.raises(InputError, match='expected|NAME=VALUE'):
+    with pytest.raises(InputError, match='expected|NAME=VALUE|not in the catalogue'):
         parse_effect(text)

@@ -3,7 +3,13 @@
 
 """Mounting from a flat pose: every frame, every attitude, the singular ones too."""
 
-from accel_calib.calibrate.mounting import flat_direction, FRAMES, mounting, mounting_with_heading
+from accel_calib.calibrate.mounting import (
+    flat_direction,
+    FRAMES,
+    mounting,
+    with_heading,
+    with_heading_of,
+)
 from accel_calib.errors import InputError
 from accel_calib.sphere import random_directions, rotation_from_rpy
 import numpy as np
@@ -51,17 +57,32 @@ def test_pure_roll_and_pitch_are_found_without_yaw():
     np.testing.assert_allclose(mounting(rotation.T @ [0, 0, 1]), rotation.T, atol=1e-12)
 
 
-def test_a_second_pose_fixes_the_heading():
-    truth = rotation_from_rpy(*np.radians((170.0, 35.0, -120.0)))
-    nose_down = np.array([-0.8, 0.0, 0.6])
-    found = mounting_with_heading(truth @ [0, 0, 1], truth @ nose_down, nose_down)
+@pytest.mark.parametrize(('frame', 'nose_down'), [
+    ('ros', (-0.8, 0.0, 0.6)), ('ned', (0.8, 0.0, 0.6)), ('android', (0.0, -0.8, 0.6)),
+    ('win8', (0.0, 0.8, -0.6)), ('ros', (-0.6, 0.0, -0.8))])
+@pytest.mark.parametrize('rpy', [(170.0, 35.0, -120.0), (0.0, 90.0, 0.0), (90.0, 0.0, 45.0)])
+def test_a_pose_with_the_nose_down_fixes_the_heading(rpy, frame, nose_down):
+    truth = rotation_from_rpy(*np.radians(rpy))
+    levelled = mounting(truth @ flat_direction(frame), frame)
+    found = with_heading(levelled, truth @ nose_down, frame)
     np.testing.assert_allclose(found, truth, atol=1e-12)
+
+
+def test_a_levelled_mounting_keeps_its_heading():
+    before = rotation_from_rpy(*np.radians((10.0, -20.0, 130.0)))
+    tilt = rotation_from_rpy(*np.radians((3.0, 2.0, 0.0)))
+    level = mounting(tilt @ before[:, 2])
+    found = with_heading_of(before, level)
+    np.testing.assert_allclose(found[:, 2], level[:, 2], atol=1e-12)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    assert np.degrees(np.arccos(found[:, 0] @ before[:, 0])) < 4.0
+    np.testing.assert_array_equal(with_heading_of(before, mounting(before[:, 0])),
+                                  mounting(before[:, 0]))
 
 
 def test_a_second_pose_that_is_the_first_is_refused():
     with pytest.raises(InputError, match='within 10° of the flat one'):
-        mounting_with_heading(np.array([0, 0, 1.0]), np.array([0, 0.05, 1.0]),
-                              np.array([0, 0.05, 1.0]))
+        with_heading(np.eye(3), np.array([0, 0.05, 1.0]))
 
 
 @pytest.mark.parametrize('flat', [(0, 0, 0), (np.nan, 0, 1)])

@@ -5,9 +5,9 @@
 
 import json
 
-from accel_calib.calibrate import fit_poses, sensing_axes, verify
-from accel_calib.calibrate.closed_form import fit_six_faces, two_position
+from accel_calib.calibrate import fit_poses, verify
 from accel_calib.cli.main import main
+from accel_calib.estimate.sensing_axes import sensing_axes
 from accel_calib.files import read_poses
 from accel_calib.units import units_of
 import numpy as np
@@ -64,18 +64,13 @@ def test_twelve_parameters_from_six_faces_are_those_of_the_report(name, diagonal
             assert found.max_before_percent / 100 == pytest.approx(published[0], abs=1e-6)
 
 
-def test_closed_form_of_six_faces_is_least_squares():
-    calibration, table = fit(HUAWEI, 1, 6, 9.81, '12')
-    down, up = table.reading[[0, 2, 4]], table.reading[[1, 3, 5]]
-    mat_x, shift = fit_six_faces(up, down, 9.81)
-    np.testing.assert_allclose(mat_x, calibration.gain, atol=1e-12)
-    np.testing.assert_allclose(shift, calibration.offset, atol=1e-12)
-
-
-def test_two_positions_of_the_rhd2000_note():
-    sensitivity, offset = two_position(2.1218, 1.4282)
-    assert sensitivity == pytest.approx(0.3468)
-    assert offset == pytest.approx(1.775)
+def test_two_positions_of_the_rhd2000_note(tmp_path):
+    table = tmp_path / 'volts.csv'
+    table.write_text('ax,ay,az\n2.1218,1.775,1.775\n1.4282,1.775,1.775\n1.775,2.1218,1.775\n'
+                     '1.775,1.4282,1.775\n1.775,1.775,2.1218\n1.775,1.775,1.4282\n')
+    calibration = fit_poses(read_poses(table), units_of('native'), model='12')
+    np.testing.assert_allclose(calibration.gain, 0.3468 * np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(calibration.offset, 1.775, atol=1e-6)
 
 
 @pytest.mark.parametrize('name', ['mpu9150_imu0', 'mpu9150_imu1'])

@@ -182,4 +182,4 @@ def test_dwell_that_cannot_be_is_refused(tmp_path, capsys):
     path = simulated(tmp_path / 'r.csv', '--recording', '--poses', 3)
     capsys.readouterr()
     assert run('refine', path, '--max-dwell', 0.1) == 2
-    assert 'change --max-dwell' in capsys.readouterr().err
+    assert 'max_dwell is 0.1, expected at least twice min_dwell' in capsys.readouterr().err

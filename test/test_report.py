@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report: what the maps keep, what the page holds, and that it needs nothing else."""
+"""Maps keep areas; the page is complete and loads nothing from outside."""
 
 from html.parser import HTMLParser
 import re
@@ -10,10 +10,10 @@ from accel_calib.refine import refine
 from accel_calib.report import all_drawings, page
 from accel_calib.report.against import recorded, variables_of
 from accel_calib.report.sphere_map import equal_area
-from accel_calib.report.words import chance, effect_words, values_of
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
 from accel_calib.units import Units
+from accel_calib.words import chance, values_of
 import numpy as np
 import pytest
 
@@ -42,7 +42,7 @@ def warm():
 
 
 class Balance(HTMLParser):
-    """Follows tags that open and close."""
+    """Check that every tag that opens is closed."""
 
     def __init__(self):
         super().__init__()
@@ -84,12 +84,13 @@ def test_page_is_whole_and_needs_nothing_from_outside(warm):
     assert 'name="viewport"' in text
 
 
-def test_page_tells_each_step(warm):
+def test_page_describes_each_step(warm):
     text = page(warm, 'poses.csv')
     assert [step.effect for step in warm.steps] == ['offset_temperature']
-    for words in ('offset_temperature', 'Offset that moves with temperature', 'mg/°C',
+    for words in ('offset_temperature', 'Offset that changes with temperature', 'mg/°C',
                   'zero-g offset temperature coefficient TCO', 'rows 9', 'noise floor',
-                  'temperature [°C]', 'What these data cannot show', 'What remains'):
+                  'temperature [°C]', 'What these data cannot show', 'What remains',
+                  '<h2>Outliers</h2>'):
         assert words in text
 
 
@@ -110,7 +111,7 @@ def test_before_and_after_have_one_scale(warm):
     assert maps[0].get_clim() == maps[1].get_clim()
 
 
-def test_no_gap_has_its_page_too():
+def test_no_gap_has_a_page_too():
     clean = refined()
     assert clean.verdict == 'no_gap'
     assert [drawing.name for drawing in all_drawings(clean)] == [
@@ -118,7 +119,7 @@ def test_no_gap_has_its_page_too():
     assert 'Nothing beyond the noise' in page(clean, 'poses.csv')
 
 
-def test_ladder_from_an_ideal_sensor_has_a_rung_a_step():
+def test_ladder_from_an_ideal_sensor_has_one_rung_per_step():
     result = refined(base='ideal')
     ladder = next(iter(all_drawings(result)))
     said = {text.get_text() for text in ladder.figure.axes[0].texts}
@@ -139,7 +140,6 @@ def test_variables_are_those_of_the_effect(warm):
 def test_numbers_are_short(warm):
     assert chance(0.0) == 'p < 1e-16'
     assert chance(3.21e-4) == 'p = 0.0003'
-    assert effect_words('offset_wander').startswith('offset that wanders')
     values = dict(values_of(warm.steps[-1]))
     assert set(values) == {'x', 'y', 'z'}
     assert all(value.endswith(' mg/°C') for value in values.values())

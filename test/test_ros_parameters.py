@@ -11,8 +11,9 @@ from typing import Any
 
 from accel_calib.capture import CaptureSettings
 from accel_calib.errors import InputError
-from accel_calib.ros.parameters import changed, default_of, yaml_lines
-from accel_calib.ros.settings import CalibratorSettings, capture_settings, SimulatorSettings
+from accel_calib.ros.simulator_node import SimulatorSettings
+from accel_calib.session.parameters import changed, default_of, yaml_lines
+from accel_calib.session.settings import CalibratorSettings, capture_settings
 import pytest
 import yaml
 
@@ -32,7 +33,7 @@ def test_parameter_file_holds_the_defaults() -> None:
 
 
 @pytest.mark.parametrize('settings', SETTINGS)
-def test_defaults_are_values_that_parameters_take(settings: Any) -> None:
+def test_defaults_are_accepted_by_their_parameters(settings: Any) -> None:
     values = {parameter.name: default_of(parameter) for parameter in fields(settings)}
     assert changed(settings(), values) == settings()
 
@@ -48,7 +49,7 @@ def test_numbers_may_be_written_as_they_come() -> None:
     ('model', '12'), ('model', True), ('gravity', 0.5), ('gravity', float('nan')),
     ('gravity', '9.8'), ('auto_capture', 1), ('auto_fit_poses', 12.5), ('auto_fit_poses', True),
     ('units', 'counts'), ('sensor', ['a'])])
-def test_values_that_parameters_do_not_take_are_refused(name: str, value: Any) -> None:
+def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
         changed(CalibratorSettings(), {name: value})
 
@@ -65,7 +66,7 @@ def test_capture_has_the_defaults_of_the_library_but_for_parked_robots() -> None
     assert capture_settings(CalibratorSettings()) == CaptureSettings(repeated='merge')
 
 
-def test_settings_that_do_not_go_together_are_refused() -> None:
+def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InputError, match='max_dwell'):
         capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
 

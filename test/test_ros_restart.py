@@ -56,7 +56,7 @@ def test_killed_at_any_moment_it_has_its_files_whole(
 
 @pytest.mark.parametrize(('given', 'words'), [
     ('gravity:=900.0', 'gravity'), ('still_window:=wide', 'still_window'),
-    ('model:=11', 'expected one of auto'), ('max_dwell:=1.5', 'do not go together')])
+    ('model:=11', 'expected one of auto'), ('max_dwell:=1.5', 'contradict each other')])
 def test_bad_parameters_get_one_line_and_status_2(bench: Any, given: str, words: str) -> None:
     node = bench.start('calibrator', **dict([given.split(':=')]))
     printed = node.communicate(timeout=10)[0]

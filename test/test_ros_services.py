@@ -12,8 +12,8 @@ from typing import Any
 
 from accel_calib.files import read_calibration, read_poses
 from accel_calib.model import Model
-from accel_calib.ros.fitting import asked_for, then
 from accel_calib.ros.markers import pose_markers
+from accel_calib.session.work import asked_for, then
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
@@ -31,7 +31,7 @@ def count(markers: list[Any], namespace: str = 'poses') -> int:
     return sum(m.ns == namespace for m in markers[-1].markers) if markers else 0
 
 
-def test_services_say_what_is_missing(bench: Any) -> None:
+def test_services_report_what_is_missing(bench: Any) -> None:
     bench.calibrator()
     for name, words in (('fit', 'no Imu message has come'), ('set_level', 'no calibration yet'),
                         ('capture_pose', 'no Imu message has come'), ('undo_pose', 'no poses'),
@@ -61,10 +61,10 @@ def test_fit_of_too_few_or_flat_poses_says_which_way_to_turn(bench: Any, reading
     assert not list(bench.home.glob('accel_calib/*.yaml'))
 
 
-def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
+def test_log_and_markers_say_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
     asked = asked_for(poses, units_of('g'), 'auto')
-    assert re.fullmatch(r'more poses no longer pay: 24 poses determine \|a\| to 0\.18 mg; call '
+    assert re.fullmatch(r'more poses no longer help: 24 poses determine \|a\| to 0\.18 mg; call '
                         '~/fit', then(asked))
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
     assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
@@ -75,20 +75,20 @@ def test_it_is_said_and_drawn_that_more_poses_no_longer_pay() -> None:
     assert then(few) == text.text == few.words
 
 
-def test_set_level_tells_of_a_flat_pose_on_another_face(bench: Any, readings: Readings,
+def test_set_level_warns_of_a_flat_pose_on_another_face(bench: Any, readings: Readings,
                                                         stored: Stored) -> None:
     still = bench.listen(Bool, 'calibrator/still', latched=True)
     bench.calibrator(calibration_file=str(stored()), sensor='arm', passthrough=True)
     bench.feed(readings([[0, 0, 1], [0, 0, -1]], dwell=3.0)[:-5])
     bench.spin(lambda: still and still[-1].data)
-    answer = bench.call('set_level')
+    answer = bench.call_while('set_level', lambda: bench.imu([0, 0, -9.6]))
     assert answer.success, answer.message
     assert 'this pose is flat now' in answer.message
     assert 'the flat pose reads -1.00 g on z' in answer.message
     assert 'mounted upside down, or z (or every axis) has the wrong sign' in answer.message
 
 
-def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) -> None:
+def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     still = bench.listen(Bool, 'calibrator/still', latched=True)
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
@@ -97,9 +97,9 @@ def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) 
     bench.feed(poses[:140])
     bench.spin(lambda: still and still[-1].data)
     assert count(markers) == 0
-    answer = bench.call('capture_pose')
+    answer = bench.call_while('capture_pose', lambda: bench.imu(poses[130]))
     assert answer.success, answer.message
-    assert re.match(r'1 poses: .*; turn the sensor so that the .* points up \([-+xyz ]+\)$',
+    assert re.match(r'1 pose: .*; turn the sensor so that the .* points up \([-+xyz ]+\)$',
                     answer.message)
     bench.spin(lambda: count(markers) == 1)
     asked = markers[-1].markers[-1].text
@@ -108,12 +108,14 @@ def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) 
                                            for value in diagnostics[-1].status[0].values))
     bench.feed(poses[140:165])
     bench.spin(lambda: not still[-1].data)
-    answer = bench.call('capture_pose')
+    rng = np.random.default_rng(1)
+    answer = bench.call_while('capture_pose', lambda: bench.imu(
+        poses[150] + 2.0 * rng.normal(size=3)))
     assert not answer.success
     assert 'not still' in answer.message
     bench.feed(poses[165:310])
     bench.spin(lambda: still[-1].data)
-    assert bench.call('capture_pose').success
+    assert bench.call_while('capture_pose', lambda: bench.imu(poses[300])).success
     bench.spin(lambda: count(markers) == 2)
     table = bench.home / 'accel_calib' / 'arm_poses.csv'
     bench.spin(lambda: len(read_poses(table)) == 2)
@@ -123,7 +125,7 @@ def test_poses_are_taken_and_taken_back_by_hand(bench: Any, readings: Readings) 
     assert not bench.call('undo_pose').success
 
 
-def test_poses_are_fitted_without_being_asked(bench: Any, readings: Readings) -> None:
+def test_poses_are_fitted_automatically(bench: Any, readings: Readings) -> None:
     path = bench.home / 'accel_calib' / 'arm.yaml'
     bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=10, passthrough=True)
     bench.feed(readings(spread_directions(11)))
@@ -140,7 +142,7 @@ def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -
     bench.calibrator(calibration_file=path)
     bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
     other = stored('other.yaml', sensor='another').read_text()
-    for text, words in ((good.replace('version: 1', 'version: 999'), 'version 999'),
+    for text, words in ((good.replace('version: 2', 'version: 999'), 'version 999'),
                         (other, "of sensor 'another'"), ('', 'not a calibration'),
                         (good.replace('readings: m/s2', 'readings: g'), 'in g')):
         path.write_text(text)
@@ -153,7 +155,7 @@ def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -
     assert bench.call('load').success
 
 
-def test_calibration_of_another_sensor_is_put_down_at_the_first_message(
+def test_calibration_of_another_sensor_is_discarded_at_the_first_message(
         bench: Any, stored: Stored) -> None:
     corrected = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
@@ -189,7 +191,7 @@ def test_reset_forgets_and_keeps_what_was_stored(bench: Any, readings: Readings)
     assert not bench.call('load').success
 
 
-def test_calibration_that_cannot_be_stored_is_used_and_told_of(
+def test_calibration_that_cannot_be_stored_is_used_and_reported(
         bench: Any, readings: Readings, tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('in the way')
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)

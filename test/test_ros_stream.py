@@ -6,14 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+import os
 from pathlib import Path
+import struct
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.files import read_calibration, write_calibration
+from accel_calib.messages.layout import layout_of
+from accel_calib.model import Model
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
@@ -36,13 +42,17 @@ def rate_of(message: Imu) -> Any:
     return np.array([vector.x, vector.y, vector.z])
 
 
+def stamps(messages: list[Imu]) -> list[Any]:
+    return [message.header.stamp for message in messages]
+
+
 def full(bench: Any, **fields: Any) -> Imu:
-    """Make a message with all fields set."""
+    """Return a message with all fields set."""
     return bench.imu(READING, orientation=Quaternion(x=0.5, y=0.5, z=0.5, w=0.5),
                      angular_velocity=Vector3(x=RATE[0], y=RATE[1], z=RATE[2]), **fields)
 
 
-def test_corrected_message_speaks_of_the_levelled_frame(bench: Any, stored: Stored) -> None:
+def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored) -> None:
     path = stored(flat=FLAT)
     calibration = read_calibration(path)
     rotation, gain = calibration.model.rotation, calibration.gain
@@ -72,7 +82,7 @@ def test_corrected_message_speaks_of_the_levelled_frame(bench: Any, stored: Stor
     assert np.all(np.linalg.eigvalsh(added) > 0.0)
 
 
-def test_covariances_that_say_absent_or_unknown_are_kept(bench: Any, stored: Stored) -> None:
+def test_covariances_that_mean_absent_or_unknown_are_kept(bench: Any, stored: Stored) -> None:
     heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(calibration_file=stored(flat=FLAT))
     absent = np.array([-1.0] + [0.0] * 8)
@@ -96,8 +106,8 @@ def test_readings_in_g_come_out_in_metres_per_second_squared(bench: Any, stored:
     assert got.linear_acceleration_covariance[0] == pytest.approx(KNOWN[0] * GRAVITY ** 2, rel=0.1)
 
 
-def test_readings_that_are_not_finite_are_dropped_and_warned_of(bench: Any, stored: Stored
-                                                                ) -> None:
+def test_readings_that_are_not_finite_are_dropped_and_reported(bench: Any, stored: Stored
+                                                               ) -> None:
     heard = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(calibration_file=stored())
@@ -114,7 +124,7 @@ def test_readings_that_are_not_finite_are_dropped_and_warned_of(bench: Any, stor
     assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
 
 
-def test_nothing_goes_out_before_a_calibration(bench: Any) -> None:
+def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
     heard = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(use_sim_time=True)  # and nobody gives /clock
@@ -127,7 +137,7 @@ def test_nothing_goes_out_before_a_calibration(bench: Any) -> None:
     assert not heard
 
 
-def test_raw_messages_go_out_unchanged_with_passthrough_and_when_switched_off(
+def test_raw_messages_are_published_with_passthrough_and_when_switched_off(
         bench: Any, stored: Stored) -> None:
     heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(passthrough=True, calibration_file=stored().with_name('new.yaml'),
@@ -148,7 +158,7 @@ def test_raw_messages_go_out_unchanged_with_passthrough_and_when_switched_off(
     bench.spin(lambda: heard[-1] in sent)
 
 
-def test_motion_is_what_is_left_without_the_gravity_of_the_last_rest(
+def test_motion_is_the_force_without_the_gravity_of_the_last_rest(
         bench: Any, stored: Stored, readings: Callable[..., Any]) -> None:
     path = stored(flat=FLAT)
     calibration = read_calibration(path)
@@ -169,7 +179,7 @@ def test_motion_is_what_is_left_without_the_gravity_of_the_last_rest(
     np.testing.assert_allclose([got.x, got.y, got.z], push, atol=0.02)
 
 
-def test_breaks_of_the_stamps_are_reported(bench: Any) -> None:
+def test_interruptions_of_the_stamps_are_reported(bench: Any) -> None:
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(sensor='arm', passthrough=True)
     level = [[0.0, 0.0, GRAVITY]] * 60
@@ -183,3 +193,102 @@ def test_breaks_of_the_stamps_are_reported(bench: Any) -> None:
             'last interruption']
 
     bench.spin(lambda: diagnostics and told())
+
+
+def swapped(data: bytes) -> bytes:
+    """Return a little-endian message as a big-endian machine writes it."""
+    layout = layout_of(data)
+    assert layout is not None
+    stamp = struct.unpack_from('<iII', data, 4)
+    doubles = np.frombuffer(data, '<f8', -1, layout.begin)
+    return (b'\x00\x00\x00\x00' + struct.pack('>iII', *stamp) + data[16:layout.begin]
+            + doubles.astype('>f8').tobytes())
+
+
+def test_messages_in_another_encoding_go_the_same_way_and_broken_ones_are_dropped(
+        bench: Any, stored: Stored) -> None:
+    calibration = read_calibration(path := stored(flat=FLAT))
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=path)
+    bench.exchange(heard, lambda: bench.imu(READING))
+    message = full(bench, angular_velocity_covariance=KNOWN, linear_acceleration_covariance=KNOWN)
+    data = serialize_message(message)
+    for count, each in enumerate((data, swapped(data)), 1):
+        bench.send(each)
+        bench.spin(lambda count=count: stamps(heard).count(message.header.stamp) == count)
+        np.testing.assert_allclose(force_of(heard[-1]), calibration.correct(READING[None])[0],
+                                   atol=1e-12)
+    heard.clear()
+    bench.send(data[:90])
+    bench.send(b'\x00\x01\x00\x00')
+    bench.send(os.urandom(64))
+    last = bench.imu(READING)
+    bench.send(last)
+    bench.spin(lambda: heard)
+    assert stamps(heard) == [last.header.stamp]
+    bench.spin(lambda: any('3 readings' in array.status[0].message for array in diagnostics))
+
+
+def test_messages_reach_the_session_even_if_nobody_listens(bench: Any, stored: Stored) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=stored())
+    bench.node.destroy_subscription(next(
+        each for each in bench.node.subscriptions if each.topic == 'imu/data_calibrated'))
+
+    def counted() -> bool:
+        bench.send(bench.imu([0.1, 0.2, 9.8]))
+        values = {value.key: value.value for value in diagnostics[-1].status[0].values
+                  } if diagnostics else {}
+        return values.get('messages', '0') != '0'
+
+    bench.spin(counted)
+
+
+def test_calibrations_stored_with_effects_are_applied(bench: Any, stored: Stored) -> None:
+    path = stored(flat=FLAT)
+    calibration = read_calibration(path)
+    values = {**calibration.model.values, 'quadratic': np.array([1e-3, -2e-3, 1e-3]),
+              'lever_arm': np.array([0.1, -0.05, 0.02])}
+    size = len(np.concatenate([*values.values()]))
+    write_calibration(path, replace(
+        calibration, model=Model(values, calibration.model.rotation),
+        covariance=np.eye(size) * 1e-8))
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=path)
+    got = bench.exchange(heard, lambda: full(bench, linear_acceleration_covariance=KNOWN))
+    calibration = read_calibration(path)
+    np.testing.assert_allclose(force_of(got), calibration.apply(READING, rate=RATE), atol=1e-9)
+    assert not np.allclose(force_of(got), calibration.apply(READING), atol=1e-4)
+
+
+def test_messages_of_another_sensor_are_never_corrected(bench: Any, stored: Stored) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=stored(sensor='imu_link'))
+    bench.exchange(heard, lambda: bench.imu(READING))
+    for k in range(40):
+        message = bench.imu(READING)
+        message.header.frame_id = 'another' if k % 2 else 'imu_link'
+        bench.send(message)
+    last = bench.imu(READING)
+    bench.send(last)
+    bench.spin(lambda: heard and heard[-1].header.stamp == last.header.stamp)
+    assert {message.header.frame_id for message in heard} == {'imu_link'}
+    bench.spin(lambda: any('20 messages were of another sensor' in array.status[0].message
+                           for array in diagnostics))
+
+
+def test_corrected_messages_beyond_100_g_are_dropped_and_counted(
+        bench: Any, stored: Stored) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(calibration_file=stored())
+    bench.exchange(heard, lambda: bench.imu(READING))
+    wild, last = bench.imu([0.0, 2000.0, 9.8]), bench.imu(READING)
+    bench.send(wild)
+    bench.send(last)
+    bench.spin(lambda: last.header.stamp in stamps(heard))
+    assert wild.header.stamp not in stamps(heard)
+    bench.spin(lambda: any('1 corrected messages were not plausible' in array.status[0].message
+                           for array in diagnostics))

@@ -16,11 +16,11 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.files import read_calibration, write_table
-from accel_calib.ros.answers import Answers
-from accel_calib.ros.apart import Apart
-from accel_calib.ros.fitting import fitted
-from accel_calib.ros.settings import CalibratorSettings
+from accel_calib.ros.services import Services
 from accel_calib.ros.worker import Worker
+from accel_calib.session import CalibratorSettings, Job
+from accel_calib.session.work import fitted
+from accel_calib.session.worker_process import WorkerProcess
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -43,8 +43,13 @@ def single_threaded_executor(context: Any) -> Any:
 def test_callbacks_go_on_while_a_service_works(bench: Any, make_executor: Any) -> None:
     context = bench.node.context
     node = Node('calibrator', context=context)
-    worker, ticks, threads = Worker(node), [0], set()
-    answers = Answers(node, worker)
+    events, ticks, threads = [0], [0], set()
+
+    def on_events() -> None:
+        events[0] += 1
+
+    worker = Worker(node, on_events)
+    services = Services(node, worker, on_events)
 
     def finish(found: str) -> str:
         threads.add(threading.current_thread())
@@ -53,13 +58,13 @@ def test_callbacks_go_on_while_a_service_works(bench: Any, make_executor: Any) -
     def refuse(found: str) -> str:
         raise InputError('no such thing', 'try another')
 
-    def job() -> str:
+    def work(compute: Any) -> str:
         time.sleep(WORK)
         return 'done'
 
-    answers.serve('fit', lambda: answers.later(job, finish))
-    answers.serve('load', lambda: answers.later(lambda: 'read', refuse))
-    answers.serve('save', lambda: 'at once')
+    services.serve('fit', lambda: Job(work, finish))
+    services.serve('load', lambda: Job(lambda compute: 'read', refuse))
+    services.serve('save', lambda: 'at once')
     node.create_timer(0.005, lambda: ticks.__setitem__(0, ticks[0] + 1))
     executor = make_executor(context)
     executor.add_node(node)
@@ -79,6 +84,7 @@ def test_callbacks_go_on_while_a_service_works(bench: Any, make_executor: Any) -
         answer = bench.call('load')
         assert (answer.success, answer.message) == (False, 'no such thing; try another')
         assert bench.call('save').message == 'at once'
+        assert events[0] >= 3
     finally:
         over.set_result(None)
         spinner.join()
@@ -88,62 +94,63 @@ def test_callbacks_go_on_while_a_service_works(bench: Any, make_executor: Any) -
 
 
 @pytest.fixture
-def apart() -> Iterator[Apart]:
-    made = Apart()
+def process() -> Iterator[WorkerProcess]:
+    made = WorkerProcess()
     yield made
     made.close()
 
 
-def test_computing_apart_gives_what_it_gives_here(apart: Apart, stored: Callable[..., Path]
-                                                  ) -> None:
+def test_worker_process_computes_what_this_process_computes(
+        process: WorkerProcess, stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     given = calibration.poses, calibration.units, CalibratorSettings(model='10'), '', None, {}
-    found, here = apart.call(fitted, *given), fitted(*given)
+    found, here = process.call(fitted, *given), fitted(*given)
     np.testing.assert_array_equal(found.model.vector, here.model.vector)
     np.testing.assert_array_equal(found.covariance, here.covariance)
-    assert apart.call(os.getpid) != os.getpid()
-    assert apart.call(os.sched_getscheduler, 0) == os.SCHED_IDLE
+    assert process.call(os.getpid) != os.getpid()
+    assert process.call(os.sched_getscheduler, 0) == os.SCHED_IDLE
 
 
-def test_what_waits_too_long_for_the_processor_gets_its_share(
-        apart: Apart, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('accel_calib.ros.apart._PATIENCE', 0.5)
-    apart.call(time.sleep, 0.7)
-    assert apart.call(os.sched_getscheduler, 0) == os.SCHED_OTHER
-    apart.call(time.sleep, 0.7)
+def test_process_that_waits_too_long_for_the_processor_gets_its_share(
+        process: WorkerProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('accel_calib.session.worker_process._PATIENCE', 0.5)
+    process.call(time.sleep, 0.7)
+    assert process.call(os.sched_getscheduler, 0) == os.SCHED_OTHER
+    process.call(time.sleep, 0.7)
 
 
-def test_errors_of_computing_apart_are_those_of_computing_here(
-        apart: Apart, stored: Callable[..., Path]) -> None:
+def test_errors_in_the_worker_process_are_raised_here(
+        process: WorkerProcess, stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     few = calibration.poses.take(slice(0, 2)), calibration.units, CalibratorSettings(model='10')
     with pytest.raises(RefusedFitError) as here:
         fitted(*few, '', None, {})
     with pytest.raises(RefusedFitError) as there:
-        apart.call(fitted, *few, '', None, {})
+        process.call(fitted, *few, '', None, {})
     assert str(there.value) == str(here.value)
     with pytest.raises(ValueError, match='math domain'):
-        apart.call(math.sqrt, -1.0)
-    assert apart.call(math.sqrt, 4.0) == 2.0
+        process.call(math.sqrt, -1.0)
+    assert process.call(math.sqrt, 4.0) == 2.0
 
 
-def test_what_cannot_be_computed_apart_is_computed_here(apart: Apart) -> None:
-    os.kill(apart.call(os.getpid), signal.SIGKILL)
-    assert apart.call(math.sqrt, 4.0) == 2.0
-    assert apart.call(os.getpid) != os.getpid()
+def test_what_a_killed_worker_process_cannot_compute_is_computed_here(
+        process: WorkerProcess) -> None:
+    os.kill(process.call(os.getpid), signal.SIGKILL)
+    assert process.call(math.sqrt, 4.0) == 2.0
+    assert process.call(os.getpid) != os.getpid()
 
 
-def test_nothing_waits_for_what_is_computed_when_the_node_ends(apart: Apart) -> None:
-    apart.call(os.getpid)
-    threading.Timer(WORK, apart.close).start()
+def test_a_node_that_ends_does_not_wait_for_a_computation(process: WorkerProcess) -> None:
+    process.call(os.getpid)
+    threading.Timer(WORK, process.close).start()
     began = time.monotonic()
     with pytest.raises(InputError, match='ending'):
-        apart.call(time.sleep, 60.0)
+        process.call(time.sleep, 60.0)
     assert time.monotonic() - began < 10.0
 
 
 def children(pid: int) -> list[int]:
-    """Give the processes that a process started."""
+    """Return the processes that a process started."""
     tasks = Path(f'/proc/{pid}/task').glob('*/children')
     return [int(child) for task in tasks for child in task.read_text().split()]
 

@@ -17,7 +17,7 @@ G = units_of('g')
 
 
 def still(seed, seconds, rate=100.0, noise=2e-3):
-    """Give times and readings of a sensor at rest."""
+    """Return times and readings of a sensor at rest."""
     rng = np.random.default_rng(seed)
     time = np.arange(int(seconds * rate)) / rate
     force = Rotation.random(random_state=seed).apply([0.0, 0.0, 1.0])
@@ -25,7 +25,7 @@ def still(seed, seconds, rate=100.0, noise=2e-3):
 
 
 def turned(seed, rate=100.0, noise=2e-3, correlation=0.0, step=0.0, dwell=(1.5, 8.0), poses=8):
-    """Give times, readings and (start, end, force) of a sensor turned by hand between poses."""
+    """Return times, readings and (start, end, force) of a sensor turned by hand."""
     rng = np.random.default_rng(seed)
     lengths = np.column_stack([rng.uniform(*dwell, poses), rng.uniform(0.6, 2.0, poses)])
     keys = np.concatenate([[0.0], np.cumsum(lengths)])[:-1]
@@ -52,11 +52,23 @@ def captured(time, reading, settings=CaptureSettings(), units=G, **columns) -> C
 
 
 def pushed(time, reading, settings=CaptureSettings(), rate=None) -> StillDetector:
+    """Return a detector that got the samples in blocks of 1 to 60."""
     detector = StillDetector(settings, G)
-    for i, (stamp, sample) in enumerate(zip(time.tolist(), reading.tolist())):
-        detector.push(stamp, sample, None if rate is None else rate[i].tolist())
+    table = rows(time, reading, rate)
+    ends = np.cumsum(np.random.default_rng(len(time)).integers(1, 60, len(time)))
+    for block in np.split(table, ends[ends < len(time)]):
+        detector.push(block)
     detector.close()
     return detector
+
+
+def rows(time, reading, rate=None, temperature=np.nan):
+    """Return samples as `StillDetector.push` takes them."""
+    samples = np.full((len(time), 9), np.nan)
+    samples[:, 0], samples[:, 1:4], samples[:, 7] = time, reading, temperature
+    if rate is not None:
+        samples[:, 4:7] = rate
+    return samples
 
 
 def assert_same(one: Dwell, other: Dwell):
@@ -107,17 +119,17 @@ def test_streaming_and_blocks_give_the_dwells_of_the_whole(seed, blocks):
     time, reading, _ = turned(seed, poses=6)
     rate = np.random.default_rng(seed).normal(0.02, 2e-3, reading.shape)
     one = pushed(time, reading, rate=rate).dwells()
-    samples = np.column_stack([time, reading, rate, np.full((len(time), 2), np.nan)])
+    samples = rows(time, reading, rate)
     detector = StillDetector(CaptureSettings(), G)
     for start in range(0, len(samples), blocks):
-        detector.push_block(samples[start:start + blocks])
+        detector.push(samples[start:start + blocks])
     detector.close()
     assert len(one) == len(detector.dwells()) == 6
     for first, second in zip(one, detector.dwells()):
         assert_same(first, second)
 
 
-def test_streaming_equals_the_array_path_over_gaps_and_jumps_back():
+def test_streaming_equals_the_array_path_over_interruptions():
     time, reading, _ = turned(5, poses=6)
     time = time + 1.7e9
     time[900:] += 4.0
@@ -194,19 +206,19 @@ def test_a_gyro_tells_rests_from_slow_turning_once_its_bias_is_known():
     assert not np.any((poses['time'] > 20.0) & (poses['time'] < 23.0))
 
 
-def test_a_gyro_that_gives_zeros_vouches_for_nothing():
+def test_a_gyro_that_reads_zeros_proves_nothing():
     time, reading, _ = rests_with_a_gyro(None)
     still = captured(time, reading, rate=np.zeros_like(reading)).poses
     assert len(still) == len(captured(time, reading).poses)
 
 
-def test_turning_about_the_vertical_is_still_for_it_changes_nothing():
+def test_turning_about_the_vertical_counts_as_still():
     time, reading = still(1, 5.0)
     assert len(captured(time, reading, rate=np.full(reading.shape, 0.1)).poses) == 1
 
 
 @pytest.mark.parametrize('amplitude', [0.01, 0.03])
-def test_a_hand_held_tremor_is_withdrawn_once_the_sensor_was_put_down(amplitude):
+def test_a_hand_held_tremor_is_no_pose_once_the_sensor_was_put_down(amplitude):
     time, reading, _ = turned(2, noise=2e-3, poses=4)
     first, held = still(8, 5.0)
     held = held + amplitude * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
@@ -223,7 +235,7 @@ def test_a_knock_does_not_cut_a_dwell_in_two():
     assert result.samples > 700
 
 
-def test_a_dwell_shorter_than_min_dwell_is_none():
+def test_a_stretch_shorter_than_min_dwell_is_no_dwell():
     time, reading, _ = turned(1, dwell=(1.5, 1.6))
     assert len(captured(time, reading, CaptureSettings(min_dwell=2.0)).poses) == 0
 
@@ -247,19 +259,17 @@ def test_limits_of_the_user_override_the_adaptive_ones():
 def test_the_running_dwell_is_there_before_it_ends():
     time, reading = still(6, 4.0)
     detector = StillDetector(CaptureSettings(), G)
-    for stamp, sample in zip(time.tolist()[:80], reading.tolist()):
-        detector.push(stamp, sample)
+    detector.push(rows(time[:80], reading[:80]))
     assert detector.still
     assert detector.current() is None
-    for stamp, sample in zip(time.tolist()[80:], reading.tolist()[80:]):
-        detector.push(stamp, sample, None, {'temperature': 21.0})
+    detector.push(rows(time[80:], reading[80:], temperature=21.0))
     dwell = detector.current()
     assert dwell is not None
     assert dwell.samples > 300
     assert dwell.context['temperature'] == pytest.approx(21.0)
     assert detector.dwells() == []
-    for stamp in np.arange(4.0, 5.5, 0.01).tolist():
-        detector.push(stamp, [stamp % 0.3, 1.0, stamp % 0.7])
+    after = np.arange(4.0, 5.5, 0.01)
+    detector.push(rows(after, np.column_stack([after % 0.3, np.ones(150), after % 0.7])))
     assert not detector.still
     assert detector.current() is None
     assert len(detector.dwells()) == 1
@@ -287,19 +297,18 @@ def test_a_long_dwell_takes_bounded_memory_and_keeps_its_mean():
 
 def test_a_detector_keeps_only_the_last_dwells_and_those_are_as_they_would_be():
     time, reading, _ = turned(3, poses=8)
-    samples = np.column_stack([time, reading, np.full((len(time), 5), np.nan)])
     detector = StillDetector(CaptureSettings(), G, keep=3)
-    detector.push_block(samples)
+    detector.push(rows(time, reading))
     detector.close()
     assert [each.start for each in detector.dwells()] == [
         each.start for each in pushed(time, reading).dwells()[-3:]]
 
 
-def test_a_dwell_that_turned_out_not_to_be_still_is_withdrawn():
+def test_a_dwell_that_later_ones_show_not_to_be_still_is_doubtful():
     reading = turned(2, noise=2e-3, poses=4)[1]
     first, held = still(8, 5.0)
     held = held + 0.01 * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
     reading = np.concatenate([held, [[0.0, 0.0, 3.0]] * 100, reading])
     detector = pushed(np.arange(len(reading)) / 100.0, reading)
-    assert len(detector.withdrawn()) == 1
-    assert min(detector.withdrawn()) < 1.0
+    assert len(detector.doubtful()) == 1
+    assert min(detector.doubtful()) < 1.0

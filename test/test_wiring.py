@@ -7,7 +7,7 @@ from itertools import permutations, product
 import json
 
 from accel_calib.calibrate import fit_poses, level
-from accel_calib.calibrate.wiring import axes_of, fault_of
+from accel_calib.calibrate.checks import axes_of, fault_of
 from accel_calib.cli.main import main
 from accel_calib.errors import InputError
 from accel_calib.files import write_table
@@ -39,7 +39,7 @@ def wired(mat_p, seed=1, count=16, units=G):
 @pytest.mark.parametrize(('mat_p', 'words'), [
     (np.diag([-1.0, 1, 1]), 'the x axis has the wrong sign (x reads -x)'),
     (np.diag([1.0, 1, -1]), 'the z axis has the wrong sign (z reads -z)'),
-    (-np.eye(3), 'all three axes have the wrong sign: the sensor gives gravity'),
+    (-np.eye(3), 'all three axes have the wrong sign: the sensor reports gravity'),
     (SWAP_XY, 'x and y are swapped'),
     (np.eye(3)[[0, 2, 1]], 'y and z are swapped'),
     (np.diag([-1.0, -1, 1]) @ SWAP_XY,

@@ -1,54 +1,26 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses to calibration: closed forms, maximum likelihood, mounting, and the record of it."""
+"""
+Poses to calibration.
 
-from .agreement import LEVEL
-from .calibration import Calibration, level, Quality, Rejected
-from .comparison import compare, Comparison
-from .fit import fit_poses, MODEL_NAMES
-from .geometry import coverage
-from .identifiability import Identifiability, identifiability
-from .many import fit_many, Fleet
-from .mounting import FrameName, FRAMES, mounting, mounting_with_heading
-from .next_pose import next_pose, NextPose
-from .outlook import Outlook, outlook
+`fit` is the way in, to `unknown_orientation` and `known_orientation`; `refusal` says what poses
+cannot determine and `pose_planning` which ones to take; `mounting` levels; `checks` looks for
+wrong units and wiring; `gate` keeps implausible results out. `calibration` is the record,
+`quality` its figures.
+
+"""
+
+from .calibration import Calibration, level, of_samples, Quality, Rejected, set_heading
+from .checks import check_units, FLAT
+from .fit import fit_poses, level_by_rows, MODEL_NAMES
+from .gate import gated
+from .mounting import FrameName, FRAMES, mounting
+from .pose_planning import next_pose, NextPose, Outlook, outlook
 from .quality import in_g, Verification, verify
-from .sensing_axes import sensing_axes, SensingAxes
-from .unit_check import check_units
-from .unknown import directions_of, METHODS
-from .wiring import FLAT
+from .unknown_orientation import directions_of, Method, METHODS
 
-__all__ = [
-           'FLAT',
-           'FRAMES',
-           'LEVEL',
-           'METHODS',
-           'MODEL_NAMES',
-           'Calibration',
-           'Comparison',
-           'Fleet',
-           'FrameName',
-           'Identifiability',
-           'NextPose',
-           'Outlook',
-           'Quality',
-           'Rejected',
-           'SensingAxes',
-           'Verification',
-           'check_units',
-           'compare',
-           'coverage',
-           'directions_of',
-           'fit_many',
-           'fit_poses',
-           'identifiability',
-           'in_g',
-           'level',
-           'mounting',
-           'mounting_with_heading',
-           'next_pose',
-           'outlook',
-           'sensing_axes',
-           'verify',
-]
+__all__ = ['FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'Calibration', 'FrameName', 'Method',
+           'NextPose', 'Outlook', 'Quality', 'Rejected', 'Verification', 'check_units',
+           'directions_of', 'fit_poses', 'gated', 'in_g', 'level', 'level_by_rows',
+           'mounting', 'next_pose', 'of_samples', 'outlook', 'set_heading', 'verify']

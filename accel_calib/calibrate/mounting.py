@@ -23,8 +23,8 @@ for `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
     x column = (√(y²+z²), -xy/√(y²+z²), -xz/√(y²+z²)) / |G|
 
 singular where x is vertical (90° pitch); for `win8` in the sensor's x-z plane, singular where y is
-vertical (90° roll). There the limit of level y, or level x, is taken. A second pose of known
-direction fixes the heading (TRIAD, Black 1964).
+vertical (90° roll). There the limit of level y, or level x, is taken. A second pose, with
+the nose of the robot tilted straight down, fixes the heading (TRIAD, Black 1964).
 
 """
 
@@ -40,12 +40,16 @@ from ..table import Floats
 FrameName = Literal['ros', 'ned', 'android', 'win8']
 FRAMES: tuple[str, ...] = get_args(FrameName)
 
+_NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]),
+              'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
+"""Reading of a sensor whose nose points straight down in each frame [g]."""
+
 _VERTICAL = 1e-9
 _LEAST_HEADING_ANGLE = np.radians(10.0)
 
 
 def flat_direction(frame: str) -> Floats:
-    """Give the (3,) unit reading of a sensor that lies flat in this frame."""
+    """Return the (3,) unit reading of a sensor that lies flat in this frame."""
     return np.array([0.0, 0.0, -1.0 if frame == 'win8' else 1.0])
 
 
@@ -81,7 +85,7 @@ def mounting(flat: Floats, frame: str = 'ros') -> Floats:
 
 
 def _x_without_yaw(up: Floats) -> Floats:
-    """Give the x column of ned, android and ros: yaw zero, y level."""
+    """Return the x column of ned, android and ros: yaw zero, y level."""
     x, y, z = up
     root = np.hypot(y, z)
     if root < _VERTICAL:
@@ -90,7 +94,7 @@ def _x_without_yaw(up: Floats) -> Floats:
 
 
 def _x_of_win8(up: Floats) -> Floats:
-    """Give the x column of win8: no y component, and x never turned back."""
+    """Return the x column of win8: no y component, and x never turned back."""
     x, _, z = up
     root = np.hypot(x, z)
     if root < _VERTICAL:
@@ -99,18 +103,17 @@ def _x_of_win8(up: Floats) -> Floats:
     return np.array([z, 0.0, -x]) * sign / root
 
 
-def mounting_with_heading(flat: Floats, second: Floats, second_direction: Floats,
-                          frame: str = 'ros') -> Floats:
+def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Floats:
     """
-    Find ΔR from a flat pose and a second one of known direction.
+    Find the heading of a levelled mounting from a pose with the nose of the robot down.
 
     Parameters
     ----------
-    flat, second : (3,) array
-        Calibrated readings in the axes of the sensor.
-    second_direction : (3,) array
-        Specific force of the second pose in the levelled frame: nose straight down is
-        (-1, 0, 0) in `ros`.
+    rotation : (3, 3) array
+        ΔR of any heading, such as `mounting` returns it.
+    nose_down : (3,) array
+        Calibrated reading with the nose (forward; the top of a screen) tilted straight down, by
+        10° to 170°, in the axes of the sensor; any length.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
 
@@ -125,17 +128,43 @@ def mounting_with_heading(flat: Floats, second: Floats, second_direction: Floats
         If the second pose is nearly the flat one, or its opposite.
 
     """
-    sensor = _triad(flat, second)
-    levelled = _triad(flat_direction(frame), second_direction)
-    return sensor @ levelled.T
+    flat = flat_direction(frame)
+    return _triad(rotation @ flat, nose_down) @ _triad(flat, _NOSE_DOWN[frame]).T
+
+
+def with_heading_of(before: Floats, rotation: Floats) -> Floats:
+    """
+    Return a levelled mounting with the heading that it had before.
+
+    Parameters
+    ----------
+    before : (3, 3) array
+        ΔR as it was.
+    rotation : (3, 3) array
+        ΔR of a new flat pose, of any heading.
+
+    Returns
+    -------
+    (3, 3) array
+        ΔR whose x axis is the earlier one, turned into the new level; `rotation` itself if the
+        earlier x axis is within 10° of vertical now.
+
+    """
+    up, x = rotation[:, 2], before[:, 0]
+    level_x = x - up * (up @ x)
+    length = np.linalg.norm(level_x)
+    if length < np.sin(_LEAST_HEADING_ANGLE):
+        return rotation
+    level_x = level_x / length
+    return np.column_stack([level_x, np.cross(up, level_x), up])
 
 
 def _triad(first: Floats, second: Floats) -> Floats:
-    """Give the (3, 3) matrix whose columns are the axes spanned by two directions."""
+    """Return the (3, 3) matrix whose columns are the axes spanned by two directions."""
     unit = first / np.linalg.norm(first)
     normal = np.cross(unit, second / np.linalg.norm(second))
     if not np.linalg.norm(normal) >= np.sin(_LEAST_HEADING_ANGLE):
         raise InputError('the second pose is within 10° of the flat one or of its opposite',
-                         'tilt the robot further, nose straight down for instance')
+                         'tilt the nose of the robot further down')
     normal = normal / np.linalg.norm(normal)
     return np.column_stack([np.cross(normal, unit), normal, unit])

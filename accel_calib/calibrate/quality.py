@@ -4,8 +4,9 @@
 """
 How well a calibration does: on the poses it was fitted to, and on poses it has not seen.
 
-The error of a pose is |force| - 1 g; of a pose of known orientation under model 12, which knows
-the axes, it is the length of the vector error. The gap is its RMS over the poses.
+The error of a pose is |force| - 1 g. For a pose of known orientation under model 12, which knows
+the axes, it is the length of the vector error. The residual of a calibration is the RMS of the
+errors over the poses.
 
 """
 
@@ -15,17 +16,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .approach import with_approach
 from .calibration import Calibration, Quality
-from .geometry import coverage
-from .likelihood import Fit, norm_rows
-from .uncertainty import believable
-from ..model import correct, sensor_force
+from .previous_pose import with_previous
+from ..estimate.equations import noise_of
+from ..estimate.fit import Fit, judge
+from ..estimate.geometry import coverage, WEAK_DILUTION
+from ..estimate.outliers import by_pose
+from ..model import correct, Model, sensor_force
 from ..table import Floats, Poses
 from ..units import MG, Units
 
-_ALONE = 1e-9
-"""Of a residual less than this is left: its pose alone determines a parameter."""
+_LEAST_OWN = 1e-9
+"""1 - leverage below this: the pose alone determines a parameter."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,11 @@ class Verification:
     Parameters
     ----------
     rms_before_mg, rms_after_mg : float
-        Gap without and with the calibration [mg].
+        Residual without and with the calibration [mg].
     max_before_percent, max_after_percent : float
         Largest error without and with the calibration [% of 1 g].
     noise_floor_mg : float or None
-        Gap that the noise of the pose means alone would leave [mg]; None where it is not known.
+        Residual that the noise of the pose means alone would leave [mg]; None if it is not known.
 
     """
 
@@ -52,7 +54,7 @@ class Verification:
 
 
 def in_g(poses: Poses, units: Units) -> Poses:
-    """Give the same poses with readings, std and reference in g (native references are)."""
+    """Return the poses with readings, std and reference in g (native references are)."""
     scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
     if 'reference' in poses and units.name != 'native':
         scaled['reference'] = units.to_g(poses['reference'])
@@ -61,7 +63,7 @@ def in_g(poses: Poses, units: Units) -> Poses:
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
-    Say how well a calibration does on these poses.
+    Check a calibration against poses.
 
     Parameters
     ----------
@@ -73,74 +75,66 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     Returns
     -------
     Verification
-        Gaps before and after.
+        Residuals before and after.
 
     """
-    poses_g = with_approach(in_g(poses, calibration.units), calibration.model)
+    model, units = calibration.model, calibration.units
+    poses_g = calibration.held(with_previous(in_g(poses, units), model))
     vectors = calibration.name == '12' and 'reference' in poses
-    before = _before(poses_g, calibration.units, vectors=vectors)
-    model = calibration.model
-    if vectors:
-        after = np.linalg.norm(correct(model, poses_g.reading, poses_g.columns)
-                               - poses_g['reference'], axis=1)
-    else:
-        after = _norm_errors(sensor_force(model, poses_g.reading, poses_g.columns))
+    before = _before(poses_g, units, vectors=vectors)
+    after = _errors(model, poses_g, vectors=vectors)
+    floor = None
+    if noise_of(poses_g) is not None:
+        known = poses_g if vectors else _without_orientation(poses_g)
+        scale = judge(Model(model.values), known).equations.scale
+        floor = _rms_mg(scale) * np.sqrt(3.0 if vectors else 1.0)
     return Verification(_rms_mg(before), _rms_mg(after), _largest_percent(before),
-                        _largest_percent(after), _noise_floor_mg(calibration, poses_g, vectors))
+                        _largest_percent(after), floor)
 
 
-def _noise_floor_mg(calibration: Calibration, poses_g: Poses, vectors: bool) -> float | None:
-    """Give the gap that the noise of the pose means alone would leave [mg]."""
-    noise = believable(poses_g.noise)
-    if noise is None:
-        return None
-    if vectors:
-        inverse = np.linalg.inv(calibration.model.linear_part[0])
-        return _rms_mg(np.sqrt(np.sum(noise ** 2 @ (inverse ** 2).T, axis=1)))
-    u = sensor_force(calibration.model, poses_g.reading, poses_g.columns)
-    rows = norm_rows(calibration.model, u, poses_g.columns)
-    return _rms_mg(np.linalg.norm(rows * noise, axis=1))
+def _without_orientation(poses_g: Poses) -> Poses:
+    """Return the poses without what is known of their orientation."""
+    return Poses({key: values for key, values in poses_g.columns.items()
+                  if key not in ('reference', 'orientation')}, poses_g.row)
 
 
-def quality_of(fit: Fit, poses_g: Poses, units: Units, directions: Floats) -> Quality:
+def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """
-    Say how well a fit does.
+    Return how well a fit does.
 
     Parameters
     ----------
     fit : Fit
-        To these poses; with three residuals a pose where their orientations are known.
-    poses_g : Poses
-        The poses, in g.
+        The fit.
     units : Units
         Unit of the sensor's readings.
     directions : (n, 3) array
         Where up is in each pose, unit vectors.
 
     """
-    count = len(poses_g)
-    vectors = len(fit.residual) > count
-    before = _before(poses_g, units, vectors=vectors)
-    # Residuals of known orientation are differences of readings; W⁻¹ makes them forces.
-    to_force = np.linalg.inv(fit.model.linear_part[0]) if vectors else np.eye(1)
-    errors = np.linalg.norm(fit.residual.reshape(count, -1) @ to_force.T, axis=1)
-    held_out = np.linalg.norm(_held_out(fit, count) @ to_force.T, axis=1)
-    floor = None
-    if fit.noise_known:
-        left = fit.sigma * np.sqrt(np.maximum(1.0 - fit.leverage, 0.0))
-        floor = _rms_mg(np.linalg.norm(left.reshape(count, -1), axis=1))
+    vectors = 'reference' in fit.poses_g
+    before = _before(fit.poses_g, units, vectors=vectors)
+    errors = _errors(fit.model, fit.poses_g, vectors=vectors)
+    held_out = _held_out(fit)
     return Quality(_rms_mg(before), _rms_mg(errors), _largest_percent(before),
-                   _largest_percent(errors),
-                   None if np.any(np.isnan(held_out)) else _rms_mg(held_out), floor,
+                   _largest_percent(errors), None if held_out is None else _rms_mg(held_out),
+                   noise_floor_mg(fit) if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
 
 
+def noise_floor_mg(fit: Fit) -> float:
+    """Return the residual that the noise of the poses leaves, given what the fit absorbs [mg]."""
+    data, scale = by_pose(fit), fit.equations.scale
+    own = np.trace(data.own(data.spread), axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
+    return _rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
+
+
 def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
     """
-    Give the errors without a calibration, (n,) in g.
+    Return the errors without a calibration, (n,) [g].
 
-    Native readings mean nothing without one; they are seen from the middle of their range.
+    Native readings mean nothing without one; they are taken from the middle of their range.
 
     """
     reading = poses_g.reading
@@ -148,41 +142,75 @@ def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
         reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
     if vectors:
         return np.linalg.norm(reading - poses_g['reference'], axis=1)
-    return _norm_errors(reading)
+    return np.linalg.norm(reading, axis=1) - 1.0
 
 
-def _norm_errors(force: Floats) -> Floats:
-    """Give |force| - 1 of each row."""
-    errors: Floats = np.linalg.norm(force, axis=1) - 1.0
-    return errors
+def _errors(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
+    """Return the errors of corrected poses, (n,) [g]."""
+    if vectors:
+        force = correct(model, poses_g.reading, poses_g.columns)
+        return np.linalg.norm(force - poses_g['reference'], axis=1)
+    return np.linalg.norm(sensor_force(model, poses_g.reading, poses_g.columns), axis=1) - 1.0
 
 
-def _held_out(fit: Fit, count: int) -> Floats:
+def _held_out(fit: Fit) -> Floats | None:
     """
-    Give each pose's residual when it is left out of the fit, (count, 1 or 3) [g].
+    Return the error of each pose when it is left out of the fit, (n,) [g].
 
-    With H the hat matrix the error of a pose is (I - H_ii)⁻¹ times its residual (PRESS, Allen
-    1974); NaN where the pose alone determines a parameter.
+    With H the hat matrix, the residual of a pose is then (I - H_ii)⁻¹ times its residual (PRESS,
+    Allen 1974); None if a pose alone determines a parameter.
 
     """
-    each = len(fit.residual) // count
-    if each == 1:
-        own = 1.0 - fit.leverage
-        if np.any(own < _ALONE):
-            return np.full((count, 1), np.nan)
-        return (fit.residual / own)[:, np.newaxis]
-    orthonormal = fit.orthonormal.reshape(count, each, -1)
-    blocks = np.eye(each) - orthonormal @ np.swapaxes(orthonormal, 1, 2)
-    if np.any(np.linalg.svd(blocks, compute_uv=False) < _ALONE):
-        return np.full((count, each), np.nan)
-    weighted = fit.weighted.reshape(count, each, 1)
-    left_out: Floats = np.linalg.solve(blocks, weighted)[:, :, 0] * fit.sigma.reshape(count, each)
-    return left_out
+    data = by_pose(fit)
+    own = data.own(data.spread)
+    if np.any(np.linalg.svd(own, compute_uv=False) < _LEAST_OWN):
+        return None
+    left_out = np.linalg.solve(own, data.residual[:, :, np.newaxis])[:, :, 0]
+    if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ makes them forces
+        noise = noise_of(fit.poses_g)
+        scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
+        left_out = scaled @ np.linalg.inv(fit.model.linear_part[0]).T
+        return np.linalg.norm(left_out, axis=1)
+    return np.linalg.norm(left_out, axis=1) * fit.equations.scale
 
 
-def _rms_mg(errors_g: Floats) -> float:
-    return float(np.sqrt(np.mean(errors_g ** 2))) * MG
+def _rms_mg(errors_g: Floats | float) -> float:
+    return float(np.sqrt(np.mean(np.square(errors_g)))) * MG
 
 
 def _largest_percent(errors_g: Floats) -> float:
     return float(np.max(np.abs(errors_g))) * 100.0
+
+
+_NO_DOF = 'there are just as many poses as free parameters'
+_UNCOVERED = 'the poses leave a part of the sphere uncovered'
+_NO_NOISE = 'std and count of the poses are not given'
+_TOO_LARGE = 'the residuals are'
+
+_LARGE_CHI2 = 4.0
+"""Squared residuals over their noise that are warned of."""
+
+
+def fit_warnings(fit: Fit, stretched: float) -> tuple[str, ...]:
+    """Return what a user should know of a fit; `stretched` is its dilution."""
+    warnings = []
+    if fit.dof == 0:
+        warnings.append(f'{_NO_DOF}: nothing is left to check the fit with; take more poses')
+    if stretched > WEAK_DILUTION:
+        warnings.append(f'{_UNCOVERED}: there the error is up to {stretched:.0f} times that of a '
+                        'pose; take the next pose asked for')
+    if not fit.noise_known:
+        known = ('the residuals alone' if fit.dof > 0 else
+                 'the noise of a common sensor, 0.5 mg, which may be wrong for this one')
+        warnings.append(f'{_NO_NOISE}: the uncertainty comes from {known}')
+    elif fit.dof > 0 and fit.chi2 / fit.dof > _LARGE_CHI2:
+        warnings.append(f'{_TOO_LARGE} {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of the '
+                        'pose means: poses repeat worse than their samples say, or the model '
+                        'lacks an effect')
+    return tuple(warnings)
+
+
+def other_warnings(warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the warnings that are not of `fit_warnings`."""
+    return tuple(line for line in warnings
+                 if not line.startswith((_NO_DOF, _UNCOVERED, _NO_NOISE, _TOO_LARGE)))

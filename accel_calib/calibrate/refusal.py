@@ -1,9 +1,10 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-When the poses cannot carry a model: what is wrong, what is left open, and the way out.
 
-The way out is the poses to add, and the larger one of the smaller models that the poses do carry.
+"""
+When poses cannot determine a model: what is wrong, what is left open, and what to do.
+
+That is the poses to add, or the largest of the smaller models that the poses do determine.
 
 """
 
@@ -13,7 +14,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .geometry import (
+from .pose_planning import missing_poses
+from ..errors import RefusedFitError
+from ..estimate.geometry import (
     dilution,
     distinct,
     LARGEST_DILUTION,
@@ -21,40 +24,38 @@ from .geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
-from .identifiability import Combination, error_left_in, identifiability, left_out
-from .next_pose import missing_poses
-from ..errors import RefusedFitError
+from ..estimate.identifiability import Combination, error_left_in, identifiability, left_out
 from ..table import Floats
 from ..units import MG
 
 _SAID = 3
-"""Combinations left open that are told one by one."""
+"""Combinations left open that are named one by one."""
 
 
 def carries(name: str, directions: Floats, noise: Floats | None = None) -> bool:
-    """Tell whether poses carry a model; arguments as `refuse_if_unfit`."""
+    """Return whether poses determine a model; arguments as `refuse_if_unfit`."""
     return (len(directions) >= poses_needed(name)
             and dilution(name, directions, noise) <= LARGEST_DILUTION)
 
 
 def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) -> None:
     """
-    Make sure that the poses can carry a model.
+    Check that poses determine a model.
 
     Parameters
     ----------
     name : {'4', '7', '9', '10', '12'}
         The model.
     directions : (n, 3) array
-        Unit vectors of force in the axes of the sensor.
+        Unit vectors of force in the sensor axes.
     noise : (n,) array, optional
-        Noise of each pose, in any unit; equal where it is not given.
+        Noise of each pose, in any unit; equal if it is not given.
 
     Raises
     ------
     RefusedFitError
-        With what is wrong with the poses, what they leave open, the poses to add and the larger
-        one of the smaller models that they do carry.
+        If they do not: with what is wrong, what they leave open, the poses to add and the largest
+        of the smaller models that they do determine.
 
     """
     if carries(name, directions, noise):
@@ -73,7 +74,7 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
 
 def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tuple[str, ...]:
     """
-    Say what the largest model would show that the poses do not let be seen.
+    Return what the largest model would show if the poses determined it.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
     Returns
     -------
     tuple of str
-        A warning, or none where the largest model is carried.
+        A warning, or none if the poses determine the largest model.
 
     """
     largest = NORM_MODELS[-1]
@@ -99,8 +100,8 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
 
 
 def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:
-    """Offer a smaller model, with what it leaves out."""
-    offer = (f', or use model {smaller}, which these poses carry: it leaves out '
+    """Return the offer of a smaller model, with what it leaves out."""
+    offer = (f', or use model {smaller}, which these poses determine: it leaves out '
              f'{_and(left_out(smaller, name))}')
     if name == '12':
         return offer
@@ -108,13 +109,13 @@ def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) ->
 
 
 def _commonly(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
-    """Say what leaving out comes to."""
+    """Return the error that leaving out effects commonly makes."""
     error = error_left_in(smaller, larger, directions, noise) * MG
     return f'which in a common sensor makes |a| wrong by {error:.0f} mg'
 
 
 def words_of(open_: Sequence[Combination]) -> str:
-    """Say what is left open."""
+    """Return the words for what is left open."""
     words = [each.words for each in open_[:_SAID]]
     if len(open_) > _SAID:
         words.append(f'{len(open_) - _SAID} more')
@@ -122,19 +123,19 @@ def words_of(open_: Sequence[Combination]) -> str:
 
 
 def _add(missing: Sequence[str]) -> str:
-    """Say which way to turn the sensor."""
+    """Return which way to turn the sensor."""
     if len(missing) <= 1:
         return f'turn the sensor so that {"".join(missing) or "another side"} points up'
-    return f'turn the sensor so that one after another {_and(missing)} point up'
+    return f'turn the sensor so that in turn {_and(missing)} point up'
 
 
 def _and(words: Sequence[str]) -> str:
-    """Join words."""
+    """Return words joined by commas and 'and'."""
     return ' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))
 
 
 def _shape(name: str, directions: Floats) -> str:
-    """Say in words what is wrong with these directions."""
+    """Return what is wrong with these directions."""
     count = len(directions)
     if count < 2:
         return f'{count} pose{"" if count else "s"}'
@@ -151,4 +152,5 @@ def _shape(name: str, directions: Floats) -> str:
         return f'the {count} poses lie within {cone:.0f}° of one direction'
     if np.linalg.svd(directions - mean, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
         return f'the {count} poses lie in a plane'
-    return f'the {count} poses point in {distinct(directions)} directions that leave a gap'
+    return (f'the {count} poses point in {distinct(directions)} directions that leave a part of '
+            'the sphere uncovered')

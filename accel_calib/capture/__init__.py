@@ -4,18 +4,18 @@
 """
 Samples to still poses: streaming for the node, the same rule over arrays for recordings.
 
-The way of the data: `chunks` sums the samples over short stretches of header time, `rule` says
-of each whether the sensor is still, `tracker` joins still chunks to dwells, `run` sums a dwell,
-`average` says what it comes to, `dwell` judges it, `poses` makes the pose table. `detector` is the
-way in; both paths go through it. `sums`, `window`, `sliding` and `noise` are the arithmetic below.
+`detector` is the way in. `chunks` sums the samples over short stretches of header time, `rule`
+judges whether the sensor is still in each, `tracker` joins still chunks to dwells, `ongoing` sums
+one, `average` computes its figures, `dwell` judges it, and `poses` makes the pose table. `sums`,
+`window`, `sliding` and `noise` are the arithmetic below.
 
 """
 
 from .chunks import Interruption
 from .detector import StillDetector
 from .dwell import Dwell
-from .poses import capture, Captured, is_new, merged, poses_from, select
-from .settings import CaptureSettings, Repeated
+from .poses import capture, Captured, poses_from, select
+from .settings import CaptureSettings, REPEATED, Repeated, settings_from
 
-__all__ = ['capture', 'Captured', 'CaptureSettings', 'Dwell', 'Interruption', 'is_new', 'merged',
-           'poses_from', 'Repeated', 'select', 'StillDetector']
+__all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Interruption', 'Repeated',
+           'StillDetector', 'capture', 'poses_from', 'select', 'settings_from']

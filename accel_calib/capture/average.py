@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Runs that ended to one column of figures each, many at a time.
+Figures of finished dwells, one record each.
 
-The noise of a mean is taken along the mean where that is known to be the vertical: a sensor that
-settles tilts, which moves its reading across; its mean is right for its mean attitude, and the
-fit asks for the noise along the force only.
+The noise of a mean is taken along the mean if that is known to be the vertical: a sensor that
+settles tilts, which changes its reading across. Its mean is right for its mean attitude, and the
+fit uses the noise along the force only.
 
 """
 
@@ -16,98 +16,122 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .noise import excess_of_means, strength_of
-from .run import LEVEL, Run, WINDOWS
-from .sliding import lines_through
-from .sums import CONTEXT_COUNT, CONTEXT_SUM, COUNT, FIRST, SECOND, TIME
+from .noise import excess_of_means, strength_of, Trend
+from .ongoing import OngoingDwell
+from .sliding import Line, lines_through
+from .sums import chained, Records
 from ..table import Floats
 
-# Rows of the figures of dwells; reading and rate, or the reading alone.
-LOWEST = slice(0, 6)      # lower end of the mean variance of the windows
-AVERAGE = slice(6, 12)    # mean variance of the windows
-MEAN = slice(12, 18)
-STD = slice(18, 21)       # of the samples
-SLOPE = slice(21, 36)     # slope, residuals, neighbours, white; time_square, length, spacing
-SPAN = slice(36, 39)      # first, last and mean stamp
-SAMPLES = 39
-EXCESS = 40               # variance of the mean over that of independent samples
-BESIDE = 41               # whether the reading sloped just before or after
-ORIENTATION = 42
-AROUND = slice(43, 45)    # temperature and supply voltage
-ALONG = 45                # as EXCESS, along the mean reading where that is the vertical
-PARTS = slice(46, 52)     # slopes over halves of the dwell [1/s], and their strengths
-FIGURES = 52
+FIGURES = np.dtype([
+    ('lowest', float, 6),     # lower end of the mean variance of the windows
+    ('average', float, 6),    # mean variance of the windows
+    ('mean', float, 6),       # reading and rate
+    ('std', float, 3),        # of the samples
+    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `sliding.Line`
+    ('time_square', float), ('cells', float),
+    ('white', float, 3),      # variance of a cell mean for independent samples
+    ('spacing', float),       # time between cells [s]
+    ('begin', float), ('end', float), ('time', float),  # first, last and mean stamp [s]
+    ('samples', float),
+    ('excess', float),        # variance of the mean over that of independent samples
+    ('along', float),         # the same along the mean reading, if that is the vertical
+    ('beside_slope', bool),   # the reading sloped just before or after
+    ('orientation', np.intp),
+    ('around', float, 2),     # temperature and supply voltage
+    ('part_slope', float, 3), ('part_strength', float, 3)])  # over three halves of the dwell
+"""Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
 
 
-def figures(runs: Sequence[Run], *, known_units: bool) -> Floats:
-    """Give what runs come to, (FIGURES, k); `known_units` if 0 is no force, but for the offset."""
-    found = np.empty((FIGURES, len(runs)))
-    if not runs:
+def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
+    """
+    Return the figures of dwells.
+
+    Parameters
+    ----------
+    dwells : sequence of OngoingDwell
+        As they are at their end.
+    known_units : bool
+        Whether a reading of 0 is no force, apart from the offset.
+
+    Returns
+    -------
+    (k,) array of FIGURES
+        One record per dwell.
+
+    """
+    found = np.empty(len(dwells), FIGURES)
+    if not dwells:
         return found
-    total = np.array([run.total() for run in runs]).T
-    count = total[COUNT]
-    shift = total[FIRST] / count
-    square = np.maximum(total[SECOND] - total[FIRST] * shift, 0.0)
-    variance = square[:3] / np.maximum(count - 1.0, 1.0)
-    level = total[LEVEL] / np.maximum(total[WINDOWS], 1.0)
-    found[MEAN] = shift + np.array([run.origin for run in runs]).T
-    found[STD] = np.sqrt(variance)
-    found[SLOPE], found[PARTS], found[EXCESS], found[ALONG] = _noise(
-        runs, variance, level[:3], found[MEAN][:3] if known_units else None)
-    spread = np.sqrt((1.0 + np.maximum(found[EXCESS], 1.0)) / count)
-    found[LOWEST] = level * np.exp(-2.0 * spread)
-    found[AVERAGE] = level
-    found[SPAN] = np.array([(run.begin, run.end, run.epoch) for run in runs]).T
-    found[SPAN.stop - 1] += total[TIME] / count
-    found[SAMPLES] = count
-    found[BESIDE] = [run.beside_slope for run in runs]
-    found[ORIENTATION] = [run.orientation for run in runs]
-    known = total[CONTEXT_COUNT]
-    found[AROUND] = np.where(known > 0.0, total[CONTEXT_SUM], np.nan) / np.maximum(known, 1.0)
+    total = chained(*(dwell.total() for dwell in dwells))
+    count = total['count'][:, np.newaxis]
+    shift = total['first'] / count
+    square = np.maximum(total['second'] - total['first'] * shift, 0.0)
+    variance = square[:, :3] / np.maximum(count - 1.0, 1.0)
+    level = total['level'] / np.maximum(total['windows'], 1.0)[:, np.newaxis]
+    found['mean'] = shift + [dwell.origin for dwell in dwells]
+    found['std'] = np.sqrt(variance)
+    _add_noise(found, dwells, variance.T, level[:, :3].T, known_units)
+    spread = np.sqrt((1.0 + np.maximum(found['excess'], 1.0)) / total['count'])
+    found['lowest'] = level * np.exp(-2.0 * spread)[:, np.newaxis]
+    found['average'] = level
+    for name in ('begin', 'end', 'orientation', 'beside_slope'):
+        found[name] = [getattr(dwell, name) for dwell in dwells]
+    found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
+    found['samples'] = total['count']
+    known = total['context_count']
+    found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
     return found
 
 
-def _noise(runs: Sequence[Run], variance: Floats, level: Floats, mean: Floats | None
-           ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Give `SLOPE`, `PARTS`, `EXCESS` and `ALONG`, from the means of cells."""
-    sizes = np.array([run.cells.shape[1] for run in runs], dtype=float)
-    cells = np.zeros((4, len(runs), int(sizes.max())))
-    for k, run in enumerate(runs):
-        cells[0, k, :run.cells.shape[1]] = run.cells[COUNT]
-        cells[1:, k, :run.cells.shape[1]] = run.cells[FIRST][:3]
-    per_cell = cells[0].sum(axis=1) / sizes
-    means = cells[1:] / np.maximum(cells[0], 1.0)
-    inside = cells[0] > 0.0
-    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * inside
+def trend_of(found: Records) -> Trend:
+    """Return the slopes over whole dwells, with their significance."""
+    line = Line(found['slope'].T, found['square'].T, found['neighbours'].T, found['time_square'],
+                found['cells'])
+    return strength_of(line, found['spacing'], found['white'].T)
+
+
+def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
+               known_units: bool) -> None:
+    """Set the figures that follow from the means of cells."""
+    sizes = np.array([len(dwell.cells) for dwell in dwells], dtype=float)
+    count = np.zeros((len(dwells), int(sizes.max())))
+    sums = np.zeros((3, *count.shape))
+    for k, dwell in enumerate(dwells):
+        count[k, :len(dwell.cells)] = dwell.cells['count']
+        sums[:, k, :len(dwell.cells)] = dwell.cells['first'][:, :3].T
+    per_cell = count.sum(axis=1) / sizes
+    means = sums / np.maximum(count, 1.0)
+    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * (count > 0.0)
     line = lines_through(centred, sizes)
-    spacing = [run.size * run.length for run in runs]
-    slope = np.vstack([line.slope, line.square, line.neighbours, level / per_cell,
-                       line.time_square, sizes, spacing])
+    spacing = np.array([dwell.size * dwell.length for dwell in dwells])
+    for name in ('slope', 'square', 'neighbours'):
+        found[name] = getattr(line, name).T
+    found['white'], found['spacing'] = (level / per_cell).T, spacing
+    found['time_square'], found['cells'] = line.time_square, sizes
+    _add_parts(found, centred, sizes, level / per_cell, spacing)
     white = variance / per_cell
-    excess = excess_of_means(centred, sizes, white)
-    parts = _parts(centred, sizes, level / per_cell, np.array(spacing))
-    if mean is None:
-        return slope, parts, excess, excess
-    up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
-    along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
-    white = np.sum(up**2 * white, axis=0)[np.newaxis]
-    return slope, parts, excess, excess_of_means(along, sizes, white)
+    found['excess'] = found['along'] = excess_of_means(centred, sizes, white)
+    if known_units:
+        mean = found['mean'][:, :3].T
+        up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
+        along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
+        found['along'] = excess_of_means(along, sizes, np.sum(up ** 2 * white, axis=0)[np.newaxis])
 
 
-def _parts(centred: Floats, sizes: Floats, white: Floats, spacing: Floats) -> Floats:
+def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
+               ) -> None:
     """
-    Give slopes over the first, the middle and the last half, and their strengths, (6, k).
+    Set the slopes over the first, the middle and the last half, and their strengths.
 
-    A turn that begins or ends within a dwell shows there better than over the whole.
+    They show a turn that begins or ends within a dwell better than the slope of the whole.
 
     """
     half = sizes // 2
     inside = np.arange(int(half.max())) < half[:, np.newaxis]
-    found = []
-    for start in (0.0 * half, (sizes - half) // 2, sizes - half):
+    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
         index = start[:, np.newaxis] + np.arange(inside.shape[1])
         part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
         part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
-        found.append(strength_of(lines_through(part, half), spacing, white))
-    return np.array([*(np.sqrt(np.sum(each.slope**2, axis=0)) for each in found),
-                     *(each.strength for each in found)])
+        trend = strength_of(lines_through(part, half), spacing, white)
+        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
+        found['part_strength'][:, k] = trend.strength

@@ -4,15 +4,14 @@
 """
 Samples to chunks: sums over short stretches of header time.
 
-Everything that follows works on chunks, a fifth of the still window each, so that the work per
-sample is a few additions whatever the window, and a recording of any length becomes a short
-table. A chunk is one row of sums, and the sum of two rows is the row of both chunks: windows
-and dwells are sums of rows. Samples are taken relative to the first sample of the stream before
-they are squared, which keeps the digits of a small noise on a large offset.
+Everything that follows works on chunks, a fifth of the still window each. So the work per sample
+is a few additions, whatever the window, and a recording of any length becomes a short table.
+Windows and dwells are sums of chunks. The first sample of the stream is subtracted before
+squaring, which keeps the digits of a small noise on a large offset.
 
 The sample period is learned from the first samples of a segment, never from later ones, so that
-a stream and a recording are cut in the same places. A segment is a stretch without a gap and
-without a jump back in its stamps; after either the period is learned anew.
+a stream and a recording are cut in the same places. A segment is a stretch without an interruption
+of its stamps; after one the period is learned again.
 
 """
 
@@ -26,13 +25,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .settings import CaptureSettings
-from .sums import CHUNKS_PER_WINDOW, Indices, smallest_steps, sums_of
+from .sums import chained, CHUNKS_PER_WINDOW, Indices, Records, smallest_steps, sums_of
 from ..table import Floats
 
 _LEARN = 16          # intervals from which the period is learned
 _SAMPLES = 2         # samples of a chunk, at least
-_GAP_SECONDS = 0.5   # a gap is longer than this and than _GAP_PERIODS
-_GAP_PERIODS = 5.0
+_MISSING_SECONDS = 0.5   # samples are missing for longer than this and than _MISSING_PERIODS
+_MISSING_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # stamps out of order by no more than this, or _BACK_PERIODS, are jitter
 _BACK_PERIODS = 2.0
 _INTERRUPTIONS_MAX = 10_000
@@ -42,7 +41,7 @@ _PENDING_MAX = 200_000  # samples of one chunk: more mean that the clock stands 
 
 class Interruption(NamedTuple):
     """
-    A break in the stamps, which ends a dwell.
+    An interruption of the stamps, which ends a dwell.
 
     Parameters
     ----------
@@ -50,9 +49,9 @@ class Interruption(NamedTuple):
         Last stamp before it [s].
     kind : {'gap', 'jump_back', 'stopped'}
         Samples are missing; time went back (a bag played again, simulated time reset); stamps
-        did not move while samples came.
+        did not change while samples came.
     seconds : float
-        How far the next stamp is from the last [s], negative for a jump back.
+        Difference of the next stamp to the last [s], negative for a jump back.
 
     """
 
@@ -68,14 +67,13 @@ class Chunks:
 
     Parameters
     ----------
-    sums : (ROW, m) array
-        Sums over the samples of each chunk; time relative to `epoch`, readings and rates
-        relative to `origin`.
+    sums : (m,) array of `sums.SUMS`
+        Time relative to `epoch`, readings and rates relative to `origin`.
     begin, end : (m,) array
         First and last stamp [s].
     step : (2, m) array
-        Smallest step between successive readings, and rates, that is not 0; infinite where
-        there is none, or none smaller than before.
+        Smallest step between successive readings, and rates, that is not 0; infinite if none is
+        smaller than before.
     epoch : float
         Start of the segment [s].
     origin : (6,) array
@@ -89,7 +87,7 @@ class Chunks:
 
     """
 
-    sums: Floats
+    sums: Records
     begin: Floats
     end: Floats
     step: Floats
@@ -101,7 +99,7 @@ class Chunks:
 
 
 def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
-    """Put chunks of one segment together."""
+    """Join chunks of the same segment."""
     parts: list[Chunks] = []
     for each in found:
         if each.fresh and parts:
@@ -115,14 +113,14 @@ def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
 def _one(parts: Sequence[Chunks]) -> Chunks:
     if len(parts) == 1:
         return parts[0]
-    return replace(parts[0], sums=np.concatenate([each.sums for each in parts], axis=1),
+    return replace(parts[0], sums=chained(*(each.sums for each in parts)),
                    begin=np.concatenate([each.begin for each in parts]),
                    end=np.concatenate([each.end for each in parts]),
                    step=np.concatenate([each.step for each in parts], axis=1))
 
 
 class Chunker:
-    """Turn samples into chunks, block after block; the same chunks whatever the blocks."""
+    """Turn blocks of samples into chunks, which do not depend on the blocks."""
 
     def __init__(self, settings: CaptureSettings) -> None:
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
@@ -136,25 +134,16 @@ class Chunker:
         self._fresh = True
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
 
-    @property
-    def boundary(self) -> float:
-        """Give the stamp that completes the chunk that is being filled [s]."""
-        if self._period < 0.0 or not self._pending.size:
-            return -np.inf
-        latest = max(self._latest, float(self._pending[0].max()))
-        index = np.floor((latest - self._epoch) / self._length)
-        return float(self._epoch + (index + 1.0) * self._length)
-
     def feed(self, samples: Floats, last: bool = False) -> list[Chunks]:
         """
-        Give the chunks that these samples complete.
+        Return the chunks that these samples complete.
 
         Parameters
         ----------
         samples : (k, n) array
-            Time [s] and reading, and, where k is more than 4, rate, and more than 7, context.
+            Time [s] and reading (k = 4), and rate (7), and context (9).
         last : bool
-            True if no more samples follow: a period is then learned from what is there.
+            True if no more samples follow: the period is then learned from those there are.
 
         """
         pending = _joined(self._pending, samples)
@@ -196,16 +185,16 @@ class Chunker:
         return True
 
     def _first_break(self, time: Floats) -> tuple[int, bool]:
-        """Give where the first break is, and whether the stamps before it are in order."""
-        gap = max(_GAP_SECONDS, _GAP_PERIODS * self._period)
+        """Return the index of the first interruption, and whether all stamps are in order."""
+        missing = max(_MISSING_SECONDS, _MISSING_PERIODS * self._period)
         step: Floats = time[1:] - time[:-1]
         first = time[0] - self._latest
-        if step.min(initial=first) >= 0.0 and step.max(initial=first) <= gap:
+        if step.min(initial=first) >= 0.0 and step.max(initial=first) <= missing:
             return len(time), True
         before = np.maximum.accumulate(np.concatenate([[self._latest], time]))[:-1]
         step = time - before
         back = max(_BACK_SECONDS, _BACK_PERIODS * self._period)
-        breaks = np.flatnonzero((step > gap) | (step < -back))
+        breaks = np.flatnonzero((step > missing) | (step < -back))
         if not len(breaks):
             return len(time), False
         cut = int(breaks[0])
@@ -252,7 +241,7 @@ class Chunker:
 
 
 def _joined(one: Floats, other: Floats) -> Floats:
-    """Give the samples of both; what only one of them has is NaN in the other."""
+    """Return the samples of both; what only one of them has is NaN in the other."""
     if not one.size:
         return other
     if len(one) != len(other):

@@ -2,21 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Noise of a mean when samples are correlated, and slopes that stand out of it.
+Noise of the mean of correlated samples, and significance of slopes.
 
-Both work on the means of K consecutive, equally long cells (chunks, or chunks joined).
+Both use the means of K consecutive cells of the same length (chunks, or joined chunks).
 
-**Slope.** Least squares over the cells: slope = Σ t x / Σ t², t centred. Were the samples
+**Slope.** Least squares over the cells: slope = Σ t x / Σ t², t centred. If the samples were
 independent, a cell mean would have the variance w = (variance of the samples) / (samples of a
-cell), and the slope w / Σ t². The residuals r tell by how much it is really more: their power
-over w, times (1 + ρ)/(1 - ρ) for a correlation ρ between neighbours (an AR(1) process has this
-sum of its correlations [1]_). Power and ρ are pooled over the axes, for which K cells of one
-axis are too few, and are never taken below those of white noise.
+cell), and the slope w / Σ t². The residuals r show the factor on it: their power over w, times
+(1 + ρ)/(1 - ρ) for a correlation ρ between neighbours (an AR(1) process has this sum of its
+correlations [1]_). Power and ρ are pooled over the axes, because K cells of one axis are too few,
+and are at least those of white noise.
 
 **Mean.** The variance of the mean of a correlated series is the sum of its autocovariances
-over its length. Sample autocovariances are noise at long lags; the sum is therefore stopped
-where a pair Γ_j = γ_2j + γ_2j+1 is no longer positive, the initial positive sequence of Geyer
-[2]_. Taking off the mean takes the variance of the mean from each; it is put back.
+over its length. Sample autocovariances at long lags are noise; the sum therefore ends where a
+pair Γ_j = γ_2j + γ_2j+1 is no longer positive, the initial positive sequence of Geyer [2]_.
+Subtracting the mean removes the variance of the mean from each; it is added again.
 
 References
 ----------
@@ -40,18 +40,18 @@ _TINY = 1e-300
 
 class Trend(NamedTuple):
     """
-    A slope over cells, and how it stands to its noise.
+    A slope over cells, and its significance.
 
     Parameters
     ----------
     slope : (3, ...) array
-        Unit of the cells per second.
+        In the unit of the cells per second.
     strength : (...) array
         Sum over the axes of (slope / its standard error)².
     excess : (...) array
         Variance of a mean over that of white noise, at least 1.
     error : (...) array
-        Standard error of the slope, were the samples independent, where it is largest.
+        Standard error of the slope for independent samples, of the noisiest axis.
 
     """
 
@@ -63,16 +63,16 @@ class Trend(NamedTuple):
 
 def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     """
-    Give slopes with how they stand to their noise.
+    Return slopes with their significance.
 
     Parameters
     ----------
     line : Line
-        Lines through cells, (3, ...): three axes are taken together.
+        Lines through cells, (3, ...).
     spacing : float or array
-        Time from cell to cell [s].
+        Time between cells [s].
     white : (3, ...) array
-        Variance of a cell mean, were the samples independent.
+        Variance of a cell mean for independent samples.
 
     """
     size = line.length
@@ -95,21 +95,21 @@ def _over_axes(values: Floats) -> Floats:
 
 def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
-    Give the variance of the mean of each series of cells over that of white noise.
+    Return the variance of the mean of each series of cells over that of white noise.
 
     Parameters
     ----------
     centred : (3, k, K) array
-        Means of consecutive cells less their mean, and 0 after the end of a series.
+        Means of consecutive cells minus their mean, and 0 after the end of a series.
     sizes : (k,) array
         Lengths of the series.
     white : (3, k) array
-        Variance of a cell mean, were the samples independent; axes with 0 are left out.
+        Variance of a cell mean for independent samples; axes with 0 are left out.
 
     Returns
     -------
     (k,) array
-        The excess; 1 where there is too little to tell.
+        The excess; 1 for a series of fewer than 4 cells.
 
     """
     axes = white > 0.0
@@ -120,7 +120,7 @@ def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
 
 
 def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
-    """Give (k, lags) by the Fourier transform, padded so that no end meets the beginning."""
+    """Return (k, lags) by the Fourier transform, padded against wrapping around."""
     length = centred.shape[2]
     padded = 1 << (2 * length - 1).bit_length()
     power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)

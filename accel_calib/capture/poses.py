@@ -4,15 +4,15 @@
 """
 Dwells to poses, and recordings to poses.
 
-**Repeated poses.** Two poses whose readings lie within a chord c of each other differ in
-direction by 2 asin(c/2r), r the reading of 1 g; offsets cancel in the difference. In native
-units r is half the range of the poses' readings on the axis where it is widest: too small, and
-the angle too large, until the sensor has been turned over, so that too few poses count as
-repeated rather than too many.
+**Repeated poses.** Two poses whose readings have the distance c differ in direction by
+2 asin(c/2r), with r the reading of 1 g; offsets cancel in the difference. In native units r is
+half the range of the readings on the axis where it is largest. Until the sensor has been turned
+over this is too small and the angle too large, so too few poses count as repeated rather than too
+many.
 
 **Merging.** The mean of two readings on a sphere lies inside it: with weights w and 1 - w, by
-w (1 - w) c²/2r², which for 0.1 rad is 1.25 mg. Where 1 g is known the mean is moved out by as
-much. Weights are inverse variances of the means, and the merged std and count give the noise of
+w (1 - w) c²/2r², which for 0.1 rad is 1.25 mg. If 1 g is known, the mean is moved outwards by this
+much. Weights are inverse variances of the means, and std/√count of the merged pose is the noise of
 the weighted mean.
 
 """
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ from .settings import CaptureSettings
 from .sums import CONTEXT, WIDTH
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
-from ..units import Units
+from ..units import UnitName, Units
 
 _BLOCK = 1 << 14     # samples summed at a time: few enough to stay in the cache
 _AT_ONCE = 1 << 17   # samples judged at a time
@@ -41,7 +42,7 @@ _AT_ONCE = 1 << 17   # samples judged at a time
 @dataclass(frozen=True)
 class Captured:
     """
-    What was found in a recording.
+    The result of a capture.
 
     Parameters
     ----------
@@ -50,11 +51,11 @@ class Captured:
     samples : int
         Samples of the recording that the poses are averages of.
     threshold : float
-        Standard deviation below which a window was still in the end [unit of the readings].
+        Standard deviation below which a window was still at the end [unit of the readings].
     seconds : float
-        Time from the first to the last stamp of the recording, breaks left out [s].
+        Time from the first to the last stamp of the recording, without interruptions [s].
     interruptions : tuple of Interruption
-        Breaks in the stamps.
+        Interruptions of the stamps.
     recorded : int
         All samples of the recording.
 
@@ -77,7 +78,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     ----------
     recording : Recording, or an iterable of them
         The samples, whole or in blocks; ``rate``, ``temperature`` and ``supply_voltage`` are used
-        where present.
+        if they are there.
     units : Units
         Unit of the readings.
     settings : CaptureSettings
@@ -91,12 +92,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     Raises
     ------
     InputError
-        If a time, a reading or a rate is not finite.
+        If a time or a reading is not finite.
 
     """
     detector = StillDetector(settings, units, keep=None)
     spans: list[tuple[float, float]] = []
     recorded = 0
+    about: tuple[Literal[UnitName, ''], str] = ('', '')
     for part in [recording] if isinstance(recording, Recording) else recording:
         for start in range(0, len(part), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(part))
@@ -104,40 +106,39 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                          for first in range(start, stop, _BLOCK))
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
-            recorded += len(part)
+            recorded, about = recorded + len(part), (part.units, part.sensor)
     detector.close()
     dwells = select(detector.dwells(), settings, units)
     interruptions = detector.interruptions
     seconds = spans[-1][1] - spans[0][0] if spans else 0.0
-    return Captured(poses_from(dwells, settings), sum(each.samples for each in dwells),
+    poses = replace(poses_from(dwells, settings), units=about[0], sensor=about[1])
+    return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
                     interruptions, recorded)
 
 
 def _block(recording: Recording, start: int, stop: int) -> Floats:
-    """Give the columns of some samples: as many rows of WIDTH as there is something in."""
+    """Return the columns of some samples as rows, without the last rows if they have no value."""
     which = slice(start, stop)
     time = recording['time'][which]
     samples = np.empty((_width(recording), len(time)))
     samples[0] = time
     samples[1:4] = recording.reading[which].T
-    given = samples[:4]
+    samples[4:] = np.nan
     if 'rate' in recording:
-        given = samples[:7]
-        given[4:] = recording['rate'][which].T
-    samples[len(given):] = np.nan
+        samples[4:7] = recording['rate'][which].T
     for row, name in enumerate(CONTEXT, start=7):
         if name in recording:
             samples[row] = recording[name][which]
-    if not np.isfinite(given.sum()):
-        _refuse(given, recording.row[which])
+    if not np.isfinite(samples[:4].sum()):
+        _refuse(samples[:4], recording.row[which])
     return samples
 
 
 def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
     bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
     if len(bad):
-        message = f'row {row[bad[0]]} holds a time, reading or rate that is not a finite number'
+        message = f'row {row[bad[0]]} holds a time or reading that is not a finite number'
         raise InputError(message, 'remove that row, or repair the recording')
 
 
@@ -149,12 +150,12 @@ def _width(recording: Recording) -> int:
 
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
     """
-    Give the pose table of these dwells.
+    Return the pose table of these dwells.
 
-    ``orientation`` is among its columns if ``max_dwell`` cuts dwells.
+    It has the column ``orientation`` if ``max_dwell`` cuts dwells, and ``doubtful`` if any is.
 
     """
-    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
+    columns: dict[str, NDArray[Any]] = {
         'time': np.array([each.time for each in dwells], dtype=float),
         'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
         'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
@@ -164,17 +165,19 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
             columns[name] = np.array([each.context[name] for each in dwells])
     if np.isfinite(settings.max_dwell):
         columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
+    if any(each.doubtful for each in dwells):
+        columns['doubtful'] = np.array([each.doubtful for each in dwells], dtype=float)
     return Poses(columns, numbered(columns))
 
 
 def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> list[Dwell]:
-    """Keep, merge or refuse repeated dwells, as the settings ask."""
+    """Keep, merge or refuse repeated dwells, as set; doubtful ones are kept."""
     if settings.repeated == 'keep':
         return list(dwells)
     radius = _radius([each.mean for each in dwells], units)
     kept: list[Dwell] = []
     for dwell in dwells:
-        near = _nearest(dwell, kept, radius, settings)
+        near = None if dwell.doubtful else _nearest(dwell, kept, radius, settings)
         if near is None:
             kept.append(dwell)
         elif settings.repeated == 'merge':
@@ -182,18 +185,11 @@ def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> 
     return kept
 
 
-def is_new(dwell: Dwell, dwells: Sequence[Dwell], settings: CaptureSettings, units: Units
-           ) -> bool:
-    """Tell whether no earlier dwell lies within ``min_pose_angle`` of this one."""
-    radius = _radius([each.mean for each in (*dwells, dwell)], units)
-    return _nearest(dwell, dwells, radius, settings) is None
-
-
 def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     """
-    Give the weighted mean of two dwells in nearly the same direction.
+    Return the weighted mean of two dwells in nearly the same direction.
 
-    Time and context go by the samples; the orientation is that of the first.
+    Time and context are weighted by the samples; the orientation is that of the first.
 
     """
     weight = _weight(first, second)
@@ -228,8 +224,9 @@ def _radius(means: Sequence[Floats], units: Units) -> float:
 
 def _nearest(dwell: Dwell, others: Sequence[Dwell], radius: float, settings: CaptureSettings
              ) -> int | None:
-    """Give the index of the nearest other dwell, if it is within ``min_pose_angle``."""
+    """Return the index of the nearest other dwell, if it is within ``min_pose_angle``."""
     far = [float(np.linalg.norm(dwell.mean - each.mean))
-           if each.orientation != dwell.orientation else np.inf for each in others]
+           if each.orientation != dwell.orientation and not each.doubtful else np.inf
+           for each in others]
     reach = 2.0 * radius * np.sin(0.5 * settings.min_pose_angle)
     return int(np.argmin(far)) if far and min(far) < reach else None

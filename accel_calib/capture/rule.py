@@ -2,29 +2,29 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The rule for still, over chunks.
+The stillness rule, over chunks.
 
-A window is the last `CHUNKS_PER_WINDOW` chunks. It is still when
+A window is the last `CHUNKS_PER_WINDOW` chunks. It is still if
 
-1. the variance of each axis within it is below `VARIANCE_RATIO` times the sensor's own noise;
-2. where a rate is given, so is the variance of the rate. Its mean tells nothing, for gyros have
-   biases, unless the user set a limit;
-3. |mean reading| is near 1 g, where the unit of the readings is known;
-4. over the last `SLOPE_CHUNKS` there is no slope: none that stands out of its noise and that is
-   more than a tolerance which leaves room for the drift of a sensor that warms up. Turning at
-   0.5 °/s moves a reading by up to 8.7 mg/s and shows in no variance.
+1. the variance of each axis is below `VARIANCE_RATIO` times the sensor's own noise;
+2. the variance of the rate, if there is one, is below `RATE_RATIO` times its noise. The mean rate
+   is not used, because gyros have biases, unless the user sets a limit;
+3. |mean reading| is near 1 g, if the unit of the readings is known;
+4. there is no slope over the last `SLOPE_CHUNKS`: none that is significant and larger than the
+   drift of a sensor that warms up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s and
+   does not show in any variance.
 
 **The sensor's own noise** is the lower envelope of what was seen so far. The mean variance v of
 the windows in `LONG` chunks is known to about v √(2/dof), with dof = 2 n / (1 + excess) for n
 samples whose mean is `excess` times as noisy as that of independent samples (exact for white,
-and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), has been an upper
-bound of the noise wherever the sensor was still, and lies far above it where it moved; so its
-minimum so far is taken. It is never less than the resolution allows: a quantised reading that
-flips between two steps q has a variance of up to q²/4; the smallest step seen is q. Nor less
-than a millionth of the reading, for the sake of data without noise.
+and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), is an upper bound of
+the noise if the sensor is still, and far above it if it moves; so its minimum so far is used. It
+is raised to what the resolution allows: a quantised reading that flips between two steps of
+height q has a variance of up to q²/4, and q is the smallest step seen. It is also at least a
+millionth of the reading, for data without noise.
 
-Before there is any reference, and for very noisy starts, the unit of the readings gives one: no
-sensor with a standard deviation above `STD_CAP_G` is called still.
+Before the noise is known, the unit of the readings sets a limit: a sensor with a standard
+deviation above `STD_CAP_G` is not still.
 
 """
 
@@ -38,8 +38,17 @@ from numpy.typing import NDArray
 from .chunks import Chunks
 from .noise import Trend
 from .settings import CaptureSettings
-from .sums import FIRST, ROW
-from .window import at_least, clipped, granted, rounding, Stretch, stretch, windows
+from .sums import blank, chained, SUMS
+from .window import (
+    at_least,
+    at_least_any,
+    clipped,
+    columns_of,
+    rounding,
+    Stretch,
+    stretch,
+    windows,
+)
 from ..table import Floats
 from ..units import Units
 
@@ -47,61 +56,61 @@ LONG = 12
 """Chunks over which the noise is judged."""
 
 SLOPE_CHUNKS = (LONG, 3 * LONG)
-"""Chunks over which slopes are sought: the longer, the smaller ones show in a noisy sensor."""
+"""Chunks over which slopes are sought; a longer stretch shows smaller slopes."""
 
 HORIZON = max(SLOPE_CHUNKS)
-"""Chunks after which nothing that follows changes the verdict on one."""
+"""Number of chunks after which the verdict on a chunk is final."""
 
 VARIANCE_RATIO = 12.0
-"""Variance of a window over the noise: windows are short, and cutting a dwell in two is bad."""
+"""Largest variance of a window over the noise: windows are short, and their variances scatter."""
 
 RATE_RATIO = 900.0
-"""The same for the rate: a gyro feels shaking that an average over a dwell does not."""
+"""The same for the rate: a gyro shows shaking that does not change the mean of a dwell."""
 
 STD_CAP_G = 0.15
-"""Largest standard deviation that the adaptive threshold takes [g]."""
+"""Largest adaptive threshold [g], as standard deviation."""
 
 SHAKING_G = 0.06
-"""Shaking beside the noise that the adaptive threshold takes [g], for a noisy sensor."""
+"""Largest shaking beside the noise of a noisy sensor [g], as standard deviation."""
 
 SLOPE_G = 4e-3
-"""Slope within a dwell that is let pass [g/s]: a sensor that settles on a soft base."""
+"""Largest slope within a dwell [g/s]: a sensor that settles on a soft base."""
 
 DWELL_SLOPE_G = 2e-3
-"""Slope through a dwell that is let pass [g/s]: 0.11 °/s; warming up gives some 1e-5 g/s."""
+"""Largest slope of a whole dwell [g/s]: 0.11 °/s; warming up causes some 1e-5 g/s."""
 
 TURN_G = 8.7e-3
-"""Slope below which a dwell has to be to be sure to rest [g/s]: turning at 0.5 °/s."""
+"""Slope that a dwell must exclude [g/s]: turning at 0.5 °/s."""
 
 SURE = 2.33
-"""Standard errors below it: a dwell that is turned passes in 1 % of the cases."""
+"""Distance from it in standard errors: a dwell that is turned passes in 1 % of the cases."""
 
 SLOPE_NOISE = 0.1
-"""The same in standard deviations of the samples per second, for a sensor not turned yet."""
+"""Largest slope in standard deviations of the samples per second, if 1 g is not known yet."""
 
 STRENGTH = 40.0
-"""A slope stands out if the sum of its squared scores over 3 axes is above: p about 1e-6."""
+"""A slope is significant if the sum of its squared scores over 3 axes is larger: p ≈ 1e-6."""
 
 WEAK_STRENGTH = 8.0
-"""The same for a stretch next to a slope, which was not found there: p about 0.05."""
+"""The same for a stretch next to a significant slope, where it may continue: p ≈ 0.05."""
 
 
 class Judged(NamedTuple):
     """
-    Chunks with what the rule says of the window that ends with each.
+    Chunks with the verdict on the window that ends with each.
 
     Parameters
     ----------
     chunks : Chunks
         The chunks.
     level : (6, m) array
-        Variance within the window, of reading and rate; NaN where not known.
+        Variance within the window, of reading and rate; NaN if not known.
     limit : (6, m) array
-        What the variance had to be below.
+        Largest variance of a still window.
     still : (m,) array of bool
-        The rule.
+        The verdict.
     trending : (m,) array of int
-        Where a slope was the reason, the number of chunks it was seen over; otherwise 0.
+        Number of chunks over which there is a slope; 0 if there is none.
 
     """
 
@@ -113,7 +122,7 @@ class Judged(NamedTuple):
 
 
 class Rule:
-    """The rule and its memory: the last chunks, the noise and the resolution seen so far."""
+    """The rule with its memory: the last chunks, and noise and resolution so far."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings = settings
@@ -122,45 +131,45 @@ class Rule:
         self._lowest = np.full(3, np.inf)
         self._highest = np.full(3, -np.inf)
         self._axes = 3
-        self._before = np.full((ROW, HORIZON - 1), np.nan)
+        self._before = blank(SUMS, HORIZON - 1)
         self._floor = np.full(6, np.inf)
         self._step = np.full(2, np.inf)
 
     @property
     def scale(self) -> float:
-        """Give the reading of 1 g; for native units half the range of the readings at rest."""
+        """Return the reading of 1 g; for native units half the range of the readings at rest."""
         if self.known:
             return self._per_g
         return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
 
     def noise_of(self, mean: Floats) -> Floats:
         """
-        Give the variance of the sensor's own noise, as known now, for (6, n) means.
+        Return the variance of the sensor's own noise, as known now, for (6, n) means.
 
         Infinite before anything is known.
 
         """
         axes = len(mean)
         noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
-        return granted(noise, np.asarray(self.scale))
+        return at_least_any(noise, np.asarray(self.scale))
 
     def rounding(self, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
         """
-        Give what rounding does to samples and to their mean.
+        Return the effect of rounding on samples and on their mean.
 
         Returns
         -------
         std : (n,) array
-            Standard deviation of the rounding of a sample; more than 0 in any case.
+            Standard deviation of the rounding of a sample; always above 0.
         variance : (3, n) array
-            Of the error of the mean that averaging does not remove.
+            Variance of the error of the mean that averaging does not remove.
 
         """
         return rounding(float(self._step[0]), self._floor[:3, np.newaxis], mean, std)
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
-        """Give the (3 or 6, n) largest variances of a still window at this noise."""
+        """Return the (3 or 6, n) largest variances of a still window at this noise."""
         limit = noise * ratio
         limit[3:] = noise[3:] * rate_ratio
         if self.known:
@@ -174,20 +183,20 @@ class Rule:
     def feed(self, chunks: Chunks) -> Judged:
         """Judge consecutive chunks."""
         if chunks.fresh:
-            self._before = np.full((ROW, HORIZON - 1), np.nan)
-        rows = np.concatenate([self._before, chunks.sums], axis=1)
-        self._before = rows[:, rows.shape[1] - HORIZON + 1:].copy()
-        if self._axes == 3 and np.isfinite(rows[FIRST.start + 3]).any():
+            self._before = blank(SUMS, HORIZON - 1)
+        sums = chained(self._before, chunks.sums)
+        self._before = sums[len(sums) - HORIZON + 1:].copy()
+        if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
-        size = chunks.sums.shape[1]
-        mean, level = windows(rows, self._axes)
+        size, columns = len(chunks.sums), columns_of(sums, self._axes)
+        mean, level = windows(columns)
         mean = mean[:, -size:] + chunks.origin[:self._axes, np.newaxis]
         recent = level[:, -size:]
-        seen = {length: stretch(rows, level, length, size, chunks.length)
+        seen = {length: stretch(columns, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
         noise = self._learn(seen[LONG], mean, chunks.step)
         scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0))
-        limit = self.limit_of(granted(noise, scale))
+        limit = self.limit_of(at_least_any(noise, scale))
         trending = np.zeros(size, dtype=np.intp)
         for length, each in seen.items():
             calm = np.all(each.highest <= limit[:3], axis=0)
@@ -199,7 +208,7 @@ class Rule:
               strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
               ) -> NDArray[np.bool_]:
         """
-        Tell whether a slope stands out of its noise and is more than a drift.
+        Return whether a slope is significant and more than a drift.
 
         Parameters
         ----------
@@ -208,11 +217,11 @@ class Rule:
         scale : (...) array
             Reading of 1 g.
         variance : (3, ...) array
-            Of the samples.
+            Variance of the samples.
         strength : float or array
-            What stands out.
+            Strength from which it is significant.
         drift_g : float
-            What passes as a drift [g/s].
+            Largest drift [g/s].
 
         """
         drift = drift_g * scale
@@ -222,7 +231,7 @@ class Rule:
         return np.asarray(large & (found.strength > strength))
 
     def rests(self, found: Trend, excess: Floats) -> NDArray[np.bool_]:
-        """Tell whether dwells show that they were not turned slowly: see `TURN_G`."""
+        """Return whether dwells exclude that they were turned slowly: see `TURN_G`."""
         size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
         return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
 
@@ -260,7 +269,7 @@ class Rule:
 
 
 def _six(values: Floats, rest: float) -> Floats:
-    """Give (6, m) values; those of a rate that is not given are `rest`."""
+    """Return (6, m) values; those of a missing rate are `rest`."""
     if len(values) == 6:
         return values
     return np.concatenate([values, np.full_like(values, rest)])

@@ -1,13 +1,19 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the capture of still poses can be told, with its defaults."""
+"""Settings of the capture of still poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 import math
-from typing import get_args, Literal
+from typing import Any, get_args, Literal
+
+import numpy as np
+
+from ..errors import InputError
+from ..units import Units
 
 Repeated = Literal['keep', 'merge', 'refuse']
 REPEATED: tuple[str, ...] = get_args(Repeated)
@@ -23,26 +29,26 @@ class CaptureSettings:
     still_window : float
         Length of the sliding window [s]. At low rates it grows until it holds ten samples.
     still_std_max : float
-        Largest standard deviation of a still sensor's samples, by axis; in g where the unit of
+        Largest standard deviation of the samples of a still sensor, by axis; in g if the unit of
         the readings is known, otherwise in native units. 0: adapt to the sensor's own noise.
     still_gyro_max : float
-        Largest magnitude of the mean angular rate [rad/s]; 0: the mean is not looked at, for
-        gyros have biases and may be in counts.
+        Largest magnitude of the mean angular rate [rad/s]. 0: not checked, because gyros have
+        biases and may be in counts.
     still_norm_tolerance : float
-        Largest distance of |mean| from 1 g [g]; not used for native units. Wide, for the
+        Largest distance of |mean| from 1 g [g]; not used for native units. Wide, because the
         sensor is not calibrated yet.
     min_dwell : float
-        Shortest dwell that makes a pose [s], edges trimmed. At low rates it grows until it
+        Shortest dwell that makes a pose [s], without its edges. At low rates it grows until it
         holds sixteen samples.
     max_dwell : float
         A longer dwell is cut into poses of this length [s] that share their ``orientation``;
-        use it where temperature moves during a dwell. Infinite: one pose a dwell.
+        for a temperature that changes during a dwell. Infinite: one pose per dwell.
     min_pose_angle : float
         Poses of different dwells within this angle count as repeated [rad].
     repeated : {'keep', 'merge', 'refuse'}
-        What becomes of a repeated pose: kept as it is, averaged with the earlier one, or left
-        out. Kept by default: the fit weighs poses by their noise, and effects of temperature
-        and of time show only in orientations that were visited again.
+        Whether a repeated pose is kept, averaged with the earlier one, or left out. Kept by
+        default: the fit weighs poses by their noise, and effects of temperature and time show
+        only in orientations that are repeated.
 
     """
 
@@ -69,3 +75,34 @@ class CaptureSettings:
     def _check(self, name: str, good: bool, expected: str) -> None:
         if not good:
             raise ValueError(f'{name} is {getattr(self, name)!r}, expected {expected}')
+
+
+def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
+    """
+    Return the settings that a user gave, the others with their defaults.
+
+    Parameters
+    ----------
+    given : mapping of str to object
+        By the names of `CaptureSettings`; ``still_std_max`` in the unit of the readings.
+    units : Units
+        That unit.
+
+    Raises
+    ------
+    InputError
+        If a name is not known, or a value is out of range.
+
+    """
+    names = [each.name for each in fields(CaptureSettings)]
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise InputError(f'{unknown[0]} is not a setting of the capture',
+                         f'give one of {", ".join(names)}')
+    known = dict(given)
+    if 'still_std_max' in known:
+        known['still_std_max'] = float(units.to_g(np.asarray(known['still_std_max'])))
+    try:
+        return CaptureSettings(**known)
+    except ValueError as err:
+        raise InputError(str(err), 'change that setting') from err

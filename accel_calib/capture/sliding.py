@@ -4,8 +4,8 @@
 """
 Sums, maxima and slopes over sliding windows, at a cost that grows with the logarithm of length.
 
-A window of L is put together from windows of 1, 2, 4, …, so that what comes out for a window
-depends on its own values alone, whatever stands before it and wherever a block ends.
+A window of L is composed of windows of 1, 2, 4, …, so the result of a window depends on its own
+values alone, not on the values before it or on where a block ends.
 
 **Slope.** With k = 0 … L-1 and t = k - (L-1)/2 the least squares slope is Σ t x / Σ t², from
 Σ x and Σ k x. The power of the residuals r and the product of neighbours follow without the
@@ -34,7 +34,7 @@ class Line(NamedTuple):
     Parameters
     ----------
     slope : (..., n) array
-        By step.
+        Per step.
     square, neighbours : (..., n) array
         Sum of the squared residuals, and of the products of neighbours.
     time_square : float or array
@@ -52,17 +52,17 @@ class Line(NamedTuple):
 
 
 def sliding_sum(values: Floats, length: int) -> Floats:
-    """Give the sums over windows of this length along the last axis: (..., n - length + 1)."""
+    """Return the sums over windows of this length along the last axis: (..., n - length + 1)."""
     return _folded(values, length, np.add)
 
 
 def sliding_max(values: Floats, length: int) -> Floats:
-    """Give the maxima over windows of this length."""
+    """Return the maxima over windows of this length."""
     return _folded(values, length, np.maximum)
 
 
 def lines(values: Floats, length: int) -> Line:
-    """Give the lines through all windows of this length, (axes, n - length + 1)."""
+    """Return the lines through all windows of this length, (axes, n - length + 1)."""
     if values.shape[-1] == length:
         centred = values - values.sum(axis=1, keepdims=True) / length
         return lines_through(centred[:, np.newaxis], np.array([length]))
@@ -75,7 +75,7 @@ def lines(values: Floats, length: int) -> Line:
     moment = weighted - 0.5 * (length - 1) * total
     slope = moment / time_square
     mean = total / length
-    # Both are measured from the mean: the digits of a small noise on a large level are lost once.
+    # Both relative to the mean: the digits of a small noise on a large level are lost only once.
     square -= total * mean
     square -= slope * moment
     product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
@@ -87,12 +87,12 @@ def lines(values: Floats, length: int) -> Line:
 
 def lines_through(centred: Floats, sizes: Floats) -> Line:
     """
-    Give one line through each series, by its residuals.
+    Return one line through each series.
 
     Parameters
     ----------
     centred : (axes, k, K) array
-        Values less their mean, and 0 after the end of a series.
+        Values minus their mean, and 0 after the end of a series.
     sizes : (k,) array
         Lengths of the series.
 
@@ -123,7 +123,7 @@ def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats
 
 
 def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
-    """Give Σ x and Σ k x over the windows."""
+    """Return Σ x and Σ k x over the windows."""
     count = values.shape[-1] - length + 1
     weighted = np.zeros_like(values)
     total_found = np.zeros((*values.shape[:-1], count))

@@ -1,9 +1,11 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One row of sums for each chunk of samples, and what its columns are."""
+"""Sums over the samples of a chunk, one record per chunk; the sum of records is of all chunks."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,27 +14,50 @@ from ..table import Floats
 
 Indices = NDArray[np.intp]
 
+Records = NDArray[Any]
+"""One-dimensional structured array."""
+
 CONTEXT = ('temperature', 'supply_voltage')
 """Columns of `accel_calib.table.COLUMNS` that are averaged beside reading and rate."""
 
 WIDTH = 7 + len(CONTEXT)
-"""Columns of a sample: time, reading, rate (NaN: none), context (NaN: none)."""
+"""Numbers of a sample: time, reading, rate (NaN: none), context (NaN: none)."""
 
 CHUNKS_PER_WINDOW = 5
 
-# Columns of a row of sums, over the samples of a chunk.
-COUNT = 0
-TIME = 1
-FIRST = slice(2, 8)
-SECOND = slice(8, 14)
-CONTEXT_COUNT = slice(14, 16)
-CONTEXT_SUM = slice(16, 18)
-ROW = 18
+SUMS = np.dtype([
+    ('count', float),             # samples
+    ('time', float),              # of the stamps, relative to the epoch [s]
+    ('first', float, 6),          # of reading and rate, relative to the origin
+    ('second', float, 6),         # of their squares
+    ('context_count', float, 2),  # samples that have the context
+    ('context_sum', float, 2)])
 
 
-def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Floats:
+def blank(kind: np.dtype[Any], count: int) -> Records:
+    """Return records with all numbers NaN."""
+    return np.full(count * (kind.itemsize // 8), np.nan).view(kind)
+
+
+def chained(*parts: Records) -> Records:
+    """Return records behind each other; `numpy.concatenate` copies them field by field."""
+    filled = [part for part in parts if len(part)] or list(parts[:1])
+    if len(filled) == 1:
+        return filled[0]
+    kind = filled[0].dtype
+    return np.concatenate([part.view(f'V{kind.itemsize}') for part in filled]).view(kind)
+
+
+def summed(records: Records, size: int) -> Records:
+    """Return the sums over each `size` consecutive records of floats."""
+    numbers = np.ascontiguousarray(records).view(float).reshape(-1, size,
+                                                                records.dtype.itemsize // 8)
+    return numbers.sum(axis=1).view(records.dtype)[:, 0]
+
+
+def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Records:
     """
-    Give the (ROW, m) sums over the samples from each start to the next.
+    Return the sums over the samples from each start to the next.
 
     Parameters
     ----------
@@ -41,32 +66,37 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> F
     starts : (m,) array of int
         First samples of the chunks.
     epoch, origin : float, (6,) array
-        What time, and reading and rate, are relative to.
+        Subtracted from time, and from reading and rate.
+
+    Returns
+    -------
+    (m,) array of SUMS
+        Rates are NaN if there are none.
 
     """
-    sums = np.full((ROW, len(starts)), np.nan)
-    sums[CONTEXT_COUNT] = sums[CONTEXT_SUM] = 0.0
+    sums = blank(SUMS, len(starts))
+    sums['context_count'] = sums['context_sum'] = 0.0
     if not len(starts):
         return sums
-    sums[COUNT] = np.diff(starts, append=samples.shape[1])
-    sums[TIME] = np.add.reduceat(samples[0] - epoch, starts)
+    sums['count'] = np.diff(starts, append=samples.shape[1])
+    sums['time'] = np.add.reduceat(samples[0] - epoch, starts)
     values = min(len(samples), 7) - 1
     centred = samples[1:1 + values] - origin[:values, np.newaxis]
-    sums[FIRST.start:FIRST.start + values] = np.add.reduceat(centred, starts, axis=1)
+    sums['first'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
     np.multiply(centred, centred, out=centred)
-    sums[SECOND.start:SECOND.start + values] = np.add.reduceat(centred, starts, axis=1)
+    sums['second'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
     if len(samples) == WIDTH:
         known = np.isfinite(samples[7:])
-        sums[CONTEXT_COUNT] = np.add.reduceat(known.astype(float), starts, axis=1)
-        sums[CONTEXT_SUM] = np.add.reduceat(np.where(known, samples[7:], 0.0), starts, axis=1)
+        sums['context_count'] = np.add.reduceat(known.astype(float), starts, axis=1).T
+        sums['context_sum'] = np.add.reduceat(np.where(known, samples[7:], 0.0), starts, axis=1).T
     return sums
 
 
 def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
     """
-    Give the (m,) smallest steps within chunks that are not 0, where they are below `least`.
+    Return the (m,) smallest steps within chunks that are not 0, if they are below `least`.
 
-    Infinity elsewhere: only a new smallest one matters, and it shows at a glance.
+    Infinity otherwise: only a new smallest step matters.
 
     """
     step = np.abs(values[:, 1:] - values[:, :-1])

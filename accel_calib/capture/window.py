@@ -1,35 +1,60 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Windows over chunks: their means, variances and slopes, and the least variance."""
+"""Windows over chunks: their means, variances and slopes, and the least variance allowed."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .noise import strength_of, Trend
 from .sliding import lines, sliding_max, sliding_sum
-from .sums import CHUNKS_PER_WINDOW, COUNT, FIRST, SECOND
+from .sums import CHUNKS_PER_WINDOW, Records
 from ..table import Floats
 
 RELATIVE = 1e-6
-"""Standard deviation over the size of a reading that is granted to data without noise."""
+"""Least standard deviation over the size of a reading, for data without noise."""
 
 STD_FLOOR_G = 3.3e-4
-"""Noise that is granted to any sensor [g]: smaller shaking does no harm."""
+"""Least noise of any sensor [g]: smaller shaking does no harm."""
 
 _DIGITS = 1e-14
-"""Of the square of a reading: what differences of sums may be wrong by."""
+"""Rounding error of differences of sums, over the square of a reading."""
 
 
-def windows(rows: Floats, axes: int) -> tuple[Floats, Floats]:
-    """Give mean and variance of the windows that end with each chunk, (axes, n)."""
-    count = sliding_sum(rows[COUNT], CHUNKS_PER_WINDOW)
-    first = sliding_sum(rows[FIRST.start:FIRST.start + axes], CHUNKS_PER_WINDOW)
-    level = sliding_sum(rows[SECOND.start:SECOND.start + axes], CHUNKS_PER_WINDOW)
+@dataclass(frozen=True)
+class Columns:
+    """
+    Sums of chunks as contiguous arrays.
+
+    Parameters
+    ----------
+    count : (n,) array
+        Samples.
+    first, second : (axes, n) array
+        Sums of reading and rate, and of their squares.
+
+    """
+
+    count: Floats
+    first: Floats
+    second: Floats
+
+
+def columns_of(sums: Records, axes: int) -> Columns:
+    """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
+    first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
+    return Columns(sums['count'].copy(), first, second)
+
+
+def windows(sums: Columns) -> tuple[Floats, Floats]:
+    """Return mean and variance of the windows that end with each chunk, (axes, n)."""
+    count = sliding_sum(sums.count, CHUNKS_PER_WINDOW)
+    first = sliding_sum(sums.first, CHUNKS_PER_WINDOW)
+    level = sliding_sum(sums.second, CHUNKS_PER_WINDOW)
     mean = first / count
     level -= first * mean
     np.maximum(level, 0.0, out=level)
@@ -37,22 +62,23 @@ def windows(rows: Floats, axes: int) -> tuple[Floats, Floats]:
     return mean, level
 
 
-class Stretch(NamedTuple):
+@dataclass(frozen=True)
+class Stretch:
     """
-    What was over the last chunks before each.
+    The last chunks before each chunk.
 
     Parameters
     ----------
     trend : Trend
         Slopes of the reading, (3, m).
     excess : (groups, m) array
-        As that of the trend, of reading and rate.
+        Excess of the noise of a mean, of reading and rate; see `noise`.
     variance : (axes, m) array
-        Mean of the windows' variances.
+        Mean of the variances of the windows.
     highest : (3, m) array
-        Highest of them, of the reading.
+        Largest of them, of the reading.
     samples : (m,) array
-        Samples.
+        Number of samples.
 
     """
 
@@ -63,15 +89,15 @@ class Stretch(NamedTuple):
     samples: Floats
 
 
-def stretch(rows: Floats, level: Floats, length: int, size: int, spacing: float) -> Stretch:
-    """Give what was over so many chunks, for the last `size` ones."""
-    axes = len(level)
-    rows = rows[:, rows.shape[1] - size - length + 1:]
+def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+    """Return the figures over the last `length` chunks, at each of the last `size` chunks."""
+    start = len(sums.count) - size - length + 1
+    counts, first = sums.count[start:], sums.first[:, start:]
     inner = length - CHUNKS_PER_WINDOW + 1
     level = level[:, level.shape[1] - size - inner + 1:]
     variance = sliding_sum(level, inner) / inner
-    count = sliding_sum(rows[COUNT], length)
-    cells = rows[FIRST.start:FIRST.start + axes] / rows[COUNT]
+    count = sliding_sum(counts, length)
+    cells = first / counts
     white = variance * (length / count)
     square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
     white += _DIGITS * square.repeat(3, axis=0)
@@ -84,13 +110,13 @@ def stretch(rows: Floats, level: Floats, length: int, size: int, spacing: float)
 
 
 def _grouped(values: Floats) -> Floats:
-    """Give (3, groups, n) of (axes, n)."""
+    """Return (axes, n) as (3, groups, n)."""
     return values.reshape(-1, 3, values.shape[-1]).swapaxes(0, 1)
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
     """
-    Give variances not less than the resolution and the size of the mean allow.
+    Return variances, raised to what resolution and size of the mean allow.
 
     Parameters
     ----------
@@ -109,13 +135,13 @@ def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
 
 
 def _tiny(mean: Floats) -> Floats:
-    """Give (groups, n) variances that are granted to data without noise."""
+    """Return the (groups, n) least variances, for data without noise."""
     square = (mean * mean).reshape((-1, 3, *mean.shape[1:]))
     return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
 
 
 def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
-    """Tell which axes are constant while another varies by more than rounding: no noise."""
+    """Return which axes are constant while another varies by more than rounding."""
     reading = mean[:3]
     tiny = _tiny(reading)
     least = at_least(np.zeros_like(reading), step, reading)
@@ -123,15 +149,15 @@ def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
     return np.asarray(constant & np.any(average[:3] > 2.0 * least, axis=0))
 
 
-def granted(noise: Floats, scale: Floats) -> Floats:
-    """Give (axes, n) variances, those of the reading not less than is granted to any sensor."""
+def at_least_any(noise: Floats, scale: Floats) -> Floats:
+    """Return (axes, n) variances, those of the reading raised to the least of any sensor."""
     found = noise.copy()
     found[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
     return found
 
 
 def rounding(step: float, floor: Floats, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
-    """Give what steps of the reading do to samples and to their mean; see `Rule.rounding`."""
+    """Return the effect of rounding on samples and on their mean; see `Rule.rounding`."""
     step = step if np.isfinite(step) else 0.0
     tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
     square = step**2 / 12.0

@@ -10,9 +10,16 @@ from pathlib import Path
 
 from . import options
 from .progress import progress
-from ..calibrate import Calibration, check_units
+from ..calibrate import Calibration, check_units, of_samples
 from ..errors import InputError
-from ..files import correct_bag, is_bag, read_calibration, read_samples, write_table
+from ..files import (
+    check_sensor,
+    correct_bag,
+    is_bag,
+    read_calibration,
+    read_samples,
+    write_table,
+)
 
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
 
@@ -26,28 +33,34 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='stored calibration')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
                       help='a CSV table, or a new bag of the kind of the recording')
-    made.add_argument('--topic', default='', help='Imu topic, where a bag has several')
+    made.add_argument('--topic', default='', help='Imu topic, for a bag with several')
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Correct and say how many samples there were."""
+    """Correct, and report the number of samples."""
     calibration = read_calibration(args.calibration)
     if is_bag(args.recording):
-        with progress('messages') as told:
-            count = correct_bag(args.recording, calibration, args.output, args.topic, told)
+        with progress('messages') as moved:
+            count = correct_bag(args.recording, calibration, args.output, args.topic, moved)
     else:
         count = _correct_table(args.recording, calibration, args.output)
-    options.say(args).print(f'{count} samples corrected, stored in {args.output}', markup=False)
+    options.console(args).print(f'{count} samples corrected, stored in {args.output}',
+                                markup=False)
     return 0
 
 
 def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
     if out.exists() and out.samefile(path):
-        raise InputError(f'{out} is the recording itself', 'give another name')
+        raise InputError(f'{out} is the recording itself', 'give a new name')
     recording = read_samples(path)
     check_units(recording, calibration.units)
-    columns = {'reading': calibration.correct(recording.reading, recording.columns)}
+    check_sensor(calibration, recording.sensor)
+    if recording.units not in ('', calibration.units.name):
+        raise InputError(f'{path} is in {recording.units}, the calibration is for readings in '
+                         f'{calibration.units.name}', 'give a recording in that unit')
+    known = of_samples(recording.columns, len(recording))
+    columns = {'reading': calibration.correct(recording.reading, known)}
     if 'rate' in recording:
         columns['rate'] = recording['rate'] @ calibration.model.rotation
     write_table(out, recording.with_columns(**columns))

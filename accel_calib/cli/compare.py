@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from . import options
-from ..calibrate import compare, Comparison, LEVEL
+from ..compare import compare, Comparison, LEVEL
 from ..errors import AccelCalibError
 from ..files import read_calibration
 from ..units import MG
@@ -33,7 +33,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare and say what came out."""
+    """Compare, and report the result."""
     try:
         calibrations = [read_calibration(path) for path in args.calibrations]
         comparison = compare(calibrations)
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dict[str, Any]:
-    """Give the result in the names of the documentation."""
+    """Return the result with the keys of the documentation."""
     outlier = comparison.outlier
     return {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
             'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
@@ -55,32 +55,32 @@ def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dic
 
 
 def _show(args: argparse.Namespace, models: list[str], comparison: Comparison) -> None:
-    """Tell a person what came out."""
-    console = options.say(args)
+    """Print the result."""
+    console = options.console(args)
     console.print(_runs_table(args.calibrations, models, comparison))
     console.print(_parameters_table(comparison))
     for note in comparison.notes:
         console.print(f'note: {note}', markup=False)
     if comparison.tilt_deg is not None:
-        console.print(f'the levelled ones differ by up to {comparison.tilt_deg:.3g}° in what is '
-                      'up; that has no part in the answer')
+        console.print(f'the directions of up of the levelled ones differ by up to '
+                      f'{comparison.tilt_deg:.3g}°; the test does not use them')
     console.print(_answer(comparison), markup=False)
 
 
 def _answer(comparison: Comparison) -> str:
-    """Say in a line whether they agree."""
-    sure = f'p = {comparison.p_value:.2g}; below {LEVEL:g} they do not'
+    """Return in a line whether they agree."""
+    sure = f'p = {comparison.p_value:.2g}; they do not if p is below {LEVEL:g}'
     if comparison.agree:
         return f'The calibrations agree within their uncertainties ({sure}).'
     if comparison.outlier is None:
-        more = '' if len(comparison.runs) > 2 else '; a third run would tell which is off'
+        more = '' if len(comparison.runs) > 2 else '; a third run would show which one differs'
         return f'The calibrations do not agree ({sure}){more}.'
     return (f'The calibrations do not agree ({sure}): run {comparison.outlier + 1} differs, the '
             'others agree.')
 
 
 def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) -> Any:
-    """Give each run against the others."""
+    """Return a table of each run against the others."""
     from rich.table import Table
 
     table = Table(title='Corrected |a| against the mean of the others, over all directions')
@@ -95,7 +95,7 @@ def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) ->
 
 
 def _parameters_table(comparison: Comparison) -> Any:
-    """Give the spread of each parameter."""
+    """Return a table of the spread of each parameter."""
     from rich.table import Table
 
     table = Table(title='Spread of the parameters over the runs')

@@ -26,14 +26,14 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run simulator and calibrator in processes of their own and show what comes of it."""
+    """Run simulator and calibrator in processes of their own, and show the result."""
     try:
         from ..ros.demo import demonstrate
     except ImportError as err:
-        raise InputError(f'ROS 2 is not here ({err}), the demonstration needs it',
+        raise InputError(f'ROS 2 is not installed ({err}), the demonstration needs it',
                          "source /opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'"
                          ) from err
-    console = options.say(args)
+    console = options.console(args)
     outcome = asdict(demonstrate(lambda line: console.print(line, markup=False)))
     options.write_json(args.json, outcome)
     console.print(_table(outcome))

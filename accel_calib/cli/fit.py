@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..calibrate import (
     Calibration,
     fit_poses,
     FRAMES,
-    level,
+    level_by_rows,
     METHODS,
     MODEL_NAMES,
     outlook,
@@ -34,20 +33,26 @@ def add_to(made: argparse.ArgumentParser) -> None:
     options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help='where to store the calibration (YAML); a folder for several POSES')
+                      help='file of the calibration (YAML); a folder for several POSES')
     made.add_argument('--model', choices=MODEL_NAMES, default='auto',
                       help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
                       'cross-axis; 12: known orientation; auto (default): the smallest that the '
-                      'data call for')
+                      'data support')
     made.add_argument('--method', choices=METHODS, default='ml',
-                      help='ml (default) weighs poses by their noise and leaves out disturbed '
-                      "ones; algebraic is the documents' own costs, every row kept")
-    made.add_argument('--rows', metavar='A:B', help='use these rows alone, from 1, both ends held')
-    made.add_argument('--flat', type=int, metavar='ROW', help='the pose in which the robot was '
-                      'level: the mounting is taken out')
+                      help='ml (default) weighs poses by their noise and leaves out outliers; '
+                      "algebraic is the cost functions of AN5286 and the ESGI'95 report, with "
+                      'every row')
+    made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
+    made.add_argument('--flat', type=int, metavar='ROW', help='pose in which the robot was '
+                      'level; the mounting is derived from it')
+    made.add_argument('--nose-down', type=int, metavar='ROW', help='pose in which the nose of the '
+                      'robot was tilted straight down, by 10° or more; the heading of the '
+                      'mounting is derived from it (needs --flat)')
     made.add_argument('--frame', choices=FRAMES, default='ros',
                       help='levelled frame (default: ros, z up)')
-    made.add_argument('--sensor', default='', help='which sensor this is (frame_id of its Imu)')
+    made.add_argument('--sensor', default='',
+                      help='name of the sensor (frame_id of its messages; default: '
+                      'that of the table)')
     made.add_argument('--jobs', type=int, default=1, metavar='N', help='fit N tables at a time')
     options.add_units(made)
     options.add_json(made)
@@ -55,15 +60,15 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, store, and say how well it went."""
+    """Fit, store, and report the quality."""
     if len(args.poses) == 1:
         return _run_one(args)
     if args.output is not None and not args.output.is_dir():
         raise InputError(f'-o {args.output} is not a folder, and there are {len(args.poses)} pose '
-                         'tables', 'give a folder that is there')
+                         'tables', 'give an existing folder')
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
     options.write_json(args.json, results)
-    console = options.say(args)
+    console = options.console(args)
     for result in results:
         console.print(result['file'], _in_a_line(result), markup=False)
     return 2 if any('error' in result for result in results) else 0
@@ -82,27 +87,24 @@ def _run_one(args: argparse.Namespace) -> int:
 
 
 def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
-    """Fit one pose table as the options say."""
+    """Fit one pose table with the given options."""
     table = read_poses(path)
-    units = options.units_from(args)
+    units = options.units_from(args, table.units, path)
     date = datetime.now(timezone.utc).isoformat(timespec='seconds')
-    flat = None if args.flat is None else options.row_of(table, args.flat, '--flat')
     calibration = fit_poses(options.rows_between(table, args.rows), units, model=args.model,
                             method=args.method, sensor=args.sensor, date=date)
-    if flat is None:
-        return replace(calibration, frame=args.frame)
-    return level(calibration, flat.reading[0], args.frame)
+    return level_by_rows(calibration, table, args.frame, args.flat, args.nose_down)
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Fit one of several pose tables; what is wrong with it becomes its result."""
+    """Fit one of several pose tables; an error becomes its result."""
     try:
         calibration = fit_file(args, path)
         _store(calibration, args.output and args.output / f'{path.stem}.yaml')
     except AccelCalibError as err:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
-        return {'file': path, 'error': f'{path}: {err.strerror}', 'advice': 'check its name'}
+        return {'file': path, 'error': f'{path}: {err.strerror}', 'advice': 'check the name'}
     result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration, args.model)})
     return result
 
@@ -120,11 +122,11 @@ def _in_a_line(result: dict[str, Any]) -> str:
 
 
 def _show(args: argparse.Namespace, calibration: Calibration) -> None:
-    """Tell a person what came out."""
-    console = options.say(args)
+    """Print the result."""
+    console = options.console(args)
     console.print(quality_table(calibration))
     console.print(parameter_table(calibration))
-    console.print(f'why model {calibration.name}: {calibration.reason}', markup=False)
+    console.print(f'model {calibration.name}: {calibration.reason}', markup=False)
     for rejected in calibration.rejected:
         console.print(f'left out: row {rejected.row}, {rejected.reason}', markup=False)
     for warning in calibration.warnings:

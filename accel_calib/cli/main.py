@@ -4,8 +4,7 @@
 """
 The command ``accel-calib``.
 
-Only the module of the command that is asked for is imported, so that ``--help`` does not wait for
-numpy.
+Only the module of the given command is imported, so that ``--help`` does not wait for numpy.
 
 """
 
@@ -26,25 +25,25 @@ COMMANDS = {
     'demo': 'the main job without hardware: simulated Imu, calibrator node, before and after',
     'capture': 'find the still stretches of a recording and write the pose table',
     'fit': 'fit a calibration to still poses',
-    'verify': 'say how well a calibration does on poses it has not seen',
-    'compare': 'say whether calibrations of one sensor agree within their uncertainties',
+    'verify': 'evaluate a calibration on poses that it was not fitted to',
+    'compare': 'test whether calibrations of one sensor agree within their uncertainties',
     'refine': 'find where simulation and measurement disagree, name the missing effect and add it',
     'apply': 'correct a recording with a calibration',
     'simulate': 'simulate poses or a recording of a sensor with known effects',
-    'report': 'show what a calibration still lacks: figures, and one self-contained page',
+    'report': 'show what a calibration lacks: figures, and one self-contained page',
     'node': 'run the calibrator node',
     'simulator': 'run the simulated Imu node',
 }
-"""What each command does."""
+"""Summary of each command."""
 
 _MODULES = {'node': 'nodes', 'simulator': 'nodes'}
 
 
 def parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Make the parser of the command line, with the options of the commands that are wanted."""
+    """Return the parser of the command line, with the options of the wanted commands."""
     top = argparse.ArgumentParser(
-        prog='accel-calib', description='Calibrate an accelerometer from still poses: all that '
-        'is needed is that gravity is 1 g.')
+        prog='accel-calib', description='Calibrate an accelerometer from still poses and the fact '
+        'that gravity is 1 g.')
     top.add_argument('--version', action='version', version=__version__)
     commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND',
                                   required=True)
@@ -75,14 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(args.command, str(err))
     except OSError as err:
         name = f'{err.filename}: ' if err.filename else ''
-        return _refuse(args.command, f'{name}{err.strerror or err}; check name and permissions')
+        reason = err.strerror or err
+        return _refuse(args.command, f'{name}{reason}; check the name and the permissions')
     except KeyboardInterrupt:
         return INTERRUPTED
     return status
 
 
 def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Part the arguments of this program from those of ROS, which argparse would not let by."""
+    """Separate the arguments of this program from those of ROS, which argparse would refuse."""
     at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
     return arguments[:at], arguments[at:]
 

@@ -18,12 +18,12 @@ _EXAMPLES = {'node': 'accel-calib node --ros-args -r imu/data_raw:=/imu/raw',
 def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLES[made.prog.split()[-1]])
-    made.epilog = f'{made.epilog}\n\nall from --ros-args on is passed on to ROS'
+    made.epilog = f'{made.epilog}\n\nall after --ros-args is for ROS'
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the node until it is told to stop."""
+    """Run the node until it is ended."""
     module = import_module(f'accel_calib.ros.{_MODULES[args.command]}')
     status: int = module.main([args.command, *args.for_ros])
     return status

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Options that several commands share, and the writing of results."""
+"""Options of several commands, and the output of results."""
 
 from __future__ import annotations
 
@@ -20,30 +20,43 @@ from ..units import STANDARD_GRAVITY, UNIT_NAMES, Units, units_of
 
 
 def add_example(made: argparse.ArgumentParser, example: str) -> None:
-    """End the help with an example."""
+    """Add an example to the end of the help."""
     made.epilog = f'example:\n  {example}'
     made.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def positive(text: str) -> float:
-    """Read a number above zero."""
+    """Return a number above zero."""
     value = float(text)
     if not 0.0 < value < float('inf'):
         raise argparse.ArgumentTypeError(f'{text} is not a positive number')
     return value
 
 
-def add_units(made: argparse.ArgumentParser) -> None:
-    """Add ``--units`` and ``--gravity``."""
-    made.add_argument('--units', choices=UNIT_NAMES, default='m/s2',
-                      help='unit of ax,ay,az; native is counts or volts (default: m/s2)')
+def add_units(made: argparse.ArgumentParser, default: str = '') -> None:
+    """Add ``--units`` and ``--gravity``; without a default the unit is that of the file."""
+    made.add_argument('--units', choices=UNIT_NAMES, default=default,
+                      help='unit of ax,ay,az; native is counts or volts (default: '
+                      f'{default or "what the file says, or m/s2"})')
     made.add_argument('--gravity', type=positive, default=STANDARD_GRAVITY, metavar='M/S2',
                       help='local gravity [m/s2] (default: %(default)s)')
 
 
-def units_from(args: argparse.Namespace) -> Units:
-    """Give the unit that was asked for."""
-    return units_of(args.units, args.gravity)
+def units_from(args: argparse.Namespace, stated: str, path: Path) -> Units:
+    """
+    Return the unit that was asked for, or that a file states.
+
+    Raises
+    ------
+    InputError
+        If the two differ.
+
+    """
+    if args.units and stated and args.units != stated:
+        raise InputError(f'{path} is in {stated}, --units is {args.units}',
+                         'leave --units out, or correct the file')
+    name: Any = args.units or stated or 'm/s2'
+    return units_of(name, args.gravity)
 
 
 def add_json(made: argparse.ArgumentParser) -> None:
@@ -64,7 +77,7 @@ def write_json(target: str | None, result: object) -> None:
 
 
 def plain(value: object) -> Any:
-    """Give arrays as lists, numbers that are not finite as null, and paths as text."""
+    """Return arrays as lists, numbers that are not finite as None, and paths as text."""
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, Mapping):
@@ -76,8 +89,8 @@ def plain(value: object) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def say(args: argparse.Namespace) -> Any:
-    """Give the console for a person: standard error when JSON goes to standard output."""
+def console(args: argparse.Namespace) -> Any:
+    """Return the console for people: standard error if JSON goes to standard output."""
     from rich.console import Console
 
     return Console(stderr=getattr(args, 'json', None) == '-', highlight=False, soft_wrap=True)
@@ -85,12 +98,12 @@ def say(args: argparse.Namespace) -> Any:
 
 def rows_between(poses: Poses, text: str | None) -> Poses:
     """
-    Take the rows ``A:B`` of a table: from 1, both ends held, an open end is the table's.
+    Return the rows ``A:B`` of a table, 1-based, inclusive; an open end is that of the table.
 
     Raises
     ------
     InputError
-        If it is not of that form, or not in the table.
+        If the text is not of that form, or the rows are not in the table.
 
     """
     if text is None:
@@ -102,33 +115,17 @@ def rows_between(poses: Poses, text: str | None) -> Poses:
         start, stop = 0, 0
     if not 1 <= start <= stop <= len(poses):
         raise InputError(f'--rows {text} is not A:B within rows 1:{len(poses)} of the table',
-                         'give the first and the last row, both from 1')
+                         'give the first and the last row, counted from 1')
     return poses.take(slice(start - 1, stop))
 
 
-def row_of(poses: Poses, row: int, option: str) -> Poses:
-    """
-    Take one row of a table, counted from 1.
-
-    Raises
-    ------
-    InputError
-        If the table has no such row.
-
-    """
-    if not 1 <= row <= len(poses):
-        raise InputError(f'{option} {row} is not a row of the table, which has {len(poses)}',
-                         'rows count from 1')
-    return poses.take(slice(row - 1, row))
-
-
 def in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
-    """Call a function for each item, in this process or in several, and keep the order."""
+    """Call a function for each item, in one process or several, in order."""
     if jobs <= 1 or len(items) <= 1:
         return [function(item) for item in items]
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    # A fork of a process with threads, which numpy has, may hang.
+    # A fork of a process with threads, as numpy has, may hang.
     with ProcessPoolExecutor(min(jobs, len(items)), get_context('spawn')) as pool:
         return list(pool.map(function, items))

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bar with the time left, on standard error, where that is a terminal."""
+"""A progress bar on standard error, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """Show a bar for as long as the work goes on; give the function that moves it."""
+    """Show a bar during the work; yield the function that moves it."""
     if not sys.stderr.isatty():
         yield lambda done, count: None
         return

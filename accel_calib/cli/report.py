@@ -23,7 +23,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='page to write (HTML)')
     made.add_argument('--figures', type=Path, metavar='FOLDER',
-                      help='write each figure as SVG and PNG too')
+                      help='folder for each figure as SVG and PNG')
     add_inputs(made)
     made.set_defaults(run=run)
 
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     check_matplotlib()
     result = refine_file(args, args.poses)
     write_page(args.output, result, str(args.poses))
-    console = options.say(args)
+    console = options.console(args)
     console.print(f'{result.verdict}, stored in {args.output}', markup=False)
     if args.figures is not None:
         count = len(write_figures(args.figures, result))

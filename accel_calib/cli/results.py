@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration is in JSON, and in a table for a person."""
+"""Calibrations and refinements as JSON, and as tables and lines for people."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, Outlook, outlook, sensing_axes
+from ..calibrate import Calibration, Outlook, outlook
+from ..effects import effect_named
+from ..estimate.sensing_axes import sensing_axes
 from ..units import MG
+from ..words import base_words, chance, short
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ..refine import Refinement
+
 
 def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
-    """Give the result of ``fit`` of the model asked for, in the names of the documentation."""
+    """Return the result of ``fit``, of the model asked for, as JSON."""
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -34,23 +39,23 @@ def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
 
 
 def _outlook(found: Outlook) -> dict[str, Any]:
-    """Give what the poses determine, and the next one."""
-    told, asked = found.identifiability, found.next_pose
-    unseen = told.open_parameters
+    """Return what the poses determine, and the next one."""
+    seen, asked = found.identifiability, found.next_pose
+    unseen = seen.open_parameters
     return {
         'uncertainty_mg': found.uncertainty_mg,
         'identifiability': {
-            'model': told.model, 'dilution': told.dilution, 'mean_dilution': told.mean_dilution,
+            'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
             'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
-                           for name, deviation in told.deviations.items()},
+                           for name, deviation in seen.deviations.items()},
             'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
-                             for open_ in told.undetermined]},
+                             for open_ in seen.undetermined]},
         'next_pose': None if asked.direction is None else {
             'direction': asked.direction, 'words': asked.words}}
 
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:
-    """Give what the report calls the parameters of model 9, and of known orientations."""
+    """Return the parameters of model 9, and of known orientations, as the report names them."""
     if calibration.name == '9':
         axes = sensing_axes(calibration.gain, calibration.offset)
         return {'shifts': axes.shifts, 'scales': axes.scales,
@@ -62,25 +67,25 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
 
 
 def quality_table(calibration: Calibration) -> Table:
-    """Give the gap before and after."""
+    """Return a table of the residual before and after."""
     from rich.table import Table
 
     quality = calibration.quality
-    table = Table(title=f'Error of |force| over {len(calibration.poses)} poses '
+    table = Table(title=f'Residual of |force| over {len(calibration.used_poses)} poses '
                   f'(model {calibration.name})')
     table.add_column('')
     for name in ('before', 'after'):
         table.add_column(name, justify='right')
-    table.add_row('gap (RMS), mg', _short(quality.rms_before_mg), _short(quality.rms_after_mg))
+    table.add_row('RMS, mg', _short(quality.rms_before_mg), _short(quality.rms_after_mg))
     table.add_row('largest, mg', _short(quality.max_before_percent * MG / 100.0),
                   _short(quality.max_after_percent * MG / 100.0))
-    table.add_row('of poses held out, mg', '', _short(quality.held_out_rms_mg))
+    table.add_row('held out, mg', '', _short(quality.held_out_rms_mg))
     table.add_row('noise floor, mg', '', _short(quality.noise_floor_mg))
     return table
 
 
 def parameter_table(calibration: Calibration) -> Table:
-    """Give offset and gain with their standard deviations."""
+    """Return a table of offset and gain with their standard deviations."""
     from rich.table import Table
 
     unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[calibration.units.name]
@@ -98,3 +103,48 @@ def parameter_table(calibration: Calibration) -> Table:
 
 def _short(value: float | None) -> str:
     return 'not known' if value is None else f'{value:.3g}'
+
+
+def refine_result(result: Refinement) -> dict[str, Any]:
+    """Return the result of ``refine`` with the keys of the documentation."""
+    return {
+        'verdict': result.verdict, 'base': result.calibration.name,
+        'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
+        'gap_mg': result.gap_mg,
+        'steps': [{**asdict(step), 'words': effect_named(step.effect).words}
+                  for step in result.steps],
+        'remaining_gap_mg': result.remaining_gap_mg,
+        'disturbed_poses': result.disturbed_poses,
+        'not_testable': [{'effect': effect, 'needs': needs}
+                         for effect, needs in result.not_testable],
+        'advice': result.advice, 'warnings': result.calibration.warnings,
+        'refusal': result.refusal[0] if result.refusal else None}
+
+
+def in_a_line(result: dict[str, Any]) -> str:
+    """Return one of several results in a line."""
+    if 'error' in result:
+        return f'{result["error"]}; {result["advice"]}'
+    names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
+    return (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
+            f'{short(result["remaining_gap_mg"])} mg')
+
+
+def steps_table(result: Refinement) -> Table:
+    """Return a table of the steps."""
+    from rich.table import Table
+
+    table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
+                  show_lines=True)
+    table.add_column('', justify='right')
+    table.add_column('effect, and where it was seen', min_width=24, overflow='fold')
+    for name in ('residual', 'chance'):
+        table.add_column(name, no_wrap=True)
+    table.add_column('rivals', overflow='fold')
+    for number, step in enumerate(result.steps, 1):
+        gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
+               f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
+        effect = f'{step.effect}\n{effect_named(step.effect).words}\n{step.where}'
+        table.add_row(str(number), effect, gap, chance(step.p_value),
+                      '\n'.join(step.rivals) or 'none')
+    return table

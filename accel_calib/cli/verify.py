@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib verify``: how well a calibration does on poses it has not seen."""
+"""``accel-calib verify``: evaluate a calibration on poses that it was not fitted to."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import options
-from ..calibrate import check_units, verify
+from ..api import verify
 from ..errors import AccelCalibError
 from ..files import read_calibration, read_poses
 
@@ -26,14 +26,14 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='pose table (CSV), in the unit of the calibration')
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
                       help='stored calibration')
-    made.add_argument('--rows', metavar='A:B', help='use these rows alone, from 1, both ends held')
+    made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
     made.add_argument('--jobs', type=int, default=1, metavar='N', help='N tables at a time')
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Verify and say what came out."""
+    """Verify, and report the result."""
     if len(args.poses) == 1:
         result = _verify(args, args.poses[0])
         options.write_json(args.json, result)
@@ -48,29 +48,28 @@ def run(args: argparse.Namespace) -> int:
 def _verify(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     calibration = read_calibration(args.calibration)
     poses = options.rows_between(read_poses(path), args.rows)
-    check_units(poses, calibration.units)
-    return {'file': path, 'poses': len(poses), **asdict(verify(calibration, poses))}
+    return {'file': path, 'poses': len(poses), **asdict(verify(poses, calibration))}
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Verify on one of several tables; what is wrong with it becomes its result."""
+    """Verify on one of several tables; an error becomes its result."""
     try:
         return _verify(args, path)
     except AccelCalibError as err:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
         return {'file': path, 'error': f'{err.filename}: {err.strerror}',
-                'advice': 'check its name'}
+                'advice': 'check the name'}
 
 
 def _show(args: argparse.Namespace, results: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
-    table = Table(title='Error of |force| on these poses')
-    for name in ('poses', 'gap before, mg', 'after, mg', 'largest after, mg',
+    table = Table(title='Residual of |force| over these poses')
+    for name in ('poses', 'before, mg', 'after, mg', 'largest after, mg',
                  'noise floor, mg'):
         table.add_column(name, justify='right')
-    console = options.say(args)
+    console = options.console(args)
     for result in results:
         if 'error' in result:
             console.print(f'{result["file"]}: {result["error"]}; {result["advice"]}',

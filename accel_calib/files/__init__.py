@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pose tables, recordings and calibrations on disk: one reader and one writer each."""
+"""Pose tables, recordings and calibrations as files: one reader and one writer each."""
 
 from .bag import is_bag
 from .bag_correction import correct_bag, Progress
@@ -12,9 +12,9 @@ from .calibration_yaml import (
     read_calibration,
     write_calibration,
 )
-from .recording import open_recording, read_recording, Source, Stream
+from .recording import open_recording, OpenRecording, read_recording
 from .table_csv import read_poses, read_samples, write_table
 
-__all__ = ['Progress', 'Source', 'Stream', 'check_sensor', 'correct_bag', 'format_calibration',
+__all__ = ['OpenRecording', 'Progress', 'check_sensor', 'correct_bag', 'format_calibration',
            'is_bag', 'open_recording', 'parse_calibration', 'read_calibration', 'read_poses',
            'read_recording', 'read_samples', 'write_calibration', 'write_table']

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writing a file so that it is there whole, or as it was before."""
+"""Write a file as a whole, or leave it unchanged."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import shutil
 from typing import TextIO
 
 
-def before(path: Path) -> Path:
-    """Name the file in which the one before is kept."""
+def previous(path: Path) -> Path:
+    """Return the name under which the previous file is kept."""
     return path.with_name(f'{path.name}.before')
 
 
@@ -25,16 +25,16 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     Parameters
     ----------
     path : Path
-        The target; its folder must be there.
+        The target; its folder must exist.
     write : callable
         Writes the content to an open file.
     keep_before : bool
-        Keep the present file as ``<name>.before``.
+        Keep the previous file as ``<name>.before``.
 
     Raises
     ------
     OSError
-        If the folder is missing or cannot be written; the target is then as it was.
+        If the folder is missing or cannot be written; the target is then unchanged.
 
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
@@ -52,14 +52,14 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
 
 
 def _keep(path: Path) -> None:
-    """Copy the present file to its name of before, that one too whole or as it was."""
+    """Copy the file to the name of the previous one, as a whole or not at all."""
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.before')
     shutil.copy2(path, temporary)
-    temporary.replace(before(path))
+    temporary.replace(previous(path))
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the renaming last through a loss of power."""
+    """Make the renaming survive a loss of power."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -2,105 +2,130 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags of every kind: rosbag2 (folder, mcap, db3) and ROS 1, without ROS.
+Bags, without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-The messages of a topic come in blocks, as they are serialized: by chunks from MCAP files and by
-rows from SQLite files. ROS 1 bags, rosbag2 whose files or messages are compressed, and MCAP files
-of unusual make go message by message through `rosbags`, which also says what is wrong with a bag.
+`rosbags` reads them; the serialized messages of a topic are joined to blocks of arrays
+(`accel_calib.messages.arrays`), and a bag of any length takes the memory of a block.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-import sqlite3
-import struct
 from typing import TYPE_CHECKING
 
-from . import db3, mcap_messages
-from .bag_index import index_of, Topics
-from .serialized import joined, Messages
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import InputError
+from ..messages.arrays import doubles_at, frame_ids, joined, Messages, samples_of, stamps_of
+from ..messages.layout import IMU_DOUBLES
+from ..table import Floats, Recording
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
 
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 SUFFIXES = ('.bag', '.mcap', '.db3')
-BLOCK = 16384
-"""Messages that go together where they come one by one."""
+BLOCK = 4096
+"""Messages that are joined; a block fits into the cache of a processor."""
+
+_ROWS = 65536
+"""Samples of a block, at least."""
+
+_TEMPERATURE_DOUBLES = 2
+"""Temperature and its variance."""
+
+_HELD_BACK = 8
+"""Blocks that wait for the temperature after them, at most."""
+
+_AROUND = 10
+"""Temperatures kept from before a block."""
 
 
 def is_bag(path: Path) -> bool:
-    """Tell a bag from a table by its name."""
+    """Return whether a path names a bag rather than a table."""
     return path.is_dir() or path.suffix in SUFFIXES
 
 
+@dataclass(frozen=True)
 class Bag:
     """
     An open bag; made by `open_bag`.
 
-    Attributes
+    Parameters
     ----------
     path : Path
         File or folder.
+    reader : Reader
+        It, as `rosbags` has it.
     ros2 : bool
         False for a ROS 1 bag.
-    files : list of Path
-        The files of a rosbag2 that hold its messages as they are; none of another bag.
-    topics : mapping of (str, str) to int
-        By name and type, how many messages to expect.
 
     """
 
-    def __init__(self, path: Path, stack: ExitStack) -> None:
-        self._stack = stack
-        self._reader: AnyReader | None = None
-        self.path = path
-        self.ros2 = path.suffix != '.bag'
-        index = index_of(path)
-        self.files = [] if index is None else index.files
-        self.topics = self._counted() if index is None else index.topics
+    path: Path
+    reader: Reader1 | Reader2
+    ros2: bool
 
-    @property
-    def reader(self) -> AnyReader:
-        """Open the bag with `rosbags`, which first goes through all of an SQLite file."""
-        if self._reader is None:
-            self._reader = _reader(self.path)
-            self._stack.callback(self._reader.close)
-        return self._reader
-
-    def _counted(self) -> Topics:
-        counts: Topics = {}
-        for each in self.reader.connections:
-            key = each.topic, each.msgtype
-            counts[key] = counts.get(key, 0) + each.msgcount
-        return counts
-
-    def of_type(self, msgtype: str) -> list[str]:
-        """Give the topics of a type, sorted."""
-        return sorted(topic for topic, kind in self.topics if kind == msgtype)
+    def topics(self, msgtype: str) -> list[str]:
+        """Return the topics of a type, sorted."""
+        return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
 
     def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
-        """Give the connections of a topic, as `rosbags` has them; there may be several."""
+        """Return the connections of a topic; there may be several."""
         return [c for c in self.reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
 
-    def messages(self, topic: str, msgtype: str = IMU) -> Iterator[Messages]:
-        """Give the messages of a topic in the order in which they were received, in blocks."""
-        sources = [(db3 if file.suffix == '.db3' else mcap_messages).topic_messages(
-            file, topic, msgtype) for file in self.files]
-        if sources and None not in sources:
-            for source in sources:
-                yield from source or ()
-            return
-        messages = self.reader.messages(self.connections(topic, msgtype))
-        while block := [raw for _, _, raw in islice(messages, BLOCK)]:
-            yield joined(block, ros2=self.ros2)
+    def count(self, topic: str, msgtype: str = IMU) -> int:
+        """Return the number of messages of a topic, by the index of the bag."""
+        return sum(connection.msgcount for connection in self.connections(topic, msgtype))
+
+    def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
+               ) -> Iterator[list[tuple[Connection, int, bytes]]]:
+        """
+        Yield messages by blocks, in the order of receipt.
+
+        Parameters
+        ----------
+        connections : sequence of Connection
+            What to read; by default all.
+        size : int
+            Messages of a block.
+
+        Yields
+        ------
+        list of (Connection, int, bytes)
+            With the time of receipt [ns].
+
+        """
+        messages = self.reader.messages(connections)
+        while True:
+            with _asking_rosbags(self.path):
+                block = list(islice(messages, size))
+            if not block:
+                return
+            yield block
+
+    def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
+               ) -> Messages:
+        """
+        Return messages of a topic as arrays; `before` is the number of those before them.
+
+        Raises
+        ------
+        InputError
+            If a message is damaged.
+
+        """
+        return joined(raws, doubles, f'{self.path}, {topic}', ros2=self.ros2, before=before)
 
 
 @contextmanager
@@ -111,48 +136,47 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises
     ------
     InputError
-        If it is not a whole bag, also where that shows only when its messages are read.
+        If it is not a whole bag; also later, while it is read.
     FileNotFoundError
         If it is missing.
 
     """
+    from rosbags import rosbag1, rosbag2
+
     if not path.exists():
         raise FileNotFoundError(2, 'No such file or directory', str(path))
-    with ExitStack() as stack:
-        try:
-            yield Bag(path, stack)
-        except _reading_errors() as err:
-            raise _not_whole(path, err) from err
-
-
-def _reader(path: Path) -> AnyReader:
-    """Open a bag through `rosbags`."""
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import get_typestore, Stores
-
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+    ros2 = path.suffix != '.bag'
+    with _asking_rosbags(path):
+        reader = (rosbag2.Reader if ros2 else rosbag1.Reader)(path)
         reader.open()
-    except (AnyReaderError, FileNotFoundError, AssertionError, struct.error) as err:
+    try:
+        yield Bag(path, reader, ros2)
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _asking_rosbags(path: Path) -> Iterator[None]:
+    """Report what `rosbags` raises as an InputError; nothing but calls of it belong inside."""
+    try:
+        yield
+    except OSError as err:
+        if err.errno is not None:
+            raise
         raise _not_whole(path, err) from err
-    return reader
-
-
-def _reading_errors() -> tuple[type[Exception], ...]:
-    from rosbags import rosbag1, rosbag2
-    from rosbags.highlevel import AnyReaderError
-
-    return AnyReaderError, rosbag1.ReaderError, rosbag2.ReaderError, sqlite3.Error
+    except Exception as err:  # damaged bytes raise whatever its parsers and SQLite meet first
+        raise _not_whole(path, err) from err
 
 
 def _not_whole(path: Path, err: Exception) -> InputError:
-    return InputError(f'{path} is not a whole bag ({err})',
-                      'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may mend it')
+    what = ' '.join(str(err).split()) or type(err).__name__
+    return InputError(f'{path} is not a whole bag ({what})',
+                      'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may repair it')
 
 
 def imu_topic(bag: Bag, topic: str = '') -> str:
     """
-    Find the one Imu topic of an open bag, or the one asked for.
+    Return the one Imu topic of an open bag, or the one asked for.
 
     Raises
     ------
@@ -160,9 +184,9 @@ def imu_topic(bag: Bag, topic: str = '') -> str:
         If there is none, or more than one to choose from.
 
     """
-    topics = bag.of_type(IMU)
+    topics = bag.topics(IMU)
     if not topics:
-        others = ', '.join(f'{name} ({kind})' for name, kind in sorted(bag.topics))
+        others = ', '.join(sorted(f'{c.topic} ({c.msgtype})' for c in bag.reader.connections))
         raise InputError(f'{bag.path} has no topic of type {IMU}, only {others or "none"}',
                          'record the Imu topic')
     if topic and topic not in topics:
@@ -172,3 +196,174 @@ def imu_topic(bag: Bag, topic: str = '') -> str:
         raise InputError(f'{bag.path} has {len(topics)} Imu topics: {", ".join(topics)}',
                          'choose one with --topic')
     return topic or topics[0]
+
+
+def first_frame_id(bag: Bag, topic: str) -> str:
+    """
+    Return the frame_id of the first message of an Imu topic.
+
+    Raises
+    ------
+    InputError
+        If there is no message, or it is damaged.
+
+    """
+    block = next(bag.blocks(bag.connections(topic), 1), None)
+    if block is None:
+        raise InputError(f'{bag.path} has no message on {topic}',
+                         'record while the sensor publishes')
+    return frame_ids(bag.joined([block[0][2]], topic, 0))[0]
+
+
+def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str, *,
+              chosen: bool) -> NDArray[np.bool_]:
+    """
+    Return which messages are of a sensor.
+
+    Parameters
+    ----------
+    bag, topic
+        Where they come from.
+    messages : Messages
+        A block of the topic.
+    before : int
+        Messages before these.
+    sensor : str
+        The frame_id of the sensor.
+    chosen : bool
+        Whether the user chose it; otherwise messages of another are refused.
+
+    Raises
+    ------
+    InputError
+        If a message is of another sensor, and none was chosen.
+
+    """
+    names = frame_ids(messages)
+    same = np.array([name == sensor for name in names])
+    if not chosen and not np.all(same):
+        first = int(np.argmin(same))
+        raise InputError(f'{bag.path}, {topic}: message {before + first + 1} is of the sensor '
+                         f'{names[first]!r}, those before it are of {sensor!r}',
+                         'choose one with --sensor')
+    return np.broadcast_to(same, len(messages))
+
+
+def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool) -> Iterator[Recording]:
+    """
+    Read the samples of an Imu topic in blocks; parameters as `of_sensor`.
+
+    Raises
+    ------
+    InputError
+        If a message is damaged, holds NaN, or is of another sensor.
+
+    """
+    waiting: deque[Recording] = deque()
+    parts: list[Recording] = []
+    before, track = 0, Track(np.zeros(0), np.zeros(0)) if bag.topics(TEMPERATURE) else None
+    for imus, temperatures in _raw_messages(bag, topic):
+        if track is not None and temperatures:
+            track = track.plus(bag.joined(temperatures, 'temperature', 0, _TEMPERATURE_DOUBLES))
+        if imus:
+            waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
+            before += len(imus)
+        while waiting and (track is None or len(waiting) > _HELD_BACK or track.covers(waiting[0])):
+            parts.append(_with_temperature(waiting.popleft(), track))
+        if track is not None and waiting:
+            track = track.since(waiting[0]['time'][0])
+        if sum(map(len, parts)) >= _ROWS:
+            yield together(parts)
+            parts = []
+    parts += [_with_temperature(part, track) for part in waiting]
+    if parts:
+        yield together(parts)
+
+
+def _raw_messages(bag: Bag, topic: str) -> Iterator[tuple[list[bytes], list[bytes]]]:
+    """Yield serialized Imu and Temperature messages by blocks; one pass over the bag."""
+    warm = [c for name in bag.topics(TEMPERATURE) for c in bag.connections(name, TEMPERATURE)]
+    are_warm = {id(connection) for connection in warm}
+    messages = bag.reader.messages([*bag.connections(topic), *warm])
+    while True:
+        imus: list[bytes] = []
+        temperatures: list[bytes] = []
+        with _asking_rosbags(bag.path):
+            for connection, _, raw in islice(messages, BLOCK):
+                (temperatures if id(connection) in are_warm else imus).append(raw)
+        if not imus and not temperatures:
+            return
+        yield imus, temperatures
+
+
+def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
+             ) -> Recording:
+    """Return Imu messages as samples; parameters as `of_sensor`."""
+    messages = bag.joined(raws, topic, before)
+    which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
+    columns = samples_of(messages)
+    _check_finite(bag, columns['reading'], before)
+    row = np.arange(before, before + len(raws)) + 1
+    samples = Recording(columns, row, 'm/s2', sensor)
+    return samples if np.all(which) else samples.take(which)
+
+
+def _with_temperature(samples: Recording, track: Track | None) -> Recording:
+    if track is None:
+        return samples
+    return samples.with_columns(temperature=track.at(samples['time']))
+
+
+def together(parts: Sequence[Recording]) -> Recording:
+    """Return recordings, at least one, behind each other."""
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
+    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
+
+
+def _check_finite(bag: Bag, reading: Floats, before: int) -> None:
+    """Refuse messages whose acceleration is not a number."""
+    if not np.isfinite(reading).all():
+        first = int(np.argmin(np.isfinite(reading).all(axis=1)))
+        raise InputError(f'{bag.path}: Imu message {before + first + 1} holds NaN or infinity',
+                         'fix the driver, or record again')
+
+
+@dataclass(frozen=True)
+class Track:
+    """Temperatures [°C] at times [s], which rise; NaN if it is empty."""
+
+    time: Floats
+    temperature: Floats
+
+    def at(self, time: Floats) -> Floats:
+        """Return the temperature at these times, (n,)."""
+        if not len(self.time):
+            return np.full(len(time), np.nan)
+        return np.interp(time, self.time, self.temperature)
+
+    def plus(self, messages: Messages) -> Track:
+        """Return it with Temperature messages added."""
+        temperature = doubles_at(messages, slice(0, 1))[:, 0]
+        known = np.isfinite(temperature)
+        time = np.concatenate([self.time, stamps_of(messages)[known]])
+        order = np.argsort(time, kind='stable')
+        return Track(time[order], np.concatenate([self.temperature, temperature[known]])[order])
+
+    def covers(self, samples: Recording) -> bool:
+        """Return whether it reaches to the end of these samples."""
+        return bool(len(self.time) and samples['time'][-1] <= self.time[-1])
+
+    def since(self, time: float) -> Track:
+        """Return it without what is long before a time."""
+        first = max(0, int(np.searchsorted(self.time, time)) - _AROUND)
+        return Track(self.time[first:], self.temperature[first:])
+
+
+def temperature_track(bag: Bag) -> Track:
+    """Return all temperatures of a bag."""
+    track = Track(np.zeros(0), np.zeros(0))
+    for topic in bag.topics(TEMPERATURE):
+        for block in bag.blocks(bag.connections(topic, TEMPERATURE)):
+            raws = [raw for _, _, raw in block]
+            track = track.plus(bag.joined(raws, topic, 0, _TEMPERATURE_DOUBLES))
+    return track

@@ -2,47 +2,45 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Correcting a bag: a copy in which the Imu topic is calibrated and all else is as it was.
+Correction of a bag: a copy with the Imu topic corrected and all other messages byte for byte.
 
-Of a rosbag2 the files are rewritten in their own format: other topics, names, definitions,
-compression of chunks, and ``metadata.yaml`` stay byte for byte. A ROS 1 bag, and a rosbag2 whose
-messages or files are compressed, go message by message through `rosbags`.
+The copy is written by `rosbags`, with the storage of the original. What it does not keep is said
+in the documentation of the files (attachments of MCAP, the division into several files, …).
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from . import db3, mcap_rewrite
-from .bag import Bag, BLOCK, IMU, imu_topic, open_bag
-from .bag_metadata import write_metadata
-from .bag_samples import first_frame_id, temperature_track
-from .calibration_yaml import check_sensor
-from .serialized import (
-    doubles_at,
-    frame_id_of,
-    joined,
-    layout_of,
-    Messages,
-    put_doubles,
-    stamps_of,
+from .bag import (
+    Bag,
+    first_frame_id,
+    imu_topic,
+    of_sensor,
+    open_bag,
+    TEMPERATURE,
+    temperature_track,
 )
+from .calibration_yaml import check_sensor
 from ..calibrate import Calibration
 from ..errors import InputError
-from ..imu import corrected, FIELDS
+from ..messages.arrays import doubles_at, Messages, put_doubles, samples_of
+from ..messages.correction import corrected
+from ..messages.layout import IMU_DOUBLES
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
+    from collections.abc import Iterator
 
 Progress = Callable[[int, int], object]
-"""Is told how many messages are done, and of how many."""
+"""Called with the number of messages done, and of all."""
+
+_NO_HASH = 'RIHS01_' + 64 * '0'
+"""Hash of a type whose definition neither the bag nor Jazzy has."""
 
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
@@ -57,13 +55,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     calibration : Calibration
         In m/s².
     out : Path
-        What to write; must not be there yet. A folder becomes a folder and a ROS 1 bag a ROS 1
-        bag; a single file of rosbag2 becomes a file where `out` has its suffix, otherwise a
-        folder.
+        The copy; must not exist. A rosbag2 becomes a folder, or a file if `out` has the suffix
+        of its storage; a ROS 1 bag becomes a ROS 1 bag.
     topic : str
-        Imu topic, where the bag has several.
+        Imu topic, for a bag with several.
     progress : callable
-        Told of the messages, block by block.
+        Called after each block of messages.
 
     Returns
     -------
@@ -73,142 +70,126 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     Raises
     ------
     InputError
-        If the bag is not whole or has no Imu, or `out` is there already.
+        If the bag is not whole, has no Imu or Imu messages of several sensors, or `out` exists.
     StoredCalibrationError
         If the calibration is of another sensor.
     OSError
-        If a file cannot be read or written; `out` is then not there.
+        If a file cannot be read or written; `out` then does not exist.
 
     """
     if out.exists():
-        raise InputError(f'{out} is there already', 'give a name that is still free')
+        raise InputError(f'{out} exists', 'give a new name')
     if calibration.units.name != 'm/s2':
         raise InputError(f'the calibration is for readings in {calibration.units.name}, Imu '
                          'messages are in m/s2', 'fit it to poses in m/s2')
-    partial = out.with_name(f'.{out.name}.partial')
-    _remove(partial)
+    with open_bag(path) as bag:
+        name = imu_topic(bag, topic)
+        sensor = first_frame_id(bag, name)
+        check_sensor(calibration, sensor)
+        with _new(out) as folder:
+            return _copy(bag, folder, out, _Correction(calibration, bag, name, sensor), progress)
+
+
+@contextmanager
+def _new(out: Path) -> Iterator[Path]:
+    """Yield a folder beside the target to write into, and remove it at the end."""
+    folder = out.with_name(f'.{out.name}.partial')
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
     try:
-        with open_bag(path) as bag:
-            name = imu_topic(bag, topic)
-            check_sensor(calibration, first_frame_id(bag, name))
-            change = _Correction(calibration, bag, name, progress)
-            partial.parent.mkdir(parents=True, exist_ok=True)
-            if _can_rewrite(bag):
-                _rewrite(bag, partial, out, name, change)
-            else:
-                with _writer(bag, partial) as writer:
-                    _copy(bag, writer, name, change)
-        partial.rename(out)
+        yield folder
     finally:
-        _remove(partial)
-    return change.done
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
+        shutil.rmtree(folder)
 
 
 class _Correction:
-    """Correct messages in their buffer, and count them."""
+    """The correction of the messages of one topic."""
 
-    def __init__(self, calibration: Calibration, bag: Bag, topic: str, progress: Progress
-                 ) -> None:
-        needed = 'temperature' in calibration.model.needs
-        self._calibration = calibration
-        self._name = f'{bag.path}, {topic}'
+    def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str) -> None:
+        self._calibration, self._bag, self._sensor = calibration, bag, sensor
+        needed = 'temperature' in calibration.model.needs and bag.topics(TEMPERATURE)
         self._track = temperature_track(bag) if needed else None
-        self._count = bag.topics[topic, IMU]
-        self._progress = progress
-        self.done = 0
+        self.topic, self.done = topic, 0
 
-    def __call__(self, messages: Messages) -> None:
-        """Correct these messages."""
-        layout = layout_of(messages, FIELDS, self._name, self.done)
-        check_sensor(self._calibration, frame_id_of(messages, layout))
-        context = {}
+    def __call__(self, raws: list[bytes]) -> Messages:
+        """Return messages corrected, in a new buffer."""
+        messages = self._bag.joined(raws, self.topic, self.done)
+        of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
+        context = samples_of(messages)
         if self._track is not None:
-            context['temperature'] = self._track.at(stamps_of(messages, layout))
-        fields = doubles_at(messages, layout, slice(0, FIELDS))
-        put_doubles(messages, layout, corrected(self._calibration, fields, context))
+            context['temperature'] = self._track.at(context['time'])
+        doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
+        put_doubles(messages, corrected(self._calibration, doubles, context))
         self.done += len(messages)
-        self._progress(self.done, self._count)
+        return messages
 
 
-def _can_rewrite(bag: Bag) -> bool:
-    return bool(bag.files) and all(file.suffix == '.db3' or mcap_rewrite.can_rewrite(file)
-                                   for file in bag.files)
+def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: Progress) -> int:
+    """Copy all messages, those of the Imu corrected."""
+    target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
+    count = bag.count(correction.topic)
+    imu = {id(connection) for connection in bag.connections(correction.topic)}
+    writer = _writer(bag, target)
+    with writer:
+        outputs = _added(bag, writer)
+        for block in bag.blocks():
+            which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
+            changed: dict[int, memoryview] = {}
+            if which:
+                new = correction([block[k][2] for k in which])
+                changed = dict(zip(which, new.each(), strict=True))
+            for k, (connection, stamp, raw) in enumerate(block):
+                writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
+            progress(correction.done, count)
+    (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
+    return correction.done
 
 
-def _rewrite(bag: Bag, partial: Path, out: Path, topic: str, change: _Correction) -> None:
-    """Rewrite the files of a rosbag2 one by one; others in its folder are copied."""
-    names = [file.name for file in bag.files]
-    targets = [partial / name for name in names]
-    if bag.path.is_dir():
-        _copy_others(bag.path, partial, names)
-    elif out.suffix == bag.path.suffix:
-        targets = [partial]
-    else:
-        partial.mkdir()
-        targets = [partial / f'{out.name}{bag.path.suffix}']
-        write_metadata(bag.reader, targets[0])
-    for file, target in zip(bag.files, targets, strict=True):
-        module = db3 if file.suffix == '.db3' else mcap_rewrite
-        module.rewrite(file, target, topic, IMU, change)
-
-
-def _copy_others(folder: Path, target: Path, names: Sequence[str]) -> None:
-    """Copy what is in a folder beside the files of these names."""
-    others = [item for item in folder.iterdir() if item.name not in names]
-    target.mkdir()
-    for item in others:
-        copy = shutil.copytree if item.is_dir() else shutil.copyfile
-        copy(item, target / item.name)
-
-
-def _writer(bag: Bag, out: Path) -> Writer1 | Writer2:
-    """Make a writer of the kind of the bag that is read."""
+def _writer(bag: Bag, target: Path) -> Any:
+    """Return a writer of the kind of the bag that is read."""
     if not bag.ros2:
-        from rosbags.rosbag1 import Writer as Rosbag1Writer
+        from rosbags.rosbag1 import Writer as Writer1
 
-        return Rosbag1Writer(out)
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Rosbag2Writer
+        return Writer1(target)
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
 
     mcap = bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))
-    return Rosbag2Writer(out, version=9, storage_plugin=StoragePlugin.MCAP if mcap
-                         else StoragePlugin.SQLITE3)
+    writer = Writer2(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
+                     else StoragePlugin.SQLITE3)
+    mode = bag.reader.compression_mode if isinstance(bag.reader, Reader) else None
+    if mode:
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    return writer
 
 
-def _copy(bag: Bag, writer: Writer1 | Writer2, topic: str, change: _Correction) -> None:
-    """Copy all messages, those of the Imu corrected."""
-    add = _adder(bag.reader, writer)
-    outputs = {id(connection): add(connection) for connection in bag.reader.connections}
-    imu = {id(connection) for connection in bag.connections(topic)}
-    messages: Iterator[tuple[Any, int, bytes]] = bag.reader.messages()
-    while block := list(islice(messages, BLOCK)):
-        which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-        new = joined([block[k][2] for k in which], ros2=bag.ros2)
-        if which:
-            change(new)
-        changed = dict(zip(which, new.each(), strict=True))
-        for k, (connection, stamp, raw) in enumerate(block):
-            writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
+def _added(bag: Bag, writer: Any) -> dict[int, Any]:
+    """Add the connections of a bag to a writer; return the new ones by the id of the old."""
+    made: dict[tuple[Any, ...], Any] = {}
+    outputs = {}
+    for each in bag.reader.connections:
+        key = (each.topic, each.msgtype, each.msgdef.data, str(each.ext))
+        if key not in made:
+            made[key] = (_added_to_2 if bag.ros2 else _added_to_1)(writer, each)
+        outputs[id(each)] = made[key]
+    return outputs
 
 
-def _adder(reader: AnyReader, writer: Any) -> Callable[[Any], Any]:
-    """Give the function that declares a connection of the reader to the writer."""
-    def add1(connection: Any) -> Any:
-        return writer.add_connection(connection.topic, connection.msgtype,
-                                     msgdef=connection.msgdef.data, md5sum=connection.digest,
-                                     callerid=connection.ext.callerid,
-                                     latching=connection.ext.latching)
+def _added_to_1(writer: Any, each: Any) -> Any:
+    return writer.add_connection(each.topic, each.msgtype, msgdef=each.msgdef.data,
+                                 md5sum=each.digest, callerid=each.ext.callerid,
+                                 latching=each.ext.latching)
 
-    def add2(connection: Any) -> Any:
-        return writer.add_connection(
-            connection.topic, connection.msgtype, typestore=reader.typestore,
-            serialization_format=connection.ext.serialization_format,
-            offered_qos_profiles=connection.ext.offered_qos_profiles)
 
-    return add2 if reader.is2 else add1
+def _added_to_2(writer: Any, each: Any) -> Any:
+    from rosbags.typesys import get_typestore, Stores
+
+    msgdef, digest, known = each.msgdef.data, each.digest, get_typestore(Stores.ROS2_JAZZY)
+    if each.msgtype in known.types:
+        msgdef = msgdef or known.generate_msgdef(each.msgtype, ros_version=2)[0]
+        digest = digest or known.hash_rihs01(each.msgtype)
+    return writer.add_connection(
+        each.topic, each.msgtype, msgdef=msgdef, rihs01=digest or _NO_HASH,
+        serialization_format=each.ext.serialization_format,
+        offered_qos_profiles=each.ext.offered_qos_profiles)

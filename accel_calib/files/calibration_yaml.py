@@ -4,47 +4,59 @@
 """
 Stored calibrations: readable, versioned YAML.
 
-The text is made and read by `format_calibration` and `parse_calibration`; disk is touched only
-in `write_calibration` and `read_calibration`.
+`format_calibration` and `parse_calibration` convert text; only `write_calibration` and
+`read_calibration` touch the disk. What is read is checked value by value and passes the gate of
+every other calibration (`accel_calib.calibrate.gate`). The last line is a checksum of the text
+before it, which distinguishes a file that was edited by hand.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
+import hashlib
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import yaml
 
 from .atomic import write_atomically
 from .. import __version__
-from ..calibrate import Calibration, FRAMES, Quality, Rejected
+from ..calibrate import Calibration, FRAMES, gated, in_g, METHODS, MODEL_NAMES, Quality, Rejected
 from ..effects import EFFECTS
-from ..errors import StoredCalibrationError
-from ..model import Model
+from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
+from ..estimate.fit import judge
+from ..model import Model, parameter_names
 from ..table import COLUMNS, Floats, Poses
-from ..units import UnitName, Units
+from ..units import UNIT_NAMES, Units
 
-try:  # eight times as fast, where PyYAML was built with it
+try:  # eight times as fast, if PyYAML was built with it
     from yaml import CSafeDumper as SafeDumper
     from yaml import CSafeLoader as SafeLoader
 except ImportError:
     from yaml import SafeDumper, SafeLoader  # type: ignore[assignment]
 
 FORMAT = 'accel_calib calibration'
-VERSION = 1
+_FIRST_LINE = f'format: {FORMAT}'
+VERSION = 2
+"""Version 1 had no stream, no checksum, and NaN for a covariance that nothing determined."""
+
+EDITED = 'the file was edited by hand since it was stored'
+
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
+_CHECKSUM = '\nchecksum: sha256 '
+_NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
 
 
 def format_calibration(calibration: Calibration) -> str:
-    """Give the text of a stored calibration."""
+    """Return the text of a stored calibration."""
     model, units = calibration.model, calibration.units
     content = {
         'format': FORMAT, 'version': VERSION, 'package_version': __version__,
-        'equation': _EQUATION, 'sensor': calibration.sensor, 'date': calibration.date,
+        'equation': _EQUATION, 'sensor': calibration.sensor, 'stream': calibration.stream,
+        'date': calibration.date,
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
         'effects': {name: {'what': EFFECTS[name].words, 'unit': EFFECTS[name].unit,
@@ -54,13 +66,18 @@ def format_calibration(calibration: Calibration) -> str:
         'covariance': calibration.covariance.tolist(),
         'quality': asdict(calibration.quality),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
-        'warnings': list(calibration.warnings),
+        'warnings': [line for line in calibration.warnings if line != EDITED],
         'poses': {'row': calibration.poses.row.tolist(),
-                  **{key: calibration.poses[key].tolist() for key in COLUMNS
-                     if key in calibration.poses}},
+                  **{key: calibration.poses[key].tolist() for key, column in COLUMNS.items()
+                     if key in calibration.poses and not column.made}},
     }
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99,
+    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99,
                      default_flow_style=None)
+    return f'{text.rstrip()}{_CHECKSUM}{_digest(text.rstrip())}\n'
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class _Dumper(SafeDumper):
@@ -81,35 +98,56 @@ def parse_calibration(text: str, name: str) -> Calibration:
     name : str
         What to call it in messages.
 
+    Returns
+    -------
+    Calibration
+        With the warning `EDITED` if its checksum does not match.
+
     Raises
     ------
     StoredCalibrationError
-        If it is damaged or newer than this package.
+        If it is damaged, newer than this package, or not one that a sensor can have.
 
     """
+    if not text.startswith(_FIRST_LINE):
+        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, whose first '
+                                     f'line is "{_FIRST_LINE}"', 'give a file that fit wrote')
     try:
         content = yaml.load(text, Loader=SafeLoader)
-    except yaml.YAMLError as err:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as err:
         raise _damaged(name, 'it is not YAML') from err
     _check_version(content, name)
     try:
-        return _calibration(content)
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
-        raise _damaged(name, f'{type(err).__name__}: {err}') from err
+        calibration = _calibration(content)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
+        what = f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err)
+        raise _damaged(name, what) from err
+    try:
+        calibration = gated(calibration)
+    except RefusedFitError as err:
+        raise DamagedCalibrationError(f'{name} is not a calibration to use: {err.message}',
+                                      err.advice) from err
+    if content['version'] == 1:
+        return calibration
+    body, found, digest = text.rpartition(_CHECKSUM)
+    if not found:
+        raise _damaged(name, 'its last line, the checksum, is missing')
+    if digest.strip() != _digest(body.rstrip()):
+        return replace(calibration, warnings=(*calibration.warnings, EDITED))
+    return calibration
 
 
-def _damaged(name: str, what: str) -> StoredCalibrationError:
-    return StoredCalibrationError(f'{name} is not a whole calibration ({what})',
-                                  'fit again, or use the file kept as .before')
+def _damaged(name: str, what: str) -> DamagedCalibrationError:
+    return DamagedCalibrationError(f'{name} is not a whole calibration ({" ".join(what.split())})',
+                                   'fit again, or use the file kept as .before')
 
 
 def _check_version(content: Any, name: str) -> None:
-    """Refuse what is no calibration, or a newer one. Older versions would be converted here."""
-    if not isinstance(content, Mapping) or content.get('format') != FORMAT:
-        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, whose first '
-                                     f'line is "format: {FORMAT}"', 'give a file that fit wrote')
+    """Refuse a calibration of a newer version."""
+    if not isinstance(content, Mapping):
+        raise _damaged(name, 'it is not YAML with names')
     version = content.get('version')
-    if not isinstance(version, int) or version < 1:
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise _damaged(name, f'its version is {version!r}')
     if version > VERSION:
         raise StoredCalibrationError(f'{name} has version {version}, this package reads up to '
@@ -117,44 +155,117 @@ def _check_version(content: Any, name: str) -> None:
 
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
-    """Make the record from the content of a file."""
-    if content['frame'] not in FRAMES:
-        raise ValueError(f'frame {content["frame"]!r} is none of {", ".join(FRAMES)}')
-    values = {name: np.array([float(effect[part]) for part in EFFECTS[name].values])
-              for name, effect in content['effects'].items()}
-    rotation = _finite(content['rotation'])
-    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
-        raise ValueError('rotation is not a rotation matrix')
-    if not all(np.all(np.isfinite(part)) for part in values.values()):
-        raise ValueError('an effect has a value that is not finite')
-    units = content['units']
-    return Calibration(
-        name=str(content['model']), method=str(content['method']), model=Model(values, rotation),
-        units=Units(cast(UnitName, units['readings']), float(units['per_g'])),
-        sensor=str(content['sensor']), frame=content['frame'], date=str(content['date']),
-        covariance=np.array(content['covariance'], float).reshape(2 * (_size(values),)),
-        quality=Quality(**{field.name: content['quality'][field.name]
-                           for field in fields(Quality)}),
-        poses=_poses(content['poses']),
-        rejected=tuple(Rejected(**rejected) for rejected in content['rejected']),
-        reason=str(content['reason']), warnings=tuple(content['warnings']))
+    """Return the record with the content of a file; ValueError if something is not as expected."""
+    values = {str(name): np.array([_number(effect, part) for part in EFFECTS[name].values])
+              for name, effect in _known_effects(content).items()}
+    size = len(parameter_names(tuple(values)))
+    units = _mapping(content, 'units')
+    rejected = [Rejected(_whole(each, 'row'), _text(each, 'reason'))
+                for each in _list(content, 'rejected')]
+    calibration = Calibration(
+        name=_one_of(content, 'model', _NAMES), method=_one_of(content, 'method', METHODS),
+        model=Model(values, _array(content, 'rotation', (3, 3))),
+        units=Units(_one_of(units, 'readings', UNIT_NAMES), _number(units, 'per_g')),
+        sensor=_text(content, 'sensor'), stream=str(content.get('stream', '')),
+        frame=_one_of(content, 'frame', FRAMES), date=_text(content, 'date'),
+        covariance=_array(content, 'covariance', (size, size), finite=False),
+        quality=_quality(_mapping(content, 'quality')), poses=_poses(_mapping(content, 'poses')),
+        rejected=tuple(rejected), reason=_text(content, 'reason'),
+        warnings=tuple(_text({'warning': line}, 'warning') for line in _list(content, 'warnings')))
+    return _from_version_1(calibration) if content['version'] == 1 else calibration
 
 
-def _size(values: Mapping[str, Floats]) -> int:
-    return sum(len(part) for part in values.values())
+def _from_version_1(calibration: Calibration) -> Calibration:
+    """Return the calibration with a covariance where version 1 had NaN."""
+    if np.all(np.isfinite(calibration.covariance)) or not len(calibration.used_poses):
+        return calibration
+    fit = judge(Model(calibration.model.values), in_g(calibration.used_poses, calibration.units))
+    return replace(calibration, covariance=fit.covariance)
 
 
-def _finite(values: Any) -> Floats:
-    array = np.array(values, float)
-    if not np.all(np.isfinite(array)):
-        raise ValueError('a number is not finite')
-    return array
+def _known_effects(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    effects = _mapping(content, 'effects')
+    for name, effect in effects.items():
+        if name not in EFFECTS:
+            raise ValueError(f'effect {name!r} is not known')
+        if not isinstance(effect, Mapping):
+            raise ValueError(f'effect {name} is {effect!r}')
+    return effects
+
+
+def _quality(content: Mapping[str, Any]) -> Quality:
+    optional = ('held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof')
+    figures: dict[str, Any] = {
+        each.name: None if each.name in optional and content[each.name] is None
+        else _number(content, each.name) for each in fields(Quality)}
+    return Quality(**figures)
 
 
 def _poses(content: Mapping[str, Any]) -> Poses:
-    columns = {key: np.array(content[key]) if key == 'label' else _finite(content[key])
-               for key in COLUMNS if key in content}
-    return Poses(columns, np.array(content['row'], np.int64))
+    rows = np.array([_whole({'row': row}, 'row') for row in _list(content, 'row')], np.int64)
+    columns: dict[str, Any] = {}
+    for key, column in COLUMNS.items():
+        if key in content and not column.made:
+            width = len(column.names)
+            shape = (len(rows),) if width == 1 else (len(rows), width)
+            columns[key] = (np.array([str(each) for each in _list(content, key)], dtype=str)
+                            if key == 'label' else _array(content, key, shape))
+    return Poses(columns, rows)
+
+
+def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    if not isinstance(content[key], Mapping):
+        raise ValueError(f'{key} is {_short(content[key])}, expected names with values')
+    return content[key]
+
+
+def _list(content: Mapping[str, Any], key: str) -> list[Any]:
+    if not isinstance(content[key], list):
+        raise ValueError(f'{key} is {_short(content[key])}, expected a list')
+    return content[key]
+
+
+def _text(content: Mapping[str, Any], key: str) -> str:
+    if not isinstance(content[key], str):
+        raise ValueError(f'{key} is {_short(content[key])}, expected text')
+    return content[key]
+
+
+def _one_of(content: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> Any:
+    if content[key] not in choices:
+        raise ValueError(f'{key} is {_short(content[key])}, expected one of {", ".join(choices)}')
+    return content[key]
+
+
+def _number(content: Mapping[str, Any], key: str) -> float:
+    value = content[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise ValueError(f'{key} is {_short(value)}, expected a finite number')
+    return float(value)
+
+
+def _whole(content: Mapping[str, Any], key: str) -> int:
+    value = content[key]
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f'{key} is {_short(value)}, expected a whole number')
+    return value
+
+
+def _array(content: Mapping[str, Any], key: str, shape: tuple[int, ...], *, finite: bool = True
+           ) -> Floats:
+    """Return nested lists of numbers as an array of this shape."""
+    values = _list(content, key)
+    array = np.array(values, float).reshape(shape) if not values else np.array(values, float)
+    if array.shape != shape:
+        raise ValueError(f'{key} has shape {array.shape}, expected {shape}')
+    if finite and not np.all(np.isfinite(array)):
+        raise ValueError(f'{key} holds a number that is not finite')
+    return array
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) < 60 else f'{text[:60]}…'
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -164,7 +275,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises
     ------
     StoredCalibrationError
-        If it is damaged or newer than this package.
+        If it is damaged, newer than this package, or not one that a sensor can have.
     OSError
         If it cannot be read.
 
@@ -172,27 +283,30 @@ def read_calibration(path: Path) -> Calibration:
     try:
         text = path.read_text(encoding='utf-8')
     except UnicodeDecodeError as err:
-        raise _damaged(str(path), 'it is not text') from err
+        raise StoredCalibrationError(f'{path} is not a text file', 'give a file that fit wrote'
+                                     ) from err
     return parse_calibration(text, str(path))
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """
-    Store a calibration; the one before is kept as ``<name>.before``.
+    Store a calibration; the previous one is kept as ``<name>.before``.
 
     Raises
     ------
+    RefusedFitError
+        If it is not one that a sensor can have.
     OSError
         If it cannot be written; what was stored is then as it was.
 
     """
-    text = format_calibration(calibration)
+    text = format_calibration(gated(calibration))
     write_atomically(path, lambda file: file.write(text), keep_before=True)
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:
     """
-    Make sure that a calibration is of this sensor; an empty name matches any.
+    Check that a calibration is of this sensor; an empty name matches any.
 
     Raises
     ------

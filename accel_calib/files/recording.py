@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recordings of any kind, by their name: CSV tables and bags; block by block, or whole."""
+"""Recordings of any kind, CSV tables and bags: block by block, or whole."""
 
 from __future__ import annotations
 
@@ -10,58 +10,38 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from .bag import IMU, imu_topic, is_bag, open_bag
-from .bag_samples import first_frame_id, imu_blocks, together
+from .bag import first_frame_id, imu_samples, imu_topic, is_bag, open_bag, together
 from .table_csv import read_samples
 from ..table import Recording
 from ..units import UnitName
 
 
 @dataclass(frozen=True)
-class Source:
+class OpenRecording:
     """
-    A recording and what its file says of it.
-
-    Parameters
-    ----------
-    recording : Recording
-        The samples.
-    units : {'m/s2', 'g', 'native'} or None
-        Unit of the readings where the file fixes it: Imu messages are in m/s².
-    sensor : str
-        frame_id of the messages; empty for a table.
-
-    """
-
-    recording: Recording
-    units: UnitName | None
-    sensor: str
-
-
-@dataclass(frozen=True)
-class Stream:
-    """
-    An open recording, to be read block by block.
+    An open recording, to be read block by block; made by `open_recording`.
 
     Parameters
     ----------
     blocks : iterator of Recording
-        The samples, in order; however many there are, they take the memory of a block.
+        The samples, in order. However long the recording is, a block takes bounded memory.
     samples : int
-        How many to expect, by the index of the file.
-    units, sensor
-        As of `Source`.
+        Number of samples, by the index of the file.
+    units : {'m/s2', 'g', 'native', ''}
+        Unit of the readings, m/s² for Imu messages; empty if the file does not say it.
+    sensor : str
+        frame_id of the messages; empty if the file does not say it.
 
     """
 
     blocks: Iterator[Recording]
     samples: int
-    units: UnitName | None
+    units: UnitName | str
     sensor: str
 
 
 @contextmanager
-def open_recording(path: Path, topic: str = '') -> Iterator[Stream]:
+def open_recording(path: Path, topic: str = '', sensor: str = '') -> Iterator[OpenRecording]:
     """
     Open a recording: a CSV table, a rosbag2 (folder, mcap, db3) or a ROS 1 bag.
 
@@ -70,27 +50,31 @@ def open_recording(path: Path, topic: str = '') -> Iterator[Stream]:
     path : Path
         The file or folder.
     topic : str
-        Imu topic, where a bag has several.
+        Imu topic, for a bag with several.
+    sensor : str
+        frame_id of the messages to read, for a topic with several sensors.
 
     Raises
     ------
     InputError
-        If it is not what its name says, or holds no samples; also while it is read.
+        If it is not what its name says, holds no samples, or samples of several sensors; also
+        while it is read.
     OSError
         If it cannot be read.
 
     """
     if not is_bag(path):
         table = read_samples(path)
-        yield Stream(iter((table,)), len(table), None, '')
+        yield OpenRecording(iter((table,)), len(table), table.units, table.sensor)
         return
     with open_bag(path) as bag:
         name = imu_topic(bag, topic)
-        frame_id = first_frame_id(bag, name)
-        yield Stream(imu_blocks(bag, name), bag.topics[name, IMU], 'm/s2', frame_id)
+        of = sensor or first_frame_id(bag, name)
+        yield OpenRecording(imu_samples(bag, name, of, chosen=bool(sensor)), bag.count(name),
+                            'm/s2', of)
 
 
-def read_recording(path: Path, topic: str = '') -> Source:
-    """Read a recording whole; takes and raises what `open_recording` does."""
-    with open_recording(path, topic) as stream:
-        return Source(together(list(stream.blocks)), stream.units, stream.sensor)
+def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
+    """Return a whole recording; takes and raises what `open_recording` does."""
+    with open_recording(path, topic, sensor) as recording:
+        return together(list(recording.blocks))

@@ -4,7 +4,8 @@
 """
 Pose tables and recordings as CSV: ``#`` comments, one header line, columns by name.
 
-The names are those of `accel_calib.table.COLUMNS`. Columns of other names are left alone.
+The names are those of `accel_calib.table.COLUMNS`. Columns of other names are ignored. Of the
+comments ``# units: "m/s2"`` and ``# sensor: "imu_link"`` are read, values in JSON.
 
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import csv
+import json
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -20,9 +22,11 @@ from numpy.typing import NDArray
 
 from .atomic import write_atomically
 from ..errors import InputError
-from ..table import COLUMNS, numbered, Poses, Recording, Table
+from ..table import check_values, COLUMNS, numbered, Poses, present, Recording, Table
+from ..units import UNIT_NAMES
 
 _DIGITS = '.12g'
+_ABOUT = ('units', 'sensor')
 
 
 def read_poses(path: Path) -> Poses:
@@ -37,19 +41,14 @@ def read_poses(path: Path) -> Poses:
         If it cannot be read.
 
     """
-    columns = _read(path, needed=('reading',))
-    if 'count' in columns and not np.all(columns['count'] > 0):
-        raise InputError(f'{path}: column count holds numbers that are not above 0',
-                         'give the number of samples of each pose')
-    if 'std' in columns and not np.all(columns['std'] >= 0):
-        raise InputError(f'{path}: column std_x, std_y or std_z holds negative numbers',
-                         'give standard deviations')
-    return Poses(columns, numbered(columns))
+    columns, about = _read(path, needed=('reading',))
+    check_values(columns, str(path))
+    return Poses(columns, numbered(columns), **about)
 
 
 def read_samples(path: Path) -> Recording:
     """
-    Read a recording, one row a sample; raises as `read_poses`.
+    Read a recording, one row per sample.
 
     Raises
     ------
@@ -59,25 +58,28 @@ def read_samples(path: Path) -> Recording:
         If it cannot be read.
 
     """
-    columns = _read(path, needed=('time', 'reading'))
-    return Recording(columns, numbered(columns))
+    columns, about = _read(path, needed=('time', 'reading'))
+    return Recording(columns, numbered(columns), **about)
 
 
 def write_table(path: Path, table: Table) -> None:
     """
-    Write poses or samples; a reader finds the same columns.
+    Write poses or samples; a reader finds the same columns, units and sensor.
 
     Raises
     ------
     OSError
-        If it cannot be written; a file that was there is then as it was.
+        If it cannot be written; an earlier file is then unchanged.
 
     """
-    keys = [key for key in COLUMNS if key in table]
+    keys = [key for key, column in COLUMNS.items() if key in table and not column.made]
     names = [name for key in keys for name in COLUMNS[key].names]
     parts = [_as_text(table[key]) for key in keys]
 
     def write(file: TextIO) -> None:
+        for name in _ABOUT:
+            if getattr(table, name):
+                file.write(f'# {name}: {json.dumps(getattr(table, name), ensure_ascii=False)}\n')
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(names)
         writer.writerows(zip(*(column for part in parts for column in part), strict=True))
@@ -86,7 +88,7 @@ def write_table(path: Path, table: Table) -> None:
 
 
 def _as_text(values: NDArray[Any]) -> list[list[str]]:
-    """Give the columns of an array as text, digits enough for any sensor."""
+    """Return the columns of an array as text, with enough digits for any sensor."""
     if values.dtype.kind in 'US':
         return [values.tolist()]
     digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need them all
@@ -94,18 +96,19 @@ def _as_text(values: NDArray[Any]) -> list[list[str]]:
             for column in np.atleast_2d(values.T)]
 
 
-def _read(path: Path, needed: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read a table into columns of `COLUMNS`."""
+def _read(path: Path, needed: Sequence[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read a table into columns of `COLUMNS`, and its units and sensor."""
     try:
-        filled = filter(str.strip, path.read_text(encoding='utf-8').splitlines())
-        lines = [line for line in filled if line[0] != '#']
+        filled = list(filter(str.strip, path.read_text(encoding='utf-8').splitlines()))
     except UnicodeDecodeError as err:
         raise InputError(f'{path} is not a text file', 'give a CSV table or a bag') from err
+    about = _about(path, [line for line in filled if line[0] == '#'])
+    lines = [line for line in filled if line[0] != '#']
     if not lines:
         raise InputError(f'{path} is empty', f'expected a header line such as '
                          f'{",".join(_names(needed))} and a row for each pose or sample')
     header = [name.strip() for name in lines[0].split(',')]
-    keys = _present(path, header, needed)
+    keys = _keys(path, header, needed)
     if len(lines) == 1:
         raise InputError(f'{path} has a header line and no rows',
                          'give one row for each pose or sample')
@@ -119,28 +122,35 @@ def _read(path: Path, needed: Sequence[str]) -> dict[str, NDArray[Any]]:
     if 'label' in keys:
         rows = csv.reader(lines[1:])
         columns['label'] = np.array([row[header.index('label')] for row in rows], dtype=str)
-    return columns
+    return columns, about
+
+
+def _about(path: Path, comments: list[str]) -> dict[str, Any]:
+    """Return units and sensor, from the comments."""
+    about = {}
+    for line in comments:
+        name, colon, text = line[1:].partition(':')
+        if colon and name.strip() in _ABOUT:
+            try:
+                about[name.strip()] = json.loads(text)
+            except ValueError:
+                continue  # a remark of the user
+    if about.get('units', '') not in ('', *UNIT_NAMES):
+        raise InputError(f'{path} says that its units are {about["units"]!r}, expected one of '
+                         f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')
+    return about
 
 
 def _names(keys: Iterable[str]) -> list[str]:
     return [name for key in keys for name in COLUMNS[key].names]
 
 
-def _present(path: Path, header: list[str], needed: Sequence[str]) -> list[str]:
-    """Tell which columns are there, and make sure that none is there in part."""
+def _keys(path: Path, header: list[str], needed: Sequence[str]) -> list[str]:
+    """Return which columns there are; refuse one that is there twice, or in part."""
     for name in header:
         if header.count(name) > 1 and name in _names(COLUMNS):
             raise InputError(f'{path} has {header.count(name)} columns {name}', 'keep one')
-    keys = []
-    for key, column in COLUMNS.items():
-        missing = [name for name in column.names if name not in header]
-        if not missing:
-            keys.append(key)
-        elif key in needed or len(missing) < len(column.names):
-            raise InputError(f'{path} has the columns {", ".join(header)}, and lacks '
-                             f'{", ".join(missing)}',
-                             f'name the columns {", ".join(column.names)} in the header line')
-    return keys
+    return present(header, needed, str(path))
 
 
 def _numbers(path: Path, rows: list[str], header: list[str],
@@ -158,11 +168,11 @@ def _numbers(path: Path, rows: list[str], header: list[str],
 
 
 def _fault(path: Path, rows: list[str], header: list[str], names: list[str]) -> InputError:
-    """Find the first thing that is not a finite number."""
+    """Return the error for the first cell that is not a finite number."""
     for number, cells in enumerate(csv.reader(rows), 1):
         if len(cells) < len(header):
             return InputError(f'{path}: row {number} has {len(cells)} values, expected '
-                              f'{len(header)}', 'complete the row or take it out')
+                              f'{len(header)}', 'complete the row or remove it')
         for name in names:
             text = cells[header.index(name)].strip()
             try:
@@ -171,5 +181,5 @@ def _fault(path: Path, rows: list[str], header: list[str], names: list[str]) -> 
                 sound = False
             if not sound:
                 return InputError(f'{path}: row {number}, column {name} is {text!r}, expected a '
-                                  'finite number', 'mend the row or take it out')
+                                  'finite number', 'correct the row or remove it')
     return InputError(f'{path} cannot be read as a table', 'check it for stray characters')

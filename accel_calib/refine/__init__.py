@@ -4,9 +4,10 @@
 """
 Poses and calibration to gap, named effect, larger model.
 
-The way of the data: `equations` sets up what poses say near a model, `candidates` gives the
-effects of the catalogue as columns beside them (`output` and `wander` those that are none),
-`score` ranks and admits, `search` adds, pairs and takes back, `refinement` tells the story.
+`base` is the model to begin with, `stored` a calibration that is compared as it is. `state` is a
+model fitted to the poses kept, `candidates` are the effects of the catalogue as columns beside it
+(`output` and `wander` those that are none), `search` adds, pairs and takes back, `refinement` is
+the way in and makes the record; `where`, `untestable` and `advice` put it into words.
 
 """
 

@@ -1,75 +1,105 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What to do after a refinement: which poses or conditions would tell more."""
+"""What to do after a refinement: which poses or conditions would show more."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..effects import EFFECTS
+import numpy as np
+
+from ..effects import CHANGES, effect_named, TO_SEPARATE
+from ..model import parameter_names
 
 if TYPE_CHECKING:
     from .records import Step
     from .search import Found
+    from .state import State
 
-_BY_FORCE = {'quadratic', 'cubic', 'odd_quadratic', 'gain_asymmetry', 'cross_coupling'}
-_BY_TIME = {'offset_drift', 'warm_up', 'offset_step', 'offset_wander', 'offset_temperature',
-            'gain_temperature'}
 _FAR = 10.0
+"""Sizes beyond this many times the typical one are worth a remark."""
+
+_FEW = 10
+"""Degrees of freedom below which most effects cannot show."""
+
+_OTHER_SENSOR = 'this is probably another sensor'
 
 
 def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
-               untestable: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
+               untestable: tuple[tuple[str, str], ...], left_out: int) -> tuple[str, ...]:
     """
-    Say what to do.
+    Return what to do.
 
     Parameters
     ----------
     verdict : str
         Of the refinement.
     found : Found
-        What the search came to.
+        The result of the search.
     steps : tuple of Step
         What was added.
     untestable : tuple of (str, str)
         Effects that cannot be seen, and what they need.
+    left_out : int
+        Poses that were left out.
 
     """
-    lines = [_parting(step) for step in steps if step.rivals]
+    lines = _other_sensor(found)
+    lines += [_separating(step) for step in steps if step.rivals]
     lines += [line for step in steps for line in _remarks(step)]
-    if len(found.knocked):
-        lines.append(f'{len(found.knocked)} poses were disturbed; take them again')
+    if left_out:
+        poses = '1 pose was' if left_out == 1 else f'{left_out} poses were'
+        lines.append(f'{poses} disturbed; take {"it" if left_out == 1 else "them"} again')
+    if found.base.dof < _FEW:
+        lines.append(f'{len(found.base.poses_g)} poses leave {found.base.dof} numbers to find an '
+                     'effect with, and most effects cannot show: take 24 poses or more')
     if verdict == 'unexplained':
         nearest = f'; {", ".join(found.taken_back)} would explain a part alone' if (
             found.taken_back) else ''
-        lines.append('a gap remains that no effect that these data can show accounts for'
+        lines.append('a gap remains that no effect that these data can show explains'
                      f'{nearest}: see what differs between the poses, and repeat some of them')
-        columns = sorted({needs for effect, needs in untestable
-                          if EFFECTS.get(effect) is not None and EFFECTS[effect].needs})
+        columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
         if columns:
             lines.append(f'record {"; ".join(columns)}: effects of these cannot be seen yet')
     return tuple(lines)
 
 
-def _parting(step: Step) -> str:
-    """Say what would part an effect from its rivals."""
-    names = {step.effect, *step.rivals}
-    alike = f'{step.effect} and {", ".join(step.rivals)} look alike here'
-    if names <= _BY_FORCE:
-        return (f'{alike}: on the 1 g sphere they overlap by up to 98 %; more poses between the '
-                'faces would part them, or forces other than 1 g (a centrifuge)')
-    if names <= _BY_TIME:
-        return (f'{alike}: let the temperature fall as well as rise, and visit the same '
-                'orientations again at other times')
-    return f'{alike}: vary the one while the other stays as it is'
+def _other_sensor(found: Found) -> list[str]:
+    """Return a line if the sensor has changed more than one sensor does."""
+    for name, values in found.final.model.values.items():
+        if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
+            return [f'{_OTHER_SENSOR}: its {name.removesuffix("_change")} differs from the stored '
+                    f'one by {np.max(np.abs(values)):.2g} {CHANGES[name].unit}, more than one '
+                    'sensor changes; fit it from its own poses']
+    return []
+
+
+def change_words(name: str, state: State, date: str) -> str:
+    """Return how a value of a stored calibration has changed, with its uncertainty."""
+    effect, model = effect_named(name), state.model
+    which = [parameter_names(model.effects).index(f'{name}.{part}') for part in effect.parameters]
+    deviation = float(np.sqrt(np.mean(np.diag(state.fit.covariance)[which])))
+    in_percent = name != 'offset_change'
+    scale, unit = (100.0, '%') if in_percent else (1e3, 'mg')
+    digits = max(0, -int(np.floor(np.log10(max(deviation * scale, 1e-6)))))
+    values = ', '.join(f'{value * scale:+.{digits}f}' for value in model.values[name])
+    since = f' since {date[:10]}' if date else ''
+    own = effect_named(name.removesuffix('_change')).words
+    return f'the {own} has changed by ({values}) ± {deviation * scale:.{digits}f} {unit}{since}'
+
+
+def _separating(step: Step) -> str:
+    """Return what would separate an effect from its rivals."""
+    families = {effect_named(name).family for name in (step.effect, *step.rivals)}
+    family = families.pop() if len(families) == 1 else ''
+    return (f'{step.effect} and {", ".join(step.rivals)} look alike here: '
+            f'{TO_SEPARATE[family]}')
 
 
 def _remarks(step: Step) -> list[str]:
-    """Remark on values far outside what common parts have."""
-    if step.effect not in EFFECTS:
-        return []
-    effect = EFFECTS[step.effect]
+    """Return remarks on values far outside what common parts have."""
+    effect = effect_named(step.effect)
     largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                   default=0.0)
     if largest <= _FAR * effect.typical:

@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from ..calibrate import Calibration, fit_poses
-from ..calibrate.closed_form import fit_4
-from ..calibrate.likelihood import judge
-from ..calibrate.quality import in_g, quality_of
+from ..calibrate import Calibration, fit_poses, in_g
+from ..calibrate.quality import quality_of
 from ..errors import RefusedFitError
+from ..estimate.closed_form import fit_4
+from ..estimate.fit import judge
 from ..model import Model
+from ..sphere import unit
 from ..table import Floats, Poses
 from ..units import Units
 
@@ -20,7 +19,7 @@ BASES = ('auto', 'ideal', '4', '7', '10', '12')
 
 
 def base_of(poses: Poses, units: Units, name: str) -> Calibration:
-    """Give the calibration to begin with."""
+    """Return the calibration to begin with; raises as `fit_poses`."""
     if name not in BASES:
         raise ValueError(f'base {name!r} is none of {BASES}')
     if name == 'ideal':
@@ -34,15 +33,13 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
 
 
 def ideal(poses: Poses, units: Units) -> Calibration:
-    """Give the ideal sensor; native readings have no zero, so theirs is found first."""
+    """Return the ideal sensor; native readings have no zero, so theirs is fitted first."""
     values: dict[str, Floats] = {}
     if units.name == 'native':
         mat_w, vec_v = fit_4(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
         values = {'offset': vec_v / units.per_g}
     poses_g = in_g(poses, units)
-    model = Model(values)
-    fit = judge(model, poses_g.reading, poses_g.columns, poses_g.noise)
-    directions = poses_g.reading / np.linalg.norm(poses_g.reading, axis=1, keepdims=True)
-    return Calibration('ideal', 'ml', model, units, '', 'ros', '', fit.covariance,
-                       quality_of(fit, poses_g, units, directions), poses, (), 'ideal', ())
+    fit = judge(Model(values), poses_g)
+    return Calibration('ideal', 'ml', fit.model, units, '', 'ros', '', fit.covariance,
+                       quality_of(fit, units, unit(poses_g.reading)), poses, (), 'ideal', ())

@@ -2,31 +2,45 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Candidates: the effects of the catalogue as columns of the equations.
+Candidates: effects as columns of the equations, ranked and admitted.
 
-An effect with a shape is searched over it: the time constant over a fine grid (a coarse one makes
-up second effects), the instant of a step over all pairs of successive poses.
+An effect with a shape is searched over the shapes of the catalogue. Candidates are ranked by the
+Bayesian information criterion with the scale of the noise free (Schwarz 1978): it falls by
+
+    N log(RSS / (RSS - gain)) - q log N - 2 log(shapes tried)
+
+when q parameters explain `gain` of the residual sum of squares. A name is admitted by an F test,
+its probability multiplied by the number of candidates and of shapes tried, and only if the poses
+held out agree. The scale is free because poses repeat worse than their samples say; measured noise
+decides whether a gap remains.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
-from .equations import Equations, kinds
-from .least_squares import Fitted
-from ..effects import Context, EFFECTS
-from ..table import COLUMNS, Floats, Poses
+from .least_squares import Projected
+from ..effects import Context, effect_named
+from ..estimate.equations import Equations
+from ..model import Model
+from ..table import Floats
 
-LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
-"""The effects of V and W, which every sensor has."""
+LEVEL = 0.005
+"""Probability, over all candidates, of a name if nothing is hidden."""
 
-_TAUS = 40
-_LEAST_SIDE = 5
-"""Poses on each side of a step: with three it could take up any one of them."""
+RIVAL = 9.0
+"""Effects whose criterion is within this of the named one's are its rivals: odds of 1 to 90."""
+
+_AS_GOOD = 6.0
+"""Within this of the best criterion the effect with the fewest parameters is taken."""
+
+_USUAL = 1.6
+"""Standard deviation of the logarithm of the size of an effect about its typical size."""
 
 
 @dataclass(frozen=True)
@@ -41,130 +55,198 @@ class Candidate:
     shape : (s,) array
         Its shape.
     columns : (m, r) array
-        What it adds to the equations beyond the model, orthonormal.
+        What it adds to the equations outside the model, orthonormal.
+    size : float
+        Largest of its values if it is added, over the typical size.
     searched : int
         Values of its shape that were found from the same data.
     tried : float
-        How many independent shapes were tried.
+        Number of independent shapes that were tried.
 
     """
 
     effect: str
     shape: Floats
     columns: Floats
+    size: float
     searched: int = 0
     tried: float = 1.0
 
     @property
     def parameters(self) -> int:
-        """How many parameters it costs."""
+        """Return the number of parameters that it costs."""
         return self.columns.shape[1] + self.searched
 
+    def beside(self, fitted: Projected) -> Candidate:
+        """Return the candidate beside a model that has further columns."""
+        return replace(self, columns=fitted.outside(self.columns))
 
-def candidates(equations: Equations, fitted: Fitted, context: Context, names: tuple[str, ...],
-               whitening: Floats | None = None) -> dict[str, Candidate]:
+
+def candidates(equations: Equations, fitted: Projected, context: Context, names: tuple[str, ...],
+               whiten: Callable[[Floats], Floats] | None = None) -> dict[str, Candidate]:
     """
-    Give the candidates among these effects that the equations can tell from the model.
+    Return the candidates among these effects that the equations distinguish from the model.
 
     Parameters
     ----------
     equations : Equations
         Near the model.
-    fitted : Fitted
+    fitted : Projected
         With the model projected out.
     context : mapping of str to array
         Of the poses.
     names : tuple of str
-        Effects of the catalogue.
-    whitening : (m, m) array, optional
+        Names of effects.
+    whiten : callable, optional
         Applied to their columns, as it was to the equations.
 
     """
     found = {}
     for name in names:
-        effect = EFFECTS[name]
+        effect = effect_named(name)
         if effect.output is None and all(key in context for key in effect.needs):
-            best = _best_shape(name, equations, fitted, context, whitening)
+            best = _best_shape(name, equations, fitted, context, whiten)
             if best is not None:
                 found[name] = best
     return found
 
 
-def _best_shape(name: str, equations: Equations, fitted: Fitted, context: Context,
-                whitening: Floats | None) -> Candidate | None:
-    """Give the candidate in its best shape, or None where it cannot be told from the model."""
-    best, best_gain = None, 0.0
-    shapes = list(_shapes(name, context))
+def _best_shape(name: str, equations: Equations, fitted: Projected, context: Context,
+                whiten: Callable[[Floats], Floats] | None) -> Candidate | None:
+    """Return the candidate in its best shape; None if the model spans it."""
+    effect = effect_named(name)
+    shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(context))
+    best, most = None, 0.0
     for shape in shapes:
-        basis = EFFECTS[name].basis(equations.force, context, shape)
-        seen = equations.seen(basis)
-        columns = fitted.without_model(seen if whitening is None else whitening @ seen)
+        model = Model({name: np.concatenate([np.zeros(len(effect.parameters)), shape])})
+        seen = equations.columns(model)[:, :len(effect.parameters)]
+        seen = seen if whiten is None else whiten(seen)
+        columns = fitted.outside(seen)
         gain = float(np.sum((columns.T @ fitted.residual) ** 2))
-        if columns.shape[1] and (best is None or gain > best_gain):
-            tried = 1.0 if len(shapes) == 1 else len(shapes) / 3.0
-            best = Candidate(name, shape, columns, int(len(shapes) > 1), tried)
-            best_gain = gain
-    return best
+        if columns.shape[1] and (best is None or gain > most):
+            best, most = (shape, columns, seen), gain
+    if best is None:
+        return None
+    shape, columns, seen = best
+    left = seen - fitted.onto @ (fitted.onto.T @ seen)
+    values = np.linalg.lstsq(left, fitted.residual, rcond=1e-7)[0]
+    size = float(np.max(np.abs(values))) / effect.typical
+    return Candidate(name, shape, columns, size, int(len(shapes) > 1),
+                     1.0 if len(shapes) == 1 else len(shapes) / 3.0)
 
 
-def _shapes(name: str, context: Context) -> Iterator[Floats]:
-    """Give the shapes to try."""
-    if name in ('offset_drift', 'warm_up', 'offset_step'):
-        time = np.sort(context['time'])
-        start, span = time[0], time[-1] - time[0]
-        if span <= 0.0:
-            return
-        if name == 'offset_drift':
-            yield np.array([start])
-        elif name == 'warm_up':
-            for tau in np.geomspace(span / 60.0, span * 1.5, _TAUS):
-                yield np.array([start, tau])
-        else:
-            middles = (time[1:] + time[:-1]) / 2.0
-            for instant in np.unique(middles[_LEAST_SIDE - 1:len(middles) - _LEAST_SIDE + 1]):
-                yield np.array([instant])
-        return
-    yield np.zeros(0)
+def fall(gain: float, rss: float, count: int, parameters: float, tried: float = 1.0) -> float:
+    """Return the decrease of the criterion from the gain of a candidate; more is better."""
+    left = max(rss - gain, 1e-12 * rss, 1e-300)
+    return float(count * np.log(max(rss, 1e-300) / left) - parameters * np.log(count)
+                 - 2.0 * np.log(tried))
 
 
-def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tuple[str, ...]
-                 ) -> list[tuple[str, str]]:
+def gain_of(columns: Floats, fitted: Projected) -> float:
+    """Return how much of the residual sum of squares orthonormal columns explain."""
+    return float(np.sum((columns.T @ fitted.residual) ** 2))
+
+
+def fall_of(candidate: Candidate, fitted: Projected, count: int) -> float:
+    """Return the decrease of the criterion with this candidate."""
+    return fall(gain_of(candidate.columns, fitted), fitted.rss, count, candidate.parameters,
+                candidate.tried)
+
+
+def unusual(candidate: Candidate) -> float:
+    """Return how unusual the size of a candidate is, on the scale of the criterion."""
+    return (max(np.log(max(candidate.size, 1e-300)), 0.0) / _USUAL) ** 2
+
+
+def best_of(found: dict[str, Candidate], fitted: Projected, count: int) -> Candidate | None:
     """
-    Name the effects that these poses cannot show, with what to record.
+    Return the candidate with the largest decrease of the criterion.
+
+    Among rivals, which these data cannot tell apart, the size decides: one of a usual size is
+    taken before one that no accelerometer has, and one with fewer parameters if it is as good.
+
+    """
+    if not found:
+        return None
+    falls = {name: fall_of(candidate, fitted, count) for name, candidate in found.items()}
+    most = max(falls.values())
+    credible = {name: falls_by - unusual(found[name]) for name, falls_by in falls.items()
+                if falls_by > most - RIVAL}
+    most = max(credible.values())
+    near = [name for name, falls_by in credible.items() if falls_by > most - _AS_GOOD]
+    return found[min(near, key=lambda name: (found[name].parameters, 'new' in effect_named(
+        name).needs, -credible[name]))]
+
+
+def probability(candidate: Candidate, fitted: Projected, dof: int, among: int) -> float:
+    """
+    Return the probability that noise alone makes one of the candidates this good.
 
     Parameters
     ----------
-    poses_g : Poses
-        In g.
-    testable : mapping of str to Candidate
-        Effects that they can show.
-    present : tuple of str
-        Effects of the model, and their rivals.
+    candidate : Candidate
+        The best of them.
+    fitted : Projected
+        The model without it.
+    dof : int
+        Independent equations less parameters of the model.
+    among : int
+        Number of candidates.
 
     """
-    missing = []
-    known = kinds(poses_g)[0]
-    for name, effect in EFFECTS.items():
-        if name in testable or name in present or effect.output is not None:
-            continue
-        if name in ('gain', 'axis_gain') and {'gain', 'axis_gain'} & set(present):
-            continue
-        lacking = [', '.join(COLUMNS[key].names) for key in effect.needs
-                   if key in COLUMNS and key not in poses_g]
-        if lacking:
-            missing.append((name, ' and '.join(lacking)))
-        elif name == 'misalignment' and not len(known):
-            missing.append((name, 'ref_x, ref_y, ref_z (known orientation)'))
-        else:
-            missing.append((name, _more(name)))
-    if 'time' not in poses_g:
-        missing.append(('offset_wander', 'time'))
-    return missing
+    from scipy.special import fdtrc
+
+    added = candidate.parameters
+    left = dof - added
+    if left < 1:
+        return 1.0
+    gain = gain_of(candidate.columns, fitted)
+    rss = max(fitted.rss - gain, 1e-300)
+    p = float(fdtrc(added, left, gain / added / (rss / left)))
+    return min(1.0, p * among * candidate.tried)
 
 
-def _more(name: str) -> str:
-    """Say what would make an effect visible whose columns are there."""
-    needs = [COLUMNS[key].meaning for key in EFFECTS[name].needs if key in COLUMNS]
-    if needs:
-        return f'poses between which this changes more: {needs[0]}'
-    return 'more poses in more directions'
+def agrees(candidate: Candidate, fitted: Projected) -> bool:
+    """Return whether poses held out are predicted better with the candidate than without."""
+    with_it = fitted.plus(candidate.columns).held_out
+    return bool(with_it @ with_it < fitted.held_out @ fitted.held_out)
+
+
+_PAIR_BETTER = 12.0
+"""By how much the criterion of a pair must be below that of the best two single steps."""
+
+
+def best_pair(found: dict[str, Candidate], fitted: Projected, count: int
+              ) -> tuple[Candidate, Candidate] | None:
+    """Return the pair with the largest decrease of the criterion, the better one first."""
+    best, most = None, -np.inf
+    for first, second in combinations(found.values(), 2):
+        onto = np.linalg.qr(np.hstack([first.columns, second.columns]))[0]
+        gain = gain_of(onto, fitted)
+        falls = fall(gain, fitted.rss, count, first.parameters + second.parameters,
+                     first.tried * second.tried)
+        if falls > most:
+            best, most = (first, second), falls
+    if best is None:
+        return None
+    ordered = sorted(best, key=lambda c: -gain_of(c.columns, fitted))
+    return ordered[0], ordered[1]
+
+
+def pair_is_better(pair: tuple[Candidate, Candidate], single: Candidate, fitted: Projected,
+                   count: int, found: dict[str, Candidate]) -> bool:
+    """Return whether both of a pair are significant, and better than single steps."""
+    if single.effect in (pair[0].effect, pair[1].effect):
+        return False
+    for one, other in (pair, pair[::-1]):
+        beside = fitted.plus(other.columns)
+        left = one.beside(beside)
+        if not left.columns.shape[1] or probability(left, beside, count - other.parameters,
+                                                    len(found)) > LEVEL:
+            return False
+    first = fitted.plus(single.columns)
+    second = max((fall_of(c.beside(first), first, count) for c in found.values()
+                  if c.effect != single.effect), default=0.0)
+    with_one = fitted.plus(pair[0].columns)
+    together = fall_of(pair[0], fitted, count) + fall_of(pair[1].beside(with_one), with_one, count)
+    return together > fall_of(single, fitted, count) + max(second, 0.0) + _PAIR_BETTER

@@ -4,9 +4,9 @@
 """
 Linear least squares with columns that come and go.
 
-`Fitted` holds the equations with the columns in the model projected out. The gain of further
-columns is then one small regression: the joint refit of all values, to first order, at the cost of
-the candidate alone.
+`Projected` holds the residual of the equations with the columns of the model projected out. The
+gain of further columns is then one small regression: the joint refit of all values, to first
+order, at the cost of the candidate alone.
 
 """
 
@@ -19,11 +19,11 @@ import numpy as np
 from ..table import Floats
 
 _SEEN = 0.02
-"""A column of which less than this part is left beside the model cannot be told from it."""
+"""A column of which less than this part is outside the model cannot be distinguished from it."""
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Projected:
     """
     Equations with columns projected out.
 
@@ -32,7 +32,7 @@ class Fitted:
     onto : (m, r) array
         Orthonormal columns that span the model.
     residual : (m,) array
-        What it leaves.
+        What the model leaves.
 
     """
 
@@ -44,8 +44,8 @@ class Fitted:
         """Residual sum of squares."""
         return float(self.residual @ self.residual)
 
-    def without_model(self, columns: Floats) -> Floats:
-        """Give the part of (m, q) columns that the model does not span, orthonormal (m, r)."""
+    def outside(self, columns: Floats) -> Floats:
+        """Return the part of (m, q) columns that the model does not span, orthonormal (m, r)."""
         left = columns - self.onto @ (self.onto.T @ columns)
         sizes = np.linalg.norm(columns, axis=0)
         kept = np.linalg.norm(left, axis=0) > _SEEN * np.maximum(sizes, 1e-300)
@@ -55,23 +55,23 @@ class Fitted:
         left_vectors, scales, _ = np.linalg.svd(scaled, full_matrices=False)
         return left_vectors[:, scales > _SEEN * max(scales[0], _SEEN)]
 
-    def plus(self, orthonormal: Floats) -> Fitted:
-        """Take up columns that `without_model` gave."""
-        return Fitted(np.hstack([self.onto, orthonormal]),
-                      self.residual - orthonormal @ (orthonormal.T @ self.residual))
+    def plus(self, orthonormal: Floats) -> Projected:
+        """Return the equations with columns from `outside` projected out too."""
+        return Projected(np.hstack([self.onto, orthonormal]),
+                         self.residual - orthonormal @ (orthonormal.T @ self.residual))
 
-    def with_columns(self, columns: Floats) -> Fitted:
-        """Take up (m, q) columns."""
-        return self.plus(self.without_model(columns))
+    def with_columns(self, columns: Floats) -> Projected:
+        """Return the equations with (m, q) columns projected out too."""
+        return self.plus(self.outside(columns))
 
     @property
-    def left_out(self) -> Floats:
-        """Give each residual as it is when its own equation is left out, (m,) (PRESS)."""
+    def held_out(self) -> Floats:
+        """(m,) array, each residual when its own equation is left out (PRESS)."""
         own = 1.0 - np.sum(self.onto ** 2, axis=1)
         return self.residual / np.maximum(own, 0.02)
 
 
-def fitted(residual: Floats, columns: Floats) -> Fitted:
+def projected(residual: Floats, columns: Floats) -> Projected:
     """Project (m, q) columns out of the (m,) residual."""
-    start = Fitted(np.zeros((len(residual), 0)), residual)
+    start = Projected(np.zeros((len(residual), 0)), residual)
     return start.with_columns(columns) if columns.shape[1] else start

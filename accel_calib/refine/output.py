@@ -8,7 +8,7 @@ Both act on the whole reading and are no columns beside the others; they show in
 themselves. Where the samples of a pose hardly scatter on an axis at its extreme, the sensor clips:
 that pose, and the others so near the limit that some samples reach it, are left out of the fit.
 Where pose means are multiples of a step that is coarse against the noise, the step q adds a
-variance of q²/12 that no averaging takes away.
+variance of q²/12 that no averaging removes.
 
 """
 
@@ -19,29 +19,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .noise import is_down_to_noise
-from .score import fall
+from .candidates import fall
 from .state import beginning, State
 from ..model import Model
 from ..table import Floats, Poses
 
 _LEAST_CLIPPED = 2
 _QUIET = 0.25
-"""Scatter of clipped samples over that of others, at most."""
+"""Largest scatter of clipped samples over that of others."""
 
 _REACH = 2.0
 """Standard deviations from the limit within which samples reach it."""
 
 _LEAST_CONSTANT = 0.2
-"""Share of readings from which those whose samples do not scatter tell the grid alone."""
+"""Share of readings from which those whose samples do not scatter define the grid alone."""
 
 _ON_GRID = 0.6
 _OFF_GRID = 0.05
 """Distance from a multiple of the step, in steps, within which a reading is on the grid."""
 
+_COARSEST_G = 0.1
+_LEAST_STEPS = 12
+"""Coarsest step of a sensor [g]; readings that differ, at least, to see a grid in them."""
+
 _LEAST_KEPT = 6
 _CLEARLY = 10.0
-"""By how much the criterion must fall for poses at the limit to be left out."""
+"""Decrease of the criterion for poses at the limit to be left out."""
 
 _COARSE = 1.0
 """Least q/√12 over the noise of a pose mean for a grid to matter."""
@@ -66,7 +69,7 @@ class Clipped:
 
 
 def clipped(poses_g: Poses) -> Clipped | None:
-    """Find poses that end at a limit, from the scatter of their samples; None if none do."""
+    """Return the poses that end at a limit, from the scatter of their samples, or None."""
     if 'std' not in poses_g:
         return None
     size, scatter = np.abs(poses_g.reading), float(np.median(poses_g['std']))
@@ -86,25 +89,26 @@ def grid_step(poses_g: Poses) -> float | None:
     Returns
     -------
     float or None
-        The step [g]; None where there is none that is coarse against the noise.
+        The step [g]; None if there is none that is coarse against the noise.
 
     """
     values = _constant(poses_g)
-    gaps = np.concatenate([np.diff(np.unique(column)) for column in values])
-    gaps = gaps[gaps > 1e-7]
-    if not gaps.size:
+    different = [np.unique(column) for column in values]
+    apart = np.concatenate([np.diff(column) for column in different])
+    apart = apart[apart > 1e-7]
+    if sum(map(len, different)) < _LEAST_STEPS or not apart.size:
         return None
     noise = 0.0 if poses_g.noise is None else float(np.median(poses_g.noise))
-    for step in _steps(gaps):
+    for step in _steps(apart):
         if step / np.sqrt(12.0) < max(_COARSE * noise, 1e-5):
             return None
-        if _on_grid(np.concatenate(values), step) >= _ON_GRID:
+        if step <= _COARSEST_G and _on_grid(np.concatenate(values), step) >= _ON_GRID:
             return float(step)
     return None
 
 
 def _constant(poses_g: Poses) -> list[Floats]:
-    """Give the readings of each axis whose samples do not scatter at all; all, if few are so."""
+    """Return the readings of each axis whose samples do not scatter; all, if few are so."""
     reading = poses_g.reading
     if 'std' in poses_g:
         still = poses_g['std'] < 1e-9
@@ -113,31 +117,31 @@ def _constant(poses_g: Poses) -> list[Floats]:
     return list(reading.T)
 
 
-def _steps(gaps: Floats) -> Floats:
-    """Give steps to try: typical smallest gaps and their simple parts."""
-    smallest = np.quantile(gaps, np.linspace(0.0, 0.7, 15), method='nearest')
+def _steps(apart: Floats) -> Floats:
+    """Return the steps to try: typical smallest distances and their simple parts."""
+    smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
     return np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
 
 
 def _on_grid(values: Floats, step: float) -> float:
-    """Give the share of readings that are multiples of the step."""
+    """Return the share of readings that are multiples of the step."""
     steps = values / step
     return float(np.mean(np.abs(steps - np.round(steps)) < _OFF_GRID))
 
 
 def with_grid(poses_g: Poses, step: float) -> Poses:
-    """Give the poses with the variance of the grid in their noise."""
+    """Return the poses with the variance of the grid in their noise."""
     noise = np.zeros_like(poses_g.reading) if poses_g.noise is None else poses_g.noise
     std = np.sqrt(noise ** 2 + step ** 2 / 12.0)
     return poses_g.with_columns(std=std, count=np.ones(len(poses_g)))
 
 
 def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None]:
-    """Find poses at the limit of the sensor, where leaving them out closes a gap."""
+    """Return the poses at the limit of the sensor, if leaving them out closes a gap."""
     clip = clipped(poses_g)
     if clip is None or len(poses_g) - len(clip.poses) < _LEAST_KEPT:
         return None, None
-    # Clipped samples hardly scatter, so their noise says nothing: all weigh the same here.
+    # Clipped samples hardly scatter, so their noise means nothing: all weigh the same here.
     plain = Poses({key: values for key, values in poses_g.columns.items() if key != 'std'},
                   poses_g.row)
     whole, kept = beginning(plain, base), beginning(
@@ -148,11 +152,8 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
 
 
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
-    """Find a coarse grid, where it is the grid that the measured noise leaves out."""
+    """Return the poses with the noise of a coarse grid, if that is what their noise leaves out."""
     step = grid_step(poses_g)
-    if step is None:
-        return poses_g, None
-    before = beginning(poses_g, base)
-    if is_down_to_noise(before):
+    if step is None or beginning(poses_g, base).is_down_to_noise:
         return poses_g, None
     return with_grid(poses_g, step), step

@@ -2,48 +2,52 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The refinement: a calibration in, a larger one and the story of how it grew out.
+The refinement: a calibration in, a larger one and how it was found out.
 
-See `accel_calib.refine.search` for the method.
+See `accel_calib.refine.search` for the method, `.stored` for a stored calibration as the base.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from .advice import advice_for
+from .advice import advice_for, change_words
 from .base import base_of
-from .candidates import LADDER, not_testable
-from .exact import covariance_of
-from .noise import is_noise, is_noise_of
+from .candidates import fall_of, probability, RIVAL
 from .records import Refinement, Stage, Step, Verdict
-from .score import fall_of, probability
-from .search import Found, search, WANDER
-from .state import plus, State
+from .search import Found, search
+from .state import is_noise, State
+from .stored import beside_stored, with_changes, with_stored
+from .untestable import not_testable
 from .where import where
-from ..calibrate import Calibration
-from ..calibrate.geometry import coverage
-from ..calibrate.likelihood import judge
-from ..calibrate.quality import in_g, quality_of
-from ..calibrate.unit_check import check_units
-from ..effects import EFFECTS
+from ..calibrate import Calibration, check_units, FLAT, gated, in_g, Rejected
+from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
+from ..calibrate.previous_pose import with_previous
+from ..calibrate.quality import fit_warnings, other_warnings, quality_of
+from ..effects import CHANGES, effect_named, LADDER, WANDER
 from ..errors import RefusedFitError
+from ..estimate.fit import judge
+from ..estimate.geometry import LARGEST_DILUTION
+from ..estimate.noise import variance_factor
+from ..estimate.solve import NotConvergedError
 from ..model import Model
+from ..sphere import unit
 from ..table import Poses
 from ..units import MG, Units
 
-_RIVAL = 9.0
-"""Effects whose criterion is within this of the named one's are its rivals: odds of 1 to 90."""
+_LEAST_POSES = 4
+_NAMED = 4
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
            date: str = '') -> Refinement:
     """
-    Find what a model lacks, name it, add it, and show how the gap shrinks.
+    Find what a model lacks, name it, add it, and show how the residual shrinks.
 
     Parameters
     ----------
@@ -52,7 +56,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     units : Units
         That unit.
     base : Calibration or {'auto', 'ideal', '4', '7', '10', '12'}
-        The model to begin with.
+        The model to begin with. A Calibration is compared as it is stored: first how the sensor
+        has changed since then, then what the calibration lacks.
     sensor, date : str
         Kept in the refined calibration.
 
@@ -64,83 +69,156 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     Raises
     ------
     RefusedFitError
-        If the poses cannot carry the base.
+        If the poses do not determine the base, or leave nothing to find an effect with.
     InputError
-        If the readings are plainly not in that unit.
+        If the readings are clearly not in that unit.
 
     """
     check_units(poses, units)
-    if len(poses) < 4:
-        raise RefusedFitError(f'{len(poses)} poses are too few to find an effect',
+    sure, doubts = sure_rows(poses)
+    if doubts:
+        try:
+            return _refine(poses, sure, doubts, units, base, sensor, date)
+        except RefusedFitError:
+            pass  # the doubtful poses are needed
+    return _refine(poses, poses, (), units, base, sensor, date)
+
+
+def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
+            base: str | Calibration, sensor: str, date: str) -> Refinement:
+    """Refine with some of the poses; the others are rejected already."""
+    sound, unsound = sound_rows(used, units)
+    if len(sound) < _LEAST_POSES:
+        raise RefusedFitError(f'{len(sound)} poses are too few to find an effect',
                               'take at least 4, better 24')
-    calibration = base if isinstance(base, Calibration) else base_of(poses, units, base)
-    poses_g = in_g(poses, calibration.units)
-    found = search(poses_g, Model(calibration.model.values))
-    states = _sequence(found)
-    steps = tuple(_step(name, before, after, found)
-                  for name, before, after in zip(found.added, states[:-1], states[1:],
-                                                 strict=False))
-    steps = (*_output_steps(found), *steps)
+    stored = base if isinstance(base, Calibration) else None
+    calibration = stored or base_of(sound, units, str(base))
+    poses_g = with_previous(in_g(sound, calibration.units), calibration.model)
+    if stored is not None:
+        poses_g = beside_stored(poses_g, stored)
+    model = Model(calibration.model.values)
+    try:
+        found = search(poses_g, model)
+    except NotConvergedError:
+        raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses',
+                              'check the poses for mistakes, or begin with another base') from None
+    if found.base.dof < 1:
+        raise RefusedFitError(
+            f'{len(sound)} poses for {found.base.fitted.onto.shape[1]} parameters of the base '
+            'leave nothing to find an effect with', 'take 12 poses or more, better 24')
+    given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound))
+    return _told(calibration, found, given, sensor or poses.sensor, date)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The poses as given, all poses used [g], whether the base is stored, and unsound rows."""
+
+    poses: Poses
+    poses_g: Poses
+    stored: bool
+    rejected: tuple[Rejected, ...]
+
+    @property
+    def joint(self) -> bool:
+        """Whether the poses of the stored calibration are among those used."""
+        return 'new' in self.poses_g
+
+
+def _told(calibration: Calibration, found: Found, given: _Given, sensor: str, date: str
+          ) -> Refinement:
+    """Return the record of a search."""
+    start = _as_stored(calibration, found) if given.stored else found.base
+    states = _sequence(found, start)
+    steps = (*_output_steps(found), *(
+        _step(name, pair, found, calibration.date, unseen=given.joint and k == 0)
+        for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))))
     remaining, noise = _remaining(found)
-    verdict: Verdict = ('unexplained' if not noise else 'explained' if steps else 'no_gap')
-    left_out = tuple(int(row) for row in poses.row[found.knocked])
-    alike = tuple(rival for step in steps for rival in step.rivals)
-    testable = {**found.final.found, **found.final.candidates_among(LADDER)}
-    untestable = tuple(not_testable(found.final.poses_g, testable,
-                                    (*found.final.model.effects, *alike)))
-    kept = found.final.poses_g
+    verdict: Verdict = 'unexplained' if not noise else 'explained' if steps else 'no_gap'
+    rejected = _rejected(found, given)
+    refined, refusal = _refined(calibration, found, given, rejected)
+    if sensor or date:
+        refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
+    untestable = _untestable(found, steps)
     return Refinement(
-        verdict, found.final.floor_mg, found.base.gap_mg(found.base.fitted.residual), remaining,
-        steps, left_out, untestable, advice_for(verdict, found, steps, untestable),
-        _refined(calibration, found, poses, sensor, date), kept, found.final.near.force,
-        _stages(states, found))
+        verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
+        tuple(each.row for each in rejected), untestable,
+        advice_for(verdict, found, steps, untestable, len(rejected)), refined, refusal,
+        found.final.poses_g, found.final.fit.equations.force, _stages(states, found))
 
 
-def _sequence(found: Found) -> list[State]:
-    """Give the states from the base on, one for each effect added."""
-    states = [found.base]
+def _as_stored(calibration: Calibration, found: Found) -> State:
+    """Return a stored calibration at the poses kept, as it is."""
+    kept = calibration.held(found.base.poses_g)
+    return State(judge(Model(calibration.model.values), kept))
+
+
+def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
+    """Return the rows of the table that were left out, and why."""
+    out = given.poses_g.take(found.outliers)
+    force = found.final.model.at(out.columns).force(out.reading)
+    away = np.linalg.norm(force, axis=1) - 1.0
+    rejected = [Rejected(int(row), f'outlier: |force| is {error * MG:+.2f} mg off what the other '
+                         'poses say') for row, error in zip(out.row, away, strict=True)]
+    if found.clipped is not None:
+        rejected += [Rejected(int(row), 'it ends at the limit of the sensor')
+                     for row in given.poses_g.row[found.clipped.poses]]
+    return tuple(sorted((*given.rejected, *(each for each in rejected
+                                            if each.row in given.poses.row)),
+                        key=lambda each: each.row))
+
+
+def _sequence(found: Found, start: State) -> list[State]:
+    """Return the states from the start on, one for each effect added."""
+    states, state = [start], found.base
     for name in found.added:
         if name == WANDER:
             break
-        among = states[-1].candidates_among((name,))
-        states.append(plus(states[-1], among[name]) if name in among else states[-1])
+        among = state.candidates_among((name,))
+        state = (state.plus(among[name]) if name in among else None) or state
+        states.append(state)
     if len(states) > 1 and found.added[-1] != WANDER:
-        states[-1] = State(found.final.model, states[-1].poses_g)
+        states[-1] = State(judge(found.final.model, states[-1].poses_g))
     return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
 
 
-def _step(name: str, before: State, after: State, found: Found) -> Step:
-    """Tell the story of one step."""
+def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
+          ) -> Step:
+    """Return the record of one step; `unseen` if the model before it never saw the poses."""
+    before, after = states
     if name == WANDER:
         return _wander_step(before)
     among = {**before.found, **before.candidates_among((name,))}
     values = after.model.values.get(name, np.zeros(0))
     p_value = (probability(among[name], before.fitted, before.dof, len(among))
                if name in among else 1.0)
-    return Step(name, _rivals(name, found), dict(zip(EFFECTS[name].values, values.tolist(),
-                                                     strict=False)),
-                before.gap_mg(before.fitted.residual), after.gap_mg(after.fitted.residual),
-                before.gap_mg(before.fitted.left_out), after.gap_mg(after.fitted.left_out),
-                p_value, where(name, before, after.near.residual))
+    seen = where(name, before, after.fit.residual)
+    if name in CHANGES:
+        seen = f'{change_words(name, after, date)}; {seen}'
+    held_out = before.fit.residual if unseen else before.fitted.held_out
+    return Step(name.removesuffix('_change'), _rivals(name, found),
+                dict(zip(effect_named(name).values, values.tolist(), strict=False)),
+                before.gap_mg(before.fit.residual), after.gap_mg(after.fit.residual),
+                before.gap_mg(held_out), after.gap_mg(after.fitted.held_out), p_value, seen)
 
 
 def _output_steps(found: Found) -> tuple[Step, ...]:
-    """Tell of readings that end at a limit or lie on a grid."""
+    """Return the steps of readings that end at a limit or lie on a grid."""
     steps = []
     base = found.base
-    gap, held_out = base.gap_mg(base.fitted.residual), base.gap_mg(base.fitted.left_out)
+    gap, held_out = base.gap_mg(base.fitted.residual), base.gap_mg(base.fitted.held_out)
     if found.clipped is not None and found.with_clipped is not None:
         whole = found.with_clipped
         rows = ', '.join(str(row) for row in whole.poses_g.row[found.clipped.poses])
         steps.append(Step('saturation', (), {'limit': found.clipped.limit_g},
                           whole.gap_mg(whole.fitted.residual), gap,
-                          whole.gap_mg(whole.fitted.left_out), held_out, 0.0,
+                          whole.gap_mg(whole.fitted.held_out), held_out, 0.0,
                           f'rows {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
                           'samples hardly scatter'))
     if found.grid_g is not None:
         steps.append(Step('quantisation', (), {'step': found.grid_g}, gap, gap, held_out, held_out,
                           0.0, f'pose means are multiples of {found.grid_g * MG:.3g} mg: that '
-                          f'alone is {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS an axis'))
+                          f'alone is {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS per axis'))
     return tuple(steps)
 
 
@@ -150,60 +228,100 @@ def _wander_step(before: State) -> Step:
         raise ValueError('a walk was named without one')
     p_value = float(np.exp(-walk.likelihood_ratio / 2.0))
     return Step(WANDER, (), {}, before.gap_mg(before.fitted.residual),
-                before.gap_mg(walk.residual), before.gap_mg(before.fitted.left_out),
-                before.gap_mg(walk.left_out), p_value, where(WANDER, before, walk.residual))
+                before.gap_mg(walk.residual), before.gap_mg(before.fitted.held_out),
+                before.gap_mg(walk.held_out), p_value, where(WANDER, before, walk.residual))
 
 
 def _rivals(name: str, found: Found) -> tuple[str, ...]:
-    """Name the effects that would do about as well in the place of this one."""
+    """Return the effects that would do about as well in the place of this one."""
     final = found.final
     if name not in final.model.values or name in found.base.model.values:
         return ()
-    without = final.with_effects({key: part for key, part in final.model.values.items()
-                                  if key != name})
+    without = final.without_effect(name)
+    if without is None:
+        return ()
     among = {**without.found, **without.candidates_among((name,))}
     if name not in among:
         return ()
     falls = {key: fall_of(c, without.fitted, without.dof) for key, c in among.items()}
     rivals = [key for key, falls_by in falls.items()
               if key != name and (key in LADDER or name not in LADDER)
-              and falls_by > max(falls[name] - _RIVAL, 0.0)]
+              and falls_by > max(falls[name] - RIVAL, 0.0)]
     walk = without.wander
-    if walk is not None and walk.fall > falls[name] - _RIVAL:
+    if walk is not None and walk.fall > falls[name] - RIVAL:
         rivals.append(WANDER)
-    return tuple(rivals)
+    return tuple(dict.fromkeys(rival.removesuffix('_change') for rival in rivals))
 
 
 def _remaining(found: Found) -> tuple[float, bool]:
-    """Give the gap that remains, and whether it is no more than noise."""
+    """Return the residual that remains, and whether it is no more than noise."""
     final = found.final
     if found.added[-1:] != (WANDER,) or final.wander is None:
-        return final.gap_mg(final.fitted.residual), is_noise(final)
+        return final.gap_mg(final.fitted.residual), final.is_noise
     residual = final.wander.residual
-    noise = final.noise is None or is_noise_of(float(residual @ residual), final.dof)
+    noise = not final.fit.noise_known or is_noise(float(residual @ residual), final.dof)
     return final.gap_mg(residual), noise
 
 
+def _untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
+    final = found.final
+    testable = {**final.found, **final.candidates_among(LADDER)}
+    rivals = tuple(rival for step in steps for rival in step.rivals)
+    return tuple(not_testable(final.poses_g, testable, (*final.model.effects, *rivals)))
+
+
 def _stages(states: Sequence[State], found: Found) -> tuple[Stage, ...]:
-    names = ('base', *found.added)
+    names = ('base', *(name.removesuffix('_change') for name in found.added))
     stages = []
     for name, state in zip(names, states, strict=False):
-        residual = state.fitted.residual
+        residual = state.fit.residual
         if name == WANDER and state.wander is not None:
             residual = state.wander.residual
-        stages.append(Stage(name, state.near.residual_of_pose(residual) * 1e3))
+        stages.append(Stage(name, state.fit.equations.of_poses(residual) * MG))
     return tuple(stages)
 
 
-def _refined(base: Calibration, found: Found, poses: Poses, sensor: str, date: str
-             ) -> Calibration:
-    """Make the refined calibration: an ordinary one."""
+def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rejected, ...]
+             ) -> tuple[Calibration, tuple[str, ...]]:
+    """Return the refined calibration, and why it must not be used, if so."""
     final = found.final
-    rotation = base.model.rotation
-    fit = judge(final.model, final.poses_g.reading, final.poses_g.columns, final.poses_g.noise)
-    quality = quality_of(fit, final.poses_g, base.units, final.near.force)
-    reason = f'{base.reason}; refined: {", ".join(found.added) or "nothing added"}'
-    return replace(base, model=Model(final.model.values, rotation),
-                   covariance=covariance_of(final.model, final.poses_g, final.noise),
-                   quality=replace(quality, coverage=coverage(final.near.force)), poses=poses,
-                   sensor=sensor or base.sensor, date=date or base.date, reason=reason)
+    model, matrix = with_changes(final.model)
+    kept, poses = final.poses_g, given.poses
+    if given.joint and (final.model.effects == model.effects and 'time' not in model.needs):
+        poses = with_stored(given.poses, base)
+    elif given.joint:
+        kept = kept.take(kept['new'] > 0.0)
+    if base.name != '12':
+        kept = Poses({key: values for key, values in kept.columns.items()
+                      if key not in ('reference', 'orientation')}, kept.row)
+    at_poses = judge(model, kept)
+    names = ', '.join(name.removesuffix('_change') for name in found.added)
+    warnings = [line for line in other_warnings(base.warnings)
+                if not given.stored or line.startswith(FLAT)]
+    refined = replace(
+        base, model=Model(model.values, base.model.rotation),
+        covariance=matrix @ final.fit.covariance @ matrix.T,
+        quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
+        rejected=rejected, warnings=tuple(warnings),
+        reason=f'{base.reason}; refined: {names or "nothing added"}')
+    try:
+        return _determined(gated(refined), final)
+    except RefusedFitError as refused:
+        return refined, (refused.message, refused.advice)
+
+
+def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
+    """Return a calibration with a warning, or with a refusal, if its poses leave much open."""
+    fit = final.fit
+    if fit.undetermined:
+        return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
+                         f'{", …" if len(fit.undetermined) > _NAMED else ""}',
+                         'take poses with each side of the sensor up and down, and some edges')
+    factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
+    stretched = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
+    if stretched > LARGEST_DILUTION:
+        return refined, ('the poses do not determine the refined calibration: the error of |a| '
+                         f'is up to {stretched:.3g} times that of a pose, expected less than '
+                         f'{LARGEST_DILUTION:.0f} times',
+                         'take poses with each side of the sensor up and down, and some edges')
+    return replace(refined, warnings=(*refined.warnings, *fit_warnings(fit, stretched))), ()

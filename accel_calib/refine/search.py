@@ -5,12 +5,14 @@
 The search for missing effects.
 
 First the ladder: offset, gain, gain by axis, cross-axis, as far as the base lacks them, always the
-one that lowers the criterion most. Then, in turn: poses that stand out go, if that lowers the
-criterion more than any effect; otherwise the best effect is added, or the best pair where that is
-better still, and everything is fitted again; then earlier names are tried anew, each against being
-left out and against every other effect. At the end, names that explain no more than a part of what
-lies above the noise are taken back: the rest then comes from something that is not in the
+one that lowers the criterion most. Then, in turn: outliers are left out, if that lowers the
+criterion more than any effect; otherwise the best effect is added, or the best pair if that is
+better still, and everything is fitted again; then earlier names are tested again, each against
+being left out and against every other effect. At the end, names that explain no more than a part
+of what lies above the noise are taken back: the rest then comes from something that is not in the
 catalogue, and so may they.
+
+A step is kept only if its fit converged, the cost fell and its values are plausible.
 
 """
 
@@ -21,55 +23,59 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .candidates import Candidate, LADDER
-from .equations import kinds
-from .knocked import knocked
-from .least_squares import Fitted, fitted
-from .noise import is_down_to_noise, is_noise
+from .candidates import (
+    agrees,
+    best_of,
+    best_pair,
+    Candidate,
+    fall,
+    fall_of,
+    LEVEL,
+    pair_is_better,
+    probability,
+)
+from .least_squares import projected
 from .output import Clipped, off_grid, unclipped
-from .pairs import best_pair, pair_is_better
-from .score import agrees, fall_of, LEVEL, probability
-from .state import beginning, plus, State
+from .state import beginning, State
+from ..effects import LADDER, WANDER
+from ..estimate.equations import kinds
+from ..estimate.fit import judge
+from ..estimate.outliers import outliers
 from ..model import Model
 from ..table import Poses
 
 _LARGEST = 5
-"""Effects that are added at most."""
+"""Most effects that are added."""
 
-_KNOCKED_BETTER = 2.0
-"""How many times more poses that stand out must say than any effect."""
-
-_AS_GOOD = 6.0
-"""Within this of the best criterion the effect with the fewest parameters is taken."""
+_OUTLIERS_BETTER = 2.0
+"""Outliers go first if they explain this many times more than any effect."""
 
 _WALK_SIGNIFICANT = 8.0
-"""Twice the logarithm of the likelihood ratio: p = 0.002."""
+"""Twice the logarithm of the likelihood ratio of a walk that is named: p = 0.002."""
 
 _LEAST_SHARE = 0.6
 """Part of what lies above the noise that the names must explain, if something else is left."""
-
-WANDER = 'offset_wander'
 
 
 @dataclass(frozen=True)
 class Found:
     """
-    What a search came to.
+    The result of a search.
 
     Parameters
     ----------
     base, final : State
         Before and after; the same poses are kept in both.
     added : tuple of str
-        Effects added, in order; `WANDER` last where the rest is a random walk of the offset.
-    knocked : (d,) array of int
-        Indices of the disturbed poses.
+        Effects added, in order; `WANDER` last if the rest is a random walk of the offset.
+    outliers : (d,) array of int
+        Indices of the outliers.
     taken_back : tuple of str
         Names that did not explain enough.
     clipped : Clipped or None
         Poses at the limit of the sensor; left out, too.
     grid_g : float or None
-        Step of the grid on which readings lie [g], where it matters.
+        Step of the grid on which readings lie [g], if it matters.
     with_clipped : State or None
         The base fitted to the clipped poses as well.
 
@@ -78,7 +84,7 @@ class Found:
     base: State
     final: State
     added: tuple[str, ...]
-    knocked: NDArray[np.intp]
+    outliers: NDArray[np.intp]
     taken_back: tuple[str, ...] = ()
     clipped: Clipped | None = None
     grid_g: float | None = None
@@ -96,6 +102,11 @@ def search(poses_g: Poses, base: Model) -> Found:
     base : Model
         With ΔR = I.
 
+    Raises
+    ------
+    NotConvergedError
+        If the base cannot be fitted.
+
     """
     everyone = np.arange(len(poses_g))
     whole, clip = unclipped(poses_g, base)
@@ -103,12 +114,12 @@ def search(poses_g: Poses, base: Model) -> Found:
         everyone = np.delete(everyone, clip.poses)
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
-    found = _search(poses_g, base, _KNOCKED_BETTER)
-    if not is_noise(found.final):  # a few knocked poses may look like an effect
+    found = _search(poses_g, base, _OUTLIERS_BETTER)
+    if not found.final.is_noise:  # a few outliers may look like an effect
         other = _search(poses_g, base, 0.0)
-        if other.knocked.size and is_noise(other.final):
+        if other.outliers.size and other.final.is_noise:
             found = other
-    return replace(found, knocked=everyone[found.knocked], clipped=clip, grid_g=grid,
+    return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
 
 
@@ -116,47 +127,43 @@ def _search(poses_g: Poses, base: Model, patience: float) -> Found:
     """
     Search among the effects that are columns beside the model.
 
-    Poses that stand out go first where they say more than `patience` times any effect.
+    Outliers go first if they explain more than `patience` times any effect.
 
     """
-    state = beginning(poses_g, base)
-    state, ladder = _climb(state)
-    state, out = _settle(state, np.arange(len(poses_g)), patience)
-    start, added = state, ladder
+    start = beginning(poses_g, base)
+    state, ladder = _climb(start)
+    state, out = _settle(state, patience)
+    begun, added = state, ladder
     names: tuple[str, ...] = ()
-    been: set[frozenset[str]] = set()  # a name may go again when another comes: not for ever
-    while len(names) < _LARGEST and not (names and is_down_to_noise(state)):
+    been: set[frozenset[str]] = set()  # a name may go when another comes, but not for ever
+    while len(names) < _LARGEST and not (names and state.is_down_to_noise):
         if frozenset(names) in been:
             break
         been.add(frozenset(names))
-        step = _next(state)
-        if not step:
+        after, new = _next(state)
+        if not new:
             break
-        for candidate in step:
-            among = state.candidates_among((candidate.effect,))
-            if candidate.effect in among:
-                state = plus(state, among[candidate.effect])
-                names = (*names, candidate.effect)
-        state, more = _climb(state)  # what was missing may have hidden a rung
-        added = (*added, *more)
-        state, names = _tried_anew(state, names)
+        state, more = _climb(after)  # what was missing may have hidden a rung
+        names, added = (*names, *new), (*added, *more)
+        state, names = _tested_again(state, names)
     if out.size or names:
-        state, out, start = _settled_again(poses_g, start, state)
-    names, state, back = _judged(start, state, names)
+        state, out, begun = _settled_again(start, begun, state)
+    names, state, back = _judged(begun, state, names)
     if _walks(state):
-        state, names = _called_for_beside_walk(state, names)
-        return _end(poses_g, base, state, (*added, *names, WANDER), out, back)
-    return _end(poses_g, base, state, (*added, *names), out, back)
+        state, names = _significant_beside_walk(state, names)
+        added = (*added, *names, WANDER)
+    else:
+        added = (*added, *names)
+    return _end(start, state, added, out, back)
 
 
-def _end(poses_g: Poses, base: Model, state: State, added: tuple[str, ...],
-         out: NDArray[np.intp], back: tuple[str, ...]) -> Found:
-    kept = np.delete(np.arange(len(poses_g)), out)
+def _end(start: State, state: State, added: tuple[str, ...], out: NDArray[np.intp],
+         back: tuple[str, ...]) -> Found:
     there = {*state.model.values, WANDER}
     if 'axis_gain' in there:
         there.add('gain')  # a rung below it
-    added = tuple(name for name in added if name in there)
-    return Found(beginning(poses_g.take(kept), base), state, added, out, back)
+    base = start.without(out) if out.size else start
+    return Found(base or start, state, tuple(name for name in added if name in there), out, back)
 
 
 def _climb(state: State) -> tuple[State, tuple[str, ...]]:
@@ -164,19 +171,21 @@ def _climb(state: State) -> tuple[State, tuple[str, ...]]:
     added: tuple[str, ...] = ()
     while True:
         found = state.candidates_among(_rungs(state))
-        best = _best(found, state.fitted, state.dof)
+        best = best_of(found, state.fitted, state.dof)
         if best is None or not _called_for(best, found, state):
             return state, added
         if best.effect == 'axis_gain' and 'gain' in found and probability(
                 found['gain'], state.fitted, state.dof, len(found)) < LEVEL:
             best = found['gain']  # one rung at a time
-        state = plus(state, best)
-        added = (*added, best.effect)
+        after = state.plus(best)
+        if after is None:
+            return state, added
+        state, added = after, (*added, best.effect)
 
 
 def _called_for(best: Candidate, found: dict[str, Candidate], state: State) -> bool:
-    """Tell whether a rung is called for, alone or with all the others: one may hide another."""
-    columns = fitted(np.zeros(len(state.near.residual)), np.zeros((len(state.near.residual), 0)))
+    """Return whether a rung is significant, alone or with all others: one may hide another."""
+    columns = projected(np.zeros(len(state.fit.residual)), state.fitted.onto[:, :0])
     for candidate in found.values():
         columns = columns.with_columns(candidate.columns)
     together = replace(best, columns=columns.onto)
@@ -185,7 +194,7 @@ def _called_for(best: Candidate, found: dict[str, Candidate], state: State) -> b
 
 
 def _rungs(state: State) -> tuple[str, ...]:
-    """Give the effects of the ladder that may come next."""
+    """Return the effects of the ladder that may come next."""
     present = state.model.values
     rungs = ['offset', 'cross_axis']
     if 'axis_gain' not in present:
@@ -195,108 +204,128 @@ def _rungs(state: State) -> tuple[str, ...]:
     return tuple(name for name in LADDER if name in rungs and name not in present)
 
 
-def _best(found: dict[str, Candidate], fitted: Fitted, dof: int) -> Candidate | None:
-    """Give the candidate with which the criterion falls most, or a smaller one as good."""
-    if not found:
-        return None
-    falls = {name: fall_of(candidate, fitted, dof) for name, candidate in found.items()}
-    most = max(falls.values())
-    near = [name for name, falls_by in falls.items() if falls_by > most - _AS_GOOD]
-    return found[min(near, key=lambda name: (found[name].parameters, -falls[name]))]
-
-
-def _settle(state: State, rows: NDArray[np.intp], patience: float
-            ) -> tuple[State, NDArray[np.intp]]:
-    """Take out poses that stand out, where that says more than any effect."""
-    standing = knocked(state.near, state.fitted)
-    best = _best(state.found, state.fitted, state.dof)
+def _settle(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
+    """Leave outliers out, if that explains more than any effect."""
+    none = np.zeros(0, np.intp)
+    out = outliers(state.fit, len(state.poses_g))
+    if not out.poses.size:
+        return state, none
+    best = best_of(state.found, state.fitted, state.dof)
     rival = 0.0 if best is None else fall_of(best, state.fitted, state.dof)
     if state.wander is not None:
         rival = max(rival, state.wander.fall)
-    if not standing.poses.size or standing.fall <= patience * rival:
-        return state, rows[:0]
-    return state.without(standing.poses), rows[standing.poses]
+    rows = np.isin(state.fit.equations.pose, out.poses)
+    # 2 log n for each outlier is for its choice among all.
+    falls = (fall(max(state.fitted.rss - out.chi2, 0.0), state.fitted.rss, state.dof,
+                  float(np.sum(rows)))
+             - 2.0 * len(out.poses) * np.log(len(state.poses_g)))
+    after = state.without(out.poses) if falls > patience * rival else None
+    return (state, none) if after is None else (after, out.poses)
 
 
-def _settled_again(poses_g: Poses, start: State, state: State
+def _settled_again(start: State, begun: State, state: State
                    ) -> tuple[State, NDArray[np.intp], State]:
-    """Judge all poses anew in the model that was found."""
-    # Near the model of the good poses: one that the knocked ones shaped bends the equations.
-    whole = State(state.model, beginning(poses_g, start.model).poses_g)
-    standing = knocked(whole.near, whole.fitted)
-    again = whole.without(standing.poses)
-    before = State(start.model, again.poses_g).with_effects(dict(start.model.values))
-    return again, standing.poses, before
+    """Look for outliers among all poses in the model that was found."""
+    # Near the model of the good poses: one that the outliers shaped bends the equations.
+    whole = State(judge(state.model, start.poses_g))
+    out = outliers(whole.fit, len(start.poses_g)).poses
+    again = whole.without(out)
+    before = State(judge(begun.model, start.poses_g)).without(out)
+    if again is None or before is None:
+        kept = np.isin(start.poses_g.row, state.poses_g.row)
+        return state, np.flatnonzero(~kept), begun
+    return again, out, before
 
 
-def _next(state: State) -> tuple[Candidate, ...]:
-    """Give the effect, or the pair of effects, to add; none where nothing is missing."""
-    found = state.found
-    single = _best(found, state.fitted, state.dof)
+def _next(state: State) -> tuple[State, tuple[str, ...]]:
+    """Return the state with the effect, or the pair of effects, to add; no names: none."""
+    found = dict(state.found)
+    while found:
+        new = _admitted(state, found)
+        if not new:
+            break
+        after = _with(state, new)
+        if after is not None:
+            return after, tuple(candidate.effect for candidate in new)
+        del found[new[0].effect]  # it has no sound fit: the next best
+    return state, ()
+
+
+def _with(state: State, new: tuple[Candidate, ...]) -> State | None:
+    """Return the state with these candidates in the model; None if one has no sound fit."""
+    for candidate in new:
+        among = state.candidates_among((candidate.effect,))
+        after = state.plus(among[candidate.effect]) if among else None
+        if after is None:
+            return None
+        state = after
+    return state
+
+
+def _admitted(state: State, found: dict[str, Candidate]) -> tuple[Candidate, ...]:
+    """Return the best of these effects, or the best pair, if it is significant."""
+    fitted, dof = state.fitted, state.dof
+    single = best_of(found, fitted, dof)
     if single is None:
         return ()
-    among = len(found)
-    walk = state.wander
-    falls = fall_of(single, state.fitted, state.dof)
-    pair = best_pair(found, state) if falls > 0.0 else None
-    if pair is not None and pair_is_better(pair, single, state, among):
+    falls = fall_of(single, fitted, dof)
+    pair = best_pair(found, fitted, dof) if falls > 0.0 else None
+    if pair is not None and pair_is_better(pair, single, fitted, dof, found):
         return pair
-    if walk is not None and walk.fall > falls and not is_noise(state):
-        return _next_beside_walk(state)
-    admitted = (probability(single, state.fitted, state.dof, among) < LEVEL
-                and agrees(single, state.fitted))
+    walk = state.wander
+    if walk is not None and walk.fall > falls and not state.is_noise:
+        return _admitted_beside_walk(state, found)
+    admitted = (probability(single, fitted, dof, len(found)) < LEVEL and agrees(single, fitted))
     return (single,) if admitted else ()
 
 
-def _next_beside_walk(state: State) -> tuple[Candidate, ...]:
-    """Give the effect that is called for although the offset wanders; none if there is none."""
-    found = state.found_beside_walk()
-    single = _best(found, state.beside_walk, state.dof)
+def _admitted_beside_walk(state: State, among: dict[str, Candidate]) -> tuple[Candidate, ...]:
+    """Return the one of these effects that is significant although the offset wanders, if any."""
+    found = {name: each for name, each in state.found_beside_walk().items() if name in among}
+    single = best_of(found, state.beside_walk, state.dof)
     if single is None or probability(single, state.beside_walk, state.dof, len(found)) > LEVEL:
         return ()
-    among = state.candidates_among((single.effect,))
-    return (single,) if single.effect in among and agrees(among[single.effect],
-                                                          state.fitted) else ()
+    return (single,) if agrees(among[single.effect], state.fitted) else ()
 
 
-def _tried_anew(state: State, names: tuple[str, ...]) -> tuple[State, tuple[str, ...]]:
-    """Try each name against being left out, and against every other effect."""
+def _tested_again(state: State, names: tuple[str, ...]) -> tuple[State, tuple[str, ...]]:
+    """Test each name against being left out, and against every other effect."""
     for name in names:
-        if name not in state.model.values:
+        without = state.without_effect(name) if name in state.model.values else None
+        if without is None or name not in without.found:
             continue
-        values = {key: part for key, part in state.model.values.items() if key != name}
-        without = state.with_effects(values)
         found = without.found
-        if name not in found:
-            continue
-        best = _best(found, without.fitted, without.dof)
+        best = best_of(found, without.fitted, without.dof)
         if best is None or probability(found[name], without.fitted, without.dof,
                                        len(found)) > LEVEL:
             state, names = without, tuple(other for other in names if other != name)
         elif best.effect != name and best.effect not in names:
-            state = plus(without, best)
-            names = tuple(best.effect if other == name else other for other in names)
+            after = without.plus(best)
+            if after is not None:
+                state = after
+                names = tuple(best.effect if other == name else other for other in names)
     return state, names
 
 
-def _judged(start: State, state: State, names: tuple[str, ...]
+def _judged(begun: State, state: State, names: tuple[str, ...]
             ) -> tuple[tuple[str, ...], State, tuple[str, ...]]:
     """Take the names back if something else is left and they explain too little of the whole."""
-    if not names or state.noise is None or is_noise(state):
+    if not names or not state.fit.noise_known or state.is_noise:
         return names, state, ()
-    above = start.fitted.rss - start.dof
+    above = begun.fitted.rss - begun.dof
     explained = 1.0 - (state.fitted.rss - state.dof) / max(above, 1e-300)
     if explained >= _LEAST_SHARE:
         return names, state, ()
-    return (), start, names
+    return (), begun, names
 
 
-def _called_for_beside_walk(state: State, names: tuple[str, ...]
-                            ) -> tuple[State, tuple[str, ...]]:
-    """Keep the names that are called for although the offset wanders."""
+def _significant_beside_walk(state: State, names: tuple[str, ...]
+                             ) -> tuple[State, tuple[str, ...]]:
+    """Keep the names that are significant although the offset wanders."""
     for name in names:
-        values = {key: part for key, part in state.model.values.items() if key != name}
-        without = state.with_effects(values)
+        without = state.without_effect(name)
+        if without is None:
+            continue
         found = without.found_beside_walk()
         if name not in found or probability(found[name], without.beside_walk, without.dof,
                                             len(found)) > LEVEL:
@@ -305,8 +334,8 @@ def _called_for_beside_walk(state: State, names: tuple[str, ...]
 
 
 def _walks(state: State) -> bool:
-    """Tell whether what is left is a random walk of the offset."""
+    """Return whether what is left is a random walk of the offset."""
     walk = state.wander
-    if walk is None or walk.likelihood_ratio < _WALK_SIGNIFICANT or is_noise(state):
+    if walk is None or walk.likelihood_ratio < _WALK_SIGNIFICANT or state.is_noise:
         return False
-    return bool(walk.left_out @ walk.left_out < state.fitted.left_out @ state.fitted.left_out)
+    return bool(walk.held_out @ walk.held_out < state.fitted.held_out @ state.fitted.held_out)

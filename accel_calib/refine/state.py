@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a search stands: the model so far, the poses kept, and the equations near it."""
+"""The state of a search: the model so far, fitted to the poses kept, and what it leaves."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .candidates import Candidate, candidates, LADDER
-from .equations import Equations, equations, noise_of
-from .exact import columns_of, fit_exactly
-from .least_squares import Fitted, fitted
+from .candidates import Candidate, candidates
+from .least_squares import Projected, projected
 from .wander import Wander, wander
-from ..calibrate.approach import with_approach
-from ..effects import EFFECTS
-from ..model import Model
+from ..calibrate.previous_pose import with_previous
+from ..effects import CHANGES, effect_named, EFFECTS, LADDER
+from ..estimate.fit import estimate, Fit
+from ..estimate.outliers import by_pose
+from ..estimate.solve import NotConvergedError
+from ..model import FITTED_SHAPES, Model
 from ..table import Floats, Poses
 from ..units import MG
+
+_CHI2_LEVEL = 1e-3
+_CHI2_RATIO = 1.3
+"""Poses repeat somewhat worse than their samples say; this ratio is still noise."""
 
 
 @dataclass(frozen=True)
@@ -30,118 +35,175 @@ class State:
 
     Parameters
     ----------
-    model : Model
-        The fitted model, ΔR = I.
-    poses_g : Poses
-        The poses kept, in g, with the pose before each.
+    fit : Fit
+        The fit.
 
     """
 
-    model: Model
-    poses_g: Poses
+    fit: Fit
+
+    @property
+    def model(self) -> Model:
+        """Return the fitted model, ΔR = I."""
+        return self.fit.model
+
+    @property
+    def poses_g(self) -> Poses:
+        """Return the poses kept, in g, with the pose before each."""
+        return self.fit.poses_g
 
     @cached_property
-    def noise(self) -> Floats | None:
-        """Give the (n, 3) noise of the pose means [g], if known."""
-        return noise_of(self.poses_g)
-
-    @cached_property
-    def near(self) -> Equations:
-        """Give the equations near the model."""
-        return equations(self.model, self.poses_g, self.noise)
-
-    @cached_property
-    def fitted(self) -> Fitted:
-        """Give the equations with the model projected out."""
-        return fitted(self.near.residual, columns_of(self.model, self.near, self.poses_g))
+    def fitted(self) -> Projected:
+        """Return the equations with the model projected out."""
+        return projected(self.fit.residual, self.fit.columns)
 
     @property
     def dof(self) -> int:
-        """Independent equations less fitted values."""
-        return self.near.count - self.fitted.onto.shape[1]
+        """Return the number of independent equations less that of fitted values."""
+        return self.fit.equations.count - self.fitted.onto.shape[1]
 
     @cached_property
     def found(self) -> dict[str, Candidate]:
-        """Give the candidates that the poses can tell from the model, the ladder apart."""
-        return self.candidates_among(tuple(name for name in EFFECTS if name not in LADDER))
+        """Return the candidates, without the ladder."""
+        return self.candidates_among((*(name for name in EFFECTS if name not in LADDER),
+                                      *changes_beside(self.model)))
 
     def candidates_among(self, names: tuple[str, ...]) -> dict[str, Candidate]:
-        """Give those of these effects that the poses can tell from the model."""
+        """Return those of these effects that the poses distinguish from the model."""
         absent = tuple(name for name in names if name not in self.model.values)
-        return candidates(self.near, self.fitted, self.poses_g.columns, absent)
+        return candidates(self.fit.equations, self.fitted, self.poses_g.columns, absent)
 
     @cached_property
     def wander(self) -> Wander | None:
-        """Give the random walk of the offset, if there are times."""
-        if 'time' not in self.poses_g or np.ptp(self.poses_g['time']) <= 0.0:
+        """Return the random walk of the offset, if there are times."""
+        if 'time' not in self.poses_g:
             return None
-        return wander(self.near, self.fitted, self.poses_g['time'], self.noise is not None)
+        time = self.poses_g['time']
+        if not np.any(np.isfinite(time)) or not np.ptp(time[np.isfinite(time)]) > 0.0:
+            return None
+        return wander(self.fit.equations, self.fitted, time)
 
     @cached_property
-    def beside_walk(self) -> Fitted:
-        """Give the equations with the walk of the offset whitened and the model projected out."""
+    def beside_walk(self) -> Projected:
+        """Return the equations, the walk of the offset whitened, the model projected out."""
         if self.wander is None:
             return self.fitted
-        whitening = self.wander.whitening
-        columns = columns_of(self.model, self.near, self.poses_g)
-        return fitted(whitening @ self.near.residual, whitening @ columns)
+        return projected(self.wander.whitened(self.fit.residual),
+                         self.wander.whitened(self.fit.columns))
 
     def found_beside_walk(self) -> dict[str, Candidate]:
-        """Give the candidates as they are seen beside a walk of the offset."""
-        absent = tuple(name for name in self.found if name not in self.model.values)
-        return candidates(self.near, self.beside_walk, self.poses_g.columns, absent,
-                          None if self.wander is None else self.wander.whitening)
+        """Return the candidates as they are seen beside a walk of the offset."""
+        return candidates(self.fit.equations, self.beside_walk, self.poses_g.columns,
+                          tuple(self.found),
+                          None if self.wander is None else self.wander.whitened)
+
+    @property
+    def is_noise(self) -> bool:
+        """Return whether what is left may be noise alone; true if the noise is not known."""
+        return not self.fit.noise_known or is_noise(self.fitted.rss, self.dof)
+
+    @property
+    def is_down_to_noise(self) -> bool:
+        """Return whether measured noise explains all that is left; nothing more is named then."""
+        return self.fit.noise_known and self.is_noise
 
     def gap_mg(self, residual: Floats) -> float:
-        """Give the RMS over the poses of residuals of the equations [mg]."""
-        return float(np.sqrt(np.mean(self.near.residual_of_pose(residual) ** 2))) * MG
+        """Return the RMS over the new poses of residuals of the equations [mg]."""
+        of_poses = self.fit.equations.of_poses(residual)
+        if 'new' in self.poses_g:
+            of_poses = of_poses[self.poses_g['new'] > 0.0]
+        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
 
     @property
     def floor_mg(self) -> float | None:
-        """Give what the gap would be were the model right [mg]."""
-        if self.noise is None:
+        """Return the gap if the model were right [mg]; None if the noise is not known."""
+        if not self.fit.noise_known:
             return None
-        share = self.dof / len(self.near.residual)
-        return self.gap_mg(np.full(len(self.near.residual), np.sqrt(share)))
+        rows = by_pose(self.fit).rows[self.fit.equations.pose]
+        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
+        return self.gap_mg(share)
 
-    def with_effects(self, values: dict[str, Floats]) -> State:
-        """Give the state of the model with these effects, all fitted again."""
-        model = fit_exactly(Model(values), self.poses_g, self.noise)
-        return State(model, self.poses_g)
+    def with_effects(self, values: dict[str, Floats]) -> State | None:
+        """Return the state of the model with these effects, fitted; None: no sound fit."""
+        return _state(Model(values), self.poses_g)
 
-    def without(self, poses: NDArray[np.intp]) -> State:
-        """Leave these poses out, and fit again."""
+    def without_effect(self, name: str) -> State | None:
+        """Return the state of the model without an effect, fitted; None: no sound fit."""
+        return self.with_effects({key: part for key, part in self.model.values.items()
+                                  if key != name})
+
+    def without(self, poses: NDArray[np.intp]) -> State | None:
+        """Return the state without these poses, fitted; None: no sound fit."""
         kept = np.delete(np.arange(len(self.poses_g)), poses)
-        return State(self.model, self.poses_g.take(kept)).with_effects(dict(self.model.values))
+        return _state(self.model, self.poses_g.take(kept))
+
+    def plus(self, candidate: Candidate) -> State | None:
+        """
+        Return the state with a candidate in the model, fitted.
+
+        Returns
+        -------
+        State or None
+            None if the fit did not converge, the cost did not fall, or a value is at the bound of
+            what is plausible.
+
+        """
+        effect = effect_named(candidate.effect)
+        values = dict(self.model.values)
+        if candidate.effect == 'axis_gain':
+            gain = values.pop('gain', np.zeros(1))
+            values['axis_gain'] = np.full(3, gain[0])
+        else:
+            values[candidate.effect] = np.concatenate([np.zeros(len(effect.parameters)),
+                                                       candidate.shape])
+        after = self.with_effects(self._started(values, candidate))
+        if after is None or not after.fit.chi2 < self.fit.chi2 or after.fit.at_bound:
+            return None
+        return after
+
+    def _started(self, values: dict[str, Floats], candidate: Candidate) -> dict[str, Floats]:
+        """Return the values with the amplitudes that belong to a fitted shape constant."""
+        effect = effect_named(candidate.effect)
+        if not set(FITTED_SHAPES) & set(effect.shape):
+            return values
+        count = len(effect.parameters)
+        model = Model({candidate.effect: values[candidate.effect]})
+        seen = self.fit.equations.columns(model)[:, :count]
+        left = seen - self.fitted.onto @ (self.fitted.onto.T @ seen)
+        amplitudes = np.linalg.lstsq(left, self.fitted.residual, rcond=1e-7)[0]
+        return {**values, candidate.effect: np.concatenate([amplitudes, candidate.shape])}
 
 
-def plus(state: State, candidate: Candidate) -> State:
-    """Add a candidate to the model and fit everything again."""
-    effect = EFFECTS[candidate.effect]
-    values = dict(state.model.values)
-    if candidate.effect == 'axis_gain':
-        gain = values.pop('gain', np.zeros(1))
-        values['axis_gain'] = np.full(3, gain[0])
-    else:
-        values[candidate.effect] = np.concatenate([np.zeros(len(effect.parameters)),
-                                                   candidate.shape])
-    return state.with_effects(_started(state, values, candidate))
+def is_noise(rss: float, dof: float) -> bool:
+    """Return whether measured noise leaves a weighted sum of squares like this."""
+    from scipy.special import chdtrc
+
+    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
 
 
-def _started(state: State, values: dict[str, Floats], candidate: Candidate) -> dict[str, Floats]:
-    """Begin a time constant with the amplitudes that belong to it."""
-    if 'tau' not in EFFECTS[candidate.effect].shape:
-        return values
-    basis = EFFECTS[candidate.effect].basis(state.near.force, state.poses_g.columns,
-                                            candidate.shape)
-    seen = state.near.seen(basis)
-    onto = state.fitted.onto
-    left = seen - onto @ (onto.T @ seen)
-    amplitudes = np.linalg.lstsq(left, state.fitted.residual, rcond=1e-7)[0]
-    return {**values, candidate.effect: np.concatenate([amplitudes, candidate.shape])}
+def changes_beside(model: Model) -> tuple[str, ...]:
+    """Return the changes since a stored calibration that a model may have."""
+    present = set(model.values)
+    if 'axis_gain_change' in present:
+        present.add('gain_change')
+    return tuple(name for name in CHANGES if name not in present)
 
 
 def beginning(poses_g: Poses, model: Model) -> State:
-    """Give the state of a model before anything is added, fitted to all poses."""
-    known = with_approach(poses_g, model)
-    return State(fit_exactly(model, known, noise_of(known)), known)
+    """
+    Return the state of a model before anything is added, fitted to all poses.
+
+    Raises
+    ------
+    NotConvergedError
+        If the fit does not converge.
+
+    """
+    return State(estimate(model, with_previous(poses_g, model)))
+
+
+def _state(model: Model, poses_g: Poses) -> State | None:
+    try:
+        return State(estimate(model, poses_g))
+    except NotConvergedError:
+        return None

@@ -2,12 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-`offset_wander`: an offset that changes slowly, in no form that is known.
+`offset_wander`: an offset that changes slowly, without a known form.
 
-The offset is a random walk in time, w(t), whose steps grow by q a second; the equations see it
-through the same columns as an offset. Its size is found by restricted maximum likelihood
-(Patterson and Thompson 1971): with the model projected out, in the axes of the eigenvectors of the
-walk's covariance K, the residual z has the variances s² (1 + λ Λ_i).
+The offset is a random walk w(t), expanded in its Karhunen-Loève modes
+
+    w(t) = Σ_k a_k sin((k - ½) π τ) / ((k - ½) π),   τ from 0 to 1 over the poses
+
+with independent amplitudes a_k of equal variance for each axis. The equations see it through the
+same columns as an offset. Its size is found by restricted maximum likelihood (Patterson and
+Thompson 1971): with the model projected out, along the singular vectors of the modes, the residual
+z has the variances s² (1 + λ Λ_i). With a fixed number of modes the cost is linear in the poses.
 
 """
 
@@ -17,14 +21,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .equations import Equations
-from .least_squares import Fitted
+from .least_squares import Projected
+from ..estimate.equations import Equations
+from ..model import Model
 from ..table import Floats
+
+_MODES = 60
+"""Modes of each axis: the rest has less than 1 % of the variance of a random walk."""
 
 _RATIOS = np.geomspace(1e-4, 1e6, 81)
 _LARGEST_RATIO = 1e3
 _LEAST_WHITE = 0.5
 """Part of the measured variance that is left to the poses themselves."""
+
+_OFFSET = Model({'offset': np.zeros(3)})
 
 
 @dataclass(frozen=True)
@@ -35,26 +45,32 @@ class Wander:
     Parameters
     ----------
     fall : float
-        By how much the criterion falls with it.
+        Decrease of the information criterion.
     likelihood_ratio : float
         Twice the logarithm of the likelihood ratio against no walk.
     residual : (m,) array
-        What is left with the estimated walk taken out.
-    left_out : (m,) array
+        What is left without the estimated walk.
+    held_out : (m,) array
         The same, each equation estimated from the others.
-    whitening : (m, m) array
-        Makes equations with the walk independent again.
+    axes, shrink : (m, r) array, (r,) array
+        Directions of the walk among the equations, and the factor that whitens each.
 
     """
 
     fall: float
     likelihood_ratio: float
     residual: Floats
-    left_out: Floats
-    whitening: Floats
+    held_out: Floats
+    axes: Floats
+    shrink: Floats
+
+    def whitened(self, columns: Floats) -> Floats:
+        """Return (m,) or (m, q) columns on which the walk and the noise have unit variance."""
+        along = self.axes.T @ columns
+        return columns - self.axes @ ((1.0 - self.shrink) * along.T).T
 
 
-def wander(equations: Equations, fitted: Fitted, time: Floats, known: bool) -> Wander:
+def wander(equations: Equations, fitted: Projected, time: Floats) -> Wander:
     """
     Estimate a random walk of the offset.
 
@@ -62,54 +78,43 @@ def wander(equations: Equations, fitted: Fitted, time: Floats, known: bool) -> W
     ----------
     equations : Equations
         Near the model.
-    fitted : Fitted
+    fitted : Projected
         With the model projected out.
     time : (n,) array
-        Of the poses [s].
-    known : bool
-        Whether the noise was measured: then no less is left than half its variance.
+        Of the poses [s]; NaN for poses before the walk begins.
 
     """
-    walk = _covariance(equations, time)
-    onto = fitted.onto
-    outside = walk - onto @ (onto.T @ walk)
-    outside = outside - (outside @ onto) @ onto.T
-    values, vectors = np.linalg.eigh((outside + outside.T) / 2.0)
-    values = np.clip(values, 0.0, None) / max(values[-1], 1e-300)
-    squared = (vectors.T @ fitted.residual) ** 2
-    dof = equations.count - onto.shape[1]
+    modes = _modes(equations, time)
+    outside = modes - fitted.onto @ (fitted.onto.T @ modes)
+    vectors, singular, _ = np.linalg.svd(outside, full_matrices=False)
+    largest = max(float(singular[0]) ** 2, 1e-300)
+    values = singular ** 2 / largest
+    along = vectors.T @ fitted.residual
+    squared, dof = along ** 2, equations.count - fitted.onto.shape[1]
+    rest = max(fitted.rss - float(np.sum(squared)), 0.0)
     spread = 1.0 + _RATIOS[:, np.newaxis] * values
-    scale = np.sum(squared / spread, axis=1) / dof
-    allowed = scale >= _LEAST_WHITE if known else _RATIOS <= _LARGEST_RATIO
+    scale = (np.sum(squared / spread, axis=1) + rest) / dof
+    allowed = scale >= _LEAST_WHITE if equations.noise_known else _RATIOS <= _LARGEST_RATIO
     allowed[0] = True
     deviance = np.sum(np.log(spread), axis=1) + dof * np.log(np.maximum(scale, 1e-300))
-    none = dof * np.log(max(np.sum(squared), 1e-300) / dof)
     best = int(np.argmin(np.where(allowed, deviance, np.inf)))
-    ratio = float(none - deviance[best])
-    weights = 1.0 / spread[best]
-    residual = vectors @ (weights * (vectors.T @ fitted.residual))
+    ratio = float(dof * np.log(max(fitted.rss, 1e-300) / dof) - deviance[best])
+    taken = 1.0 - 1.0 / spread[best]
+    residual = fitted.residual - vectors @ (taken * along)
     # Without its own equation each residual is P z over the diagonal of P.
-    diagonal = np.sum(vectors ** 2 * weights, axis=1) - np.sum(onto ** 2, axis=1)
-    left_out = residual / np.maximum(diagonal, 0.02)
-    largest = np.linalg.eigvalsh((outside + outside.T) / 2.0)[-1]
-    covariance = np.eye(len(walk)) + _RATIOS[best] / max(float(largest), 1e-300) * walk
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    return Wander(ratio - np.log(max(dof, 2)), ratio, residual, left_out, whitening)
+    diagonal = 1.0 - np.sum(fitted.onto ** 2, axis=1) - vectors ** 2 @ taken
+    axes, size, _ = np.linalg.svd(modes, full_matrices=False)
+    shrink = 1.0 / np.sqrt(1.0 + _RATIOS[best] * size ** 2 / largest)
+    return Wander(ratio - np.log(max(dof, 2)), ratio, residual,
+                  residual / np.maximum(diagonal, 0.02), axes, shrink)
 
 
-def _covariance(equations: Equations, time: Floats) -> Floats:
-    """Give the (m, m) covariance of a walk with steps of 1 g²/s, as the equations see it."""
-    order = np.argsort(time, kind='stable')
-    steps = np.sqrt(np.diff(time[order], prepend=time[order[0]]))
-    total = np.zeros((len(equations.residual),) * 2)
-    for axis in range(3):
-        unit = np.zeros((len(time), 3, 1))
-        unit[:, axis, 0] = 1.0
-        # Column j of the walk: a step at pose j, which all later poses keep.
-        later = np.zeros((len(time), 3, len(time)))
-        position = np.empty(len(time), int)
-        position[order] = np.arange(len(time))
-        later[:, axis, :] = (position[:, np.newaxis] >= np.arange(len(time))) * steps
-        seen = equations.seen(later)
-        total += seen @ seen.T
-    return total
+def _modes(equations: Equations, time: Floats) -> Floats:
+    """Return the (m, 3 k) columns of the modes."""
+    known = np.isfinite(time)
+    first = np.min(time[known])
+    tau = np.where(known, time - first, 0.0) / max(float(np.ptp(time[known])), 1e-300)
+    number = np.pi * (np.arange(min(int(np.sum(known)), _MODES)) + 0.5)
+    shapes = np.sin(number * tau[:, np.newaxis]) / number
+    offset = equations.columns(_OFFSET)
+    return np.hstack([offset[:, [axis]] * shapes[equations.pose] for axis in range(3)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from .state import State
-from ..effects import EFFECTS
+from ..effects import effect_named
 from ..table import COLUMNS, Floats
 from ..units import MG
 
@@ -18,7 +18,7 @@ _NEAR = np.cos(np.radians(30.0))
 
 def where(effect: str, before: State, after: Floats) -> str:
     """
-    Say where the disagreement sits that an effect accounts for.
+    Return where the disagreement is that an effect explains.
 
     Parameters
     ----------
@@ -30,20 +30,21 @@ def where(effect: str, before: State, after: Floats) -> str:
         Residuals of the equations with it.
 
     """
-    share = (before.near.residual_of_pose(before.fitted.residual - after)) * MG
+    share = (before.fit.equations.of_poses(before.fit.residual - after)) * MG
     if effect == 'offset_step':
         return _instant(before, share)
-    needs = ('time',) if effect == 'offset_wander' else EFFECTS[effect].needs
-    column = next((key for key in needs if key in COLUMNS and key in before.poses_g), None)
+    needs = effect_named(effect).needs
+    column = next((key for key in needs if key in before.poses_g and key != 'new'), None)
     if column is None:
-        return _directions(before.near.force, share)
+        return _directions(before.fit.equations.force, share)
     return _range(column, before, share)
 
 
 def _instant(before: State, share: Floats) -> str:
-    """Find where successive poses differ most."""
-    order = np.argsort(before.poses_g['time'], kind='stable')
-    time, moved = before.poses_g['time'][order], share[order]
+    """Return the instant at which successive poses differ most."""
+    time = before.poses_g['time']
+    order = np.argsort(time, kind='stable')[:int(np.sum(np.isfinite(time)))]
+    time, moved = time[order], share[order]
     count = np.arange(1, len(moved))
     sums = np.cumsum(moved ** 2)[:-1]
     at = int(np.argmax(np.abs(sums / count - (np.sum(moved ** 2) - sums) / (len(moved) - count))))
@@ -52,8 +53,9 @@ def _instant(before: State, share: Floats) -> str:
 
 
 def _range(column: str, before: State, share: Floats) -> str:
-    """Give the range of a quantity and what the disagreement is at its ends."""
-    values = before.poses_g[column]
+    """Return the range of a quantity and the disagreement at its ends."""
+    known = np.isfinite(before.poses_g[column].reshape(len(share), -1)).all(axis=1)
+    values, share = before.poses_g[column][known], share[known]
     if values.ndim > 1:
         values = np.linalg.norm(values, axis=1)
     order = np.argsort(values, kind='stable')
@@ -66,7 +68,7 @@ def _range(column: str, before: State, share: Floats) -> str:
 
 
 def _directions(force: Floats, share: Floats) -> str:
-    """Name the directions in which the disagreement is largest."""
+    """Return the directions in which the disagreement is largest."""
     signs = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)
                       if i or j or k], float)
     units = signs / np.linalg.norm(signs, axis=1, keepdims=True)

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Results to figures, and one page that holds all of them.
+Results as figures, and one page with all of them.
 
-`drawings` says which figures there are, `sphere_map`, `against` and `ladder` draw them, `style`
-says how they look; `page` puts them into HTML without anything from outside; `words` serves the
-terminal too. matplotlib is imported only where a figure is drawn.
+`drawings` lists the figures; `sphere_map`, `against` and `ladder` draw them in one `style`; `page`
+puts them into HTML. matplotlib is imported only when a figure is drawn.
 
 """
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals against the variable of an effect: force by axis, temperature, time and so on."""
+"""Residuals against the variable of an effect, such as force along an axis or time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .style import ACCENT, new_figure, residual_label, styled
-from .words import WANDER
-from ..effects import AXES, EFFECTS
+from ..effects import AXES, effect_named
 from ..table import Floats, Poses
 from ..units import MG
 
@@ -26,16 +25,16 @@ _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 @dataclass(frozen=True)
 class Variable:
     """
-    What residuals are drawn against.
+    A variable on the horizontal axis.
 
     Parameters
     ----------
     label : str
-        With its unit.
+        Its name, with the unit.
     values : (n,) array
-        Of each pose.
+        One value per pose.
     unit_range : bool
-        Whether it goes from -1 to 1 by its nature.
+        Whether its range is -1 to 1 by definition.
 
     """
 
@@ -45,11 +44,10 @@ class Variable:
 
 
 def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
-    """Give what an effect depends on: one variable, or three by axis."""
-    needs = ('time',) if effect == WANDER else EFFECTS[effect].needs
-    key = next((name for name in needs if name in poses_g), None)
-    if key == 'approach':
-        return [Variable(f'from the pose before, {axis}', poses_g[key][:, k], True)
+    """Return what an effect depends on: one variable, or three by axis."""
+    key = next((name for name in effect_named(effect).needs if name in poses_g), None)
+    if key == 'previous':
+        return [Variable(f'from the previous pose, {axis}', poses_g[key][:, k], True)
                 for k, axis in enumerate(AXES)]
     if key is None:
         return [Variable(f'force along {axis} [g]', force[:, k], True)
@@ -58,7 +56,7 @@ def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
 
 
 def recorded(poses_g: Poses) -> list[Variable]:
-    """Give all that was recorded beside the readings and changes."""
+    """Return what was recorded beside the readings and changes between poses."""
     found = [_variable(key, poses_g) for key in _CONTEXT if key in poses_g]
     return [variable for variable in found if np.ptp(variable.values) > 0.0]
 
@@ -93,17 +91,17 @@ def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
     Parameters
     ----------
     title : str
-        What is drawn.
+        Title of the figure.
     variables : sequence of Variable
         One panel each.
     residual_mg : (n,) array
-        What is left in each pose [mg].
+        Residual of each pose [mg].
     limit_mg : float
         End of the residual axis [mg].
     signed : bool
         Whether residuals have a sign.
     colour : str
-        Of the poses.
+        Colour of the poses.
 
     """
     with styled():

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which figures tell the story of a refinement."""
+"""The figures of a refinement."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .against import draw_against, recorded, Variable, variables_of
 from .ladder import draw_ladder
 from .sphere_map import draw_map
 from .style import AFTER, BEFORE, save
-from .words import base_words, short
 from ..table import Floats
+from ..words import base_words, short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,9 +37,9 @@ class Drawing:
     Parameters
     ----------
     name : str
-        Of its file, without suffix.
+        Name of its file, without suffix.
     title : str
-        What it shows, in a line.
+        What it shows.
     figure : Figure
         The figure.
 
@@ -51,14 +51,15 @@ class Drawing:
 
 
 def ladder(result: Refinement) -> Drawing:
-    """Draw the ladder of gaps."""
-    gaps = ', '.join(short(step.gap_after_mg) for step in result.steps)
-    title = f'Gap of the base {short(result.gap_mg)} mg' + (f', then {gaps} mg' if gaps else '')
+    """Draw the residual step by step."""
+    after = ', '.join(short(step.gap_after_mg) for step in result.steps)
+    title = f'Residual of the base {short(result.gap_mg)} mg' + (
+        f', then {after} mg' if after else '')
     return Drawing('ladder', title, draw_ladder(result))
 
 
 def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
-    """Draw what was left before and after a step, on one scale."""
+    """Draw the residuals before and after a step, with the same scale."""
     before, after = result.stages[step], result.stages[step + 1]
     limit_mg = _limit_mg(before, after)
     name = f'step{step + 1}_{after.name}'
@@ -75,16 +76,16 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
 
 
 def of_remainder(result: Refinement) -> Iterator[Drawing]:
-    """Draw what is left at the end, over the sphere and against all that was recorded."""
+    """Draw the final residuals over the sphere and against all that was recorded."""
     stage = result.stages[-1]
     limit_mg = _limit_mg(stage)
     if _spread(result):
-        yield _map(result, stage, 'remaining_sphere', f'What remains: {_rms(stage)} mg RMS',
+        yield _map(result, stage, 'remaining_sphere', f'Remaining residual: {_rms(stage)} mg RMS',
                    limit_mg)
     variables = recorded(result.poses_g) or variables_of('quadratic', result.poses_g,
                                                          result.force)
     yield _against(result, stage, variables[:3], 'remaining_variables',
-                   f'What remains: {_rms(stage)} mg RMS', limit_mg, AFTER)
+                   f'Remaining residual: {_rms(stage)} mg RMS', limit_mg, AFTER)
 
 
 def all_drawings(result: Refinement) -> Iterator[Drawing]:
@@ -115,12 +116,12 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
 
 
 def _signed(result: Refinement) -> bool:
-    """Tell whether residuals have a sign: where only |force| is known, they have."""
+    """Return whether residuals have a sign: they have if only |force| is known."""
     return any(bool(np.any(stage.residual_mg < 0.0)) for stage in result.stages)
 
 
 def _spread(result: Refinement) -> bool:
-    """Tell whether the poses have directions enough for a map."""
+    """Return whether the poses have enough directions for a map."""
     return len(np.unique(np.round(result.force, 1), axis=0)) >= _FEW_DIRECTIONS
 
 
@@ -148,7 +149,7 @@ def _against(result: Refinement, stage: Stage, variables: list[Variable], name: 
 
 
 def _left_out(result: Refinement) -> tuple[Floats, tuple[int, ...]]:
-    """Give directions and rows of the poses that were left out."""
+    """Return directions and rows of the poses that were left out."""
     calibration = result.calibration
     which = np.isin(calibration.poses.row, result.disturbed_poses)
     poses = calibration.poses.take(which)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The ladder of gaps: from the base down, step by step, to the noise floor."""
+"""The residual from the base down to the noise floor, step by step."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .style import ACCENT, AFTER, FAINT, new_figure, styled
-from .words import base_words, short
+from ..words import base_words, short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ _RUNG_INCHES = 0.52
 
 
 def draw_ladder(result: Refinement) -> Figure:
-    """Draw the gap of the base and after each step, over all poses and over those held out."""
+    """Draw the residual of the base and after each step, fitted and held out."""
     rungs = _rungs(result)
     with styled():
         figure = new_figure(1.25 + _RUNG_INCHES * len(rungs), _WIDTH_INCHES)
@@ -38,7 +38,7 @@ def draw_ladder(result: Refinement) -> Figure:
 
 
 def _scale(axes: Any, least: float, largest: float) -> None:
-    """Make the axis of gaps logarithmic, with marks that a person can read."""
+    """Make the axis of residuals logarithmic, with legible ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     few = largest / least > 300.0
@@ -48,12 +48,12 @@ def _scale(axes: Any, least: float, largest: float) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel('gap: RMS over the poses [mg], logarithmic')
+    axes.set_xlabel('residual: RMS over the poses [mg], logarithmic')
     axes.grid(visible=True, axis='x')
 
 
 def _rungs(result: Refinement) -> list[tuple[str, float, float | None]]:
-    """Give name, gap and gap of poses held out [mg] of the base and of each step."""
+    """Return name, residual and held-out residual [mg] of the base and of each step."""
     held_out = (result.steps[0].held_out_before_mg if result.steps
                 else result.calibration.quality.held_out_rms_mg)
     rungs = [(base_words(result), result.gap_mg, held_out)]
@@ -64,17 +64,17 @@ def _rungs(result: Refinement) -> list[tuple[str, float, float | None]]:
 
 def _draw_rungs(axes: Any, rungs: list[tuple[str, float, float | None]]) -> None:
     height = np.arange(len(rungs))
-    gaps = np.array([gap for _, gap, _ in rungs])
-    axes.step(gaps, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
-    axes.plot(gaps, height, 'o', color=AFTER, markersize=9, label='all poses kept', zorder=3)
-    held_out = np.array([np.nan if gap is None else gap for _, _, gap in rungs])
+    residuals = np.array([residual for _, residual, _ in rungs])
+    axes.step(residuals, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
+    axes.plot(residuals, height, 'o', color=AFTER, markersize=9, label='all poses used', zorder=3)
+    held_out = np.array([np.nan if out is None else out for _, _, out in rungs])
     if np.any(np.isfinite(held_out)):
         axes.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
-                  markeredgewidth=1.6, label='each held out', zorder=3)
+                  markeredgewidth=1.6, label='held out', zorder=3)
     white = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1.0}
-    for at, gap, out in zip(height, gaps, held_out, strict=True):
-        words = short(gap) if np.isnan(out) else f'{short(gap)}, held out {short(out)}'
-        axes.annotate(words, (np.nanmax([gap, out]), at), (9, 0), va='center',
+    for at, residual, out in zip(height, residuals, held_out, strict=True):
+        words = short(residual) + ('' if np.isnan(out) else f', held out {short(out)}')
+        axes.annotate(words, (np.nanmax([residual, out]), at), (9, 0), va='center',
                       textcoords='offset points', fontsize=9.0,
                       bbox=white)
     for at, (name, _, _) in zip(height, rungs, strict=True):
@@ -87,7 +87,7 @@ def _draw_rungs(axes: Any, rungs: list[tuple[str, float, float | None]]) -> None
 
 def _limits(result: Refinement, rungs: list[tuple[str, float, float | None]]
             ) -> tuple[float, float]:
-    """Give ends of the axis that leave room for the numbers."""
+    """Return the limits of the axis, with room for the numbers."""
     values = [value for rung in rungs for value in rung[1:] if value]
     values += [result.noise_floor_mg] if result.noise_floor_mg else []
     least, largest = min(values, default=1.0), max(values, default=1.0)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page: the whole story of a refinement as one HTML file, with nothing from outside."""
+"""One HTML page about a refinement, which loads nothing from outside."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from typing import TYPE_CHECKING
 from .drawings import Drawing, ladder, of_remainder, of_step
 from .sheet import SHEET
 from .style import inline_svg
-from .words import base_words, chance, effect_words, short, values_of, verdict_words
 from .. import __version__
-from ..effects import EFFECTS
+from ..effects import effect_named
 from ..files.atomic import write_atomically
+from ..html_table import table
+from ..words import base_words, chance, short, values_of, verdict_words
 
 if TYPE_CHECKING:
     from ..refine import Refinement, Step
 
-_TITLE = 'What the calibration still lacks'
+_TITLE = 'What the calibration lacks'
 _HOW_TO_READ = (
-    'The gap is the RMS of |corrected| − 1 g over the poses (of the vector error where the '
-    'orientation is known or shared). The noise floor is what it would be were the model right.',
-    'Held out: each pose judged by a fit of the others. Where it falls with the gap, the effect '
-    'is in the sensor and not in the fit.',
-    'p is the probability that noise alone makes one of all the candidates this good.',
-    'Rivals are effects that these poses cannot tell from the one named.',
-    'Maps are equal-area and seen from above each pole; what is drawn is the direction that '
-    'points up, in the axes of the sensor. A hollow square is a pose that was left out.',
+    'The residual is the RMS of |corrected| − 1 g over the poses, or of the vector error if the '
+    'orientation is known or shared. The noise floor is the residual of a perfect model.',
+    'Held out: each pose is predicted by a fit of the others. If the held-out residual falls too, '
+    'the effect is in the sensor and not in the fit.',
+    'p is the probability that noise alone makes one of all candidates this good.',
+    'Rivals are effects that these poses cannot distinguish from the one named.',
+    'Maps are equal-area and seen from above each pole. They show the direction of up in the '
+    'sensor axes. A hollow square is a pose that was left out.',
 )
 
 
@@ -41,7 +42,7 @@ def write_page(path: Path, result: Refinement, source: str) -> None:
     Raises
     ------
     OSError
-        If it cannot be written; a file that was there is then as it was.
+        If it cannot be written; an earlier file is then unchanged.
 
     """
     text = page(result, source)
@@ -50,14 +51,14 @@ def write_page(path: Path, result: Refinement, source: str) -> None:
 
 def page(result: Refinement, source: str) -> str:
     """
-    Give the page as text.
+    Return the page as text.
 
     Parameters
     ----------
     result : Refinement
-        What to tell.
+        The refinement.
     source : str
-        Where the poses come from.
+        File of the poses.
 
     """
     title = f'{_TITLE}: {Path(source).name}'
@@ -70,7 +71,7 @@ def page(result: Refinement, source: str) -> str:
 
 
 def _head(result: Refinement, source: str) -> Iterator[str]:
-    """Tell the verdict and the ladder."""
+    """Yield title, verdict and the figure of all steps."""
     calibration = result.calibration
     about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
              calibration.date, f'accel_calib {__version__}']
@@ -87,9 +88,9 @@ def _head(result: Refinement, source: str) -> Iterator[str]:
 
 
 def _numbers(result: Refinement) -> Iterator[tuple[str, str]]:
-    yield f'gap at the start ({base_words(result)})', f'{short(result.gap_mg)} mg'
+    yield f'residual of the base ({base_words(result)})', f'{short(result.gap_mg)} mg'
     if result.steps:
-        yield 'gap that remains', f'{short(result.remaining_gap_mg)} mg'
+        yield 'remaining residual', f'{short(result.remaining_gap_mg)} mg'
     floor = result.noise_floor_mg
     yield 'noise floor', 'not known' if floor is None else f'{short(floor)} mg'
     yield 'poses used', str(len(result.poses_g))
@@ -97,8 +98,8 @@ def _numbers(result: Refinement) -> Iterator[tuple[str, str]]:
 
 
 def _overview(result: Refinement) -> str:
-    """Give the table of steps."""
-    head = ('step', 'effect', 'gap [mg]', 'held out [mg]', 'how sure', 'rivals')
+    """Return the table of steps."""
+    head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
     rows = [(str(number), step.effect, _fall(step.gap_before_mg, step.gap_after_mg),
              _fall(step.held_out_before_mg, step.held_out_after_mg), chance(step.p_value),
              ', '.join(step.rivals) or 'none') for number, step in enumerate(result.steps, 1)]
@@ -107,7 +108,8 @@ def _overview(result: Refinement) -> str:
 
 def _steps(result: Refinement) -> Iterator[str]:
     for number, step in enumerate(result.steps, 1):
-        yield f'<section>\n<h2>{number}. {escape(effect_words(step.effect).capitalize())}</h2>\n'
+        title = escape(effect_named(step.effect).words.capitalize())
+        yield f'<section>\n<h2>{number}. {title}</h2>\n'
         yield f'<p>{_story(step)}</p>\n'
         values = values_of(step)
         if values:
@@ -118,14 +120,14 @@ def _steps(result: Refinement) -> Iterator[str]:
 
 
 def _story(step: Step) -> str:
-    """Tell where the disagreement was and what the effect did to it."""
-    term = f' ({escape(EFFECTS[step.effect].term)})' if step.effect in EFFECTS else ''
-    rivals = f' These poses cannot tell it from {", ".join(map(_code, step.rivals))}.' if (
+    """Return where the disagreement was and how the effect reduced it."""
+    rivals = f' These poses cannot distinguish it from {", ".join(map(_code, step.rivals))}.' if (
         step.rivals) else ''
-    return (f'{_code(step.effect)}{term}. The disagreement sits {escape(step.where)}. With this '
-            f'effect the gap goes from {short(step.gap_before_mg)} to '
-            f'<strong>{short(step.gap_after_mg)} mg</strong>, and over poses held out from '
-            f'{short(step.held_out_before_mg)} to {short(step.held_out_after_mg)} mg; '
+    return (f'{_code(step.effect)} ({escape(effect_named(step.effect).term)}). Found '
+            f'{escape(step.where)}. With this effect the residual falls from '
+            f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
+            f'over held-out poses from {short(step.held_out_before_mg)} to '
+            f'{short(step.held_out_after_mg)} mg; '
             f'<span class="whole">{escape(chance(step.p_value))}</span>.{rivals}')
 
 
@@ -136,20 +138,32 @@ def _remainder(result: Refinement) -> Iterator[str]:
 
 
 def _notes(result: Refinement) -> Iterator[str]:
-    """Give what to do, what was left out and what could not be seen."""
+    """Yield warnings, advice, the poses left out and what could not be tested."""
+    if result.refusal or result.calibration.warnings:
+        yield '<section>\n<h2>Warnings</h2>\n'
+        yield _list([*_refusal(result), *result.calibration.warnings])
+        yield '</section>\n'
     if result.advice:
         yield '<section>\n<h2>What to do</h2>\n'
         yield _list(result.advice)
         yield '</section>\n'
     if result.disturbed_poses:
         rows = ', '.join(str(row) for row in result.disturbed_poses)
-        yield f'<section>\n<h2>Disturbed poses</h2>\n<p>Left out: rows {rows}.</p>\n</section>\n'
+        yield f'<section>\n<h2>Outliers</h2>\n<p>Left out: rows {rows}.</p>\n</section>\n'
     if result.not_testable:
         yield '<section>\n<h2>What these data cannot show</h2>\n'
         yield _table(('effect', 'to see it, record'),
-                     [(f'{effect_words(name)} ({name})', needs)
+                     [(f'{effect_named(name).words} ({name})', needs)
                       for name, needs in result.not_testable])
         yield '</section>\n'
+
+
+def _refusal(result: Refinement) -> list[str]:
+    """Return why the calibration must not be used, in a line, if so."""
+    if not result.refusal:
+        return []
+    found, advice = result.refusal
+    return [f'the refined calibration must not be used: {found}; {advice}']
 
 
 def _reading() -> Iterator[str]:
@@ -165,11 +179,7 @@ def _figures(drawn: Iterable[Drawing], kind: str) -> str:
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '') -> str:
-    cells = ''.join(f'<th scope="col">{escape(name)}</th>' for name in head)
-    lines = ''.join('<tr>' + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
-                    for row in rows)
-    return (f'<div class="scroll"><table class="{kind}">\n<thead><tr>{cells}</tr></thead>\n'
-            f'<tbody>\n{lines}</tbody>\n</table></div>\n')
+    return f'<div class="scroll">{table(head, rows, kind)}</div>\n'
 
 
 def _list(lines: Iterable[str]) -> str:

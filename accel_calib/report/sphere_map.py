@@ -4,8 +4,8 @@
 """
 Residuals over the sphere: two hemispheres in Lambert's equal-area projection.
 
-A direction u is seen from above its pole, at radius √(1 - |u_z|): equal areas of the sphere have
-equal areas on the map, so that no part looks more important than it is.
+A direction u is seen from above its pole, at radius √(1 - |u_z|). Equal areas of the sphere have
+equal areas on the map.
 
 """
 
@@ -27,7 +27,7 @@ _INK_PER_POSE = 3500.0
 
 
 def equal_area(force: Floats) -> Floats:
-    """Give the (n, 2) place on its hemisphere's map, the unit disc, of (n, 3) directions."""
+    """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     flat = unit[:, :2]
     across = np.linalg.norm(flat, axis=1, keepdims=True)
@@ -43,13 +43,13 @@ def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
     Parameters
     ----------
     title : str
-        What is drawn.
+        Title of the figure.
     force : (n, 3) array
-        Direction that points up in each pose, in the axes of the sensor.
+        Direction of up in each pose, in the sensor axes.
     residual_mg : (n,) array
-        What is left there [mg].
+        Residual of each pose [mg].
     limit_mg : float
-        Residual of the strongest colour [mg].
+        Residual with the strongest colour [mg].
     signed : bool
         Whether residuals have a sign.
     left_out : (d, 3) array
@@ -76,7 +76,7 @@ def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
 
 
 def _draw_disc(disc: Any, *, up: bool) -> None:
-    """Draw the hemisphere of +z or -z with the axes of the sensor on it."""
+    """Draw the hemisphere of +z or -z with the sensor axes."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     disc.fill(np.cos(angle), np.sin(angle), facecolor='#fafafa', edgecolor='#888888', zorder=0)
     middle = np.sqrt(1.0 - np.sqrt(0.5))
@@ -101,7 +101,7 @@ def _draw_poses(disc: Any, force: Floats, residual_mg: Floats, limit_mg: float, 
 
 
 def _draw_left_out(disc: Any, left_out: Floats, rows: tuple[int, ...], *, up: bool) -> None:
-    """Draw the poses that were left out, hollow and with their rows."""
+    """Draw the poses that were left out as hollow squares, with their rows."""
     for place, z, row in zip(equal_area(left_out), left_out[:, 2], rows, strict=True):
         if (z >= 0.0) == up:
             disc.plot(*place, marker='s', markersize=8, fillstyle='none', color=ACCENT, zorder=4)

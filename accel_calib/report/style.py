@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How figures look, and how they become SVG and PNG.
+Style of the figures, and their output as SVG and PNG.
 
-Figures are drawn at the width of half a page, so that a phone shows one and a desk two beside
-each other with the same text. Colours are from Okabe and Ito's palette and from RdBu, which
-people with colour blindness can tell apart. matplotlib is imported only where a figure is drawn.
+Figures are half a page wide: a phone shows one column of them, a desktop two, with text of the
+same size. Colours are from Okabe and Ito's palette and from RdBu, which people with colour
+blindness can distinguish. matplotlib is imported only when a figure is drawn.
 
 """
 
@@ -46,50 +46,50 @@ _STYLE: Any = {
 
 def check_matplotlib() -> None:
     """
-    Make sure that figures can be drawn.
+    Check that figures can be drawn.
 
     Raises
     ------
     InputError
-        If matplotlib is not there.
+        If matplotlib is not installed.
 
     """
     if find_spec('matplotlib') is None:
-        raise InputError('figures need matplotlib, which is not here',
+        raise InputError('figures need matplotlib, which is not installed',
                          "pip install 'accel_calib[report]'")
 
 
 def styled() -> Any:
-    """Give the context in which figures are drawn and saved."""
+    """Return the context in which figures are drawn and saved."""
     from matplotlib import rc_context
 
     return rc_context(_STYLE)
 
 
 def new_figure(height_inches: float, width_inches: float = WIDTH_INCHES) -> Figure:
-    """Make an empty figure."""
+    """Return an empty figure."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_inches, height_inches), layout='constrained')
 
 
 def residual_label(*, signed: bool) -> str:
-    """Name the axis of residuals."""
-    return '|force| − 1 g [mg]' if signed else 'size of the error [mg]'
+    """Return the label of the axis of residuals."""
+    return '|force| − 1 g [mg]' if signed else 'size of the vector error [mg]'
 
 
 def inline_svg(figure: Figure, prefix: str, title: str) -> str:
     """
-    Give a figure as SVG to stand in a page among others.
+    Return a figure as SVG, for a page with several.
 
     Parameters
     ----------
     figure : Figure
         The figure.
     prefix : str
-        Put before its ids, which must differ between the figures of a page.
+        Put before its ids, which must be unique on the page.
     title : str
-        What it shows, for those who cannot see it; escaped already.
+        Description for screen readers, already escaped.
 
     """
     buffer = io.StringIO()
@@ -106,6 +106,6 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, of the kind that its name says."""
+    """Write a figure to a file; its suffix sets the format."""
     with styled():
         figure.savefig(path, dpi=_PNG_DPI, facecolor='white')

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the calibrator until it is told to end; give the exit status."""
+    """Run the calibrator until it is ended; return the exit status."""
     return run('.calibrator_node:CalibratorNode', args)
 
 

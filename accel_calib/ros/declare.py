@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters, declared in a node."""
+"""Declare parameters in a node."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 
-from .parameters import changed, default_of, expected, Settings
 from ..errors import InputError
+from ..session.parameters import changed, default_of, expected, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 def declared(node: Node, kind: type[Settings]) -> Settings:
     """
-    Declare the parameters of these settings and give their values.
+    Declare the parameters of these settings and return their values.
 
     Raises
     ------
     InputError
-        If a value is not one that the parameter takes.
+        If a parameter does not accept its value.
 
     """
     try:
@@ -47,7 +47,7 @@ def declared(node: Node, kind: type[Settings]) -> Settings:
 
 def follow(node: Node, settings: Callable[[], Settings],
            adopt: Callable[[Settings], None]) -> None:
-    """Have new settings adopted when parameters are set, and bad values refused."""
+    """Adopt new settings when parameters are set, and refuse bad values."""
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         values = {parameter.name: parameter.value for parameter in parameters}
         try:
@@ -60,7 +60,7 @@ def follow(node: Node, settings: Callable[[], Settings],
 
 
 def _descriptor(parameter: Field[Any]) -> ParameterDescriptor:
-    """Describe a parameter to `ros2 param describe` and to rqt."""
+    """Return the description of a parameter, for `ros2 param describe` and rqt."""
     default, limits = default_of(parameter), parameter.metadata['limits']
     descriptor = ParameterDescriptor(
         name=parameter.name, description=parameter.metadata['words'],

@@ -5,7 +5,8 @@
 The main job without hardware: simulator and calibrator in processes of their own, over DDS.
 
 This process is their user: it waits for the poses, calls ``~/fit`` and ``~/set_level``, and then
-compares raw and corrected messages with the simulator's truth while the sensor is turned again.
+compares raw and corrected messages with the truth of the simulator while the sensor is turned
+again.
 
 """
 
@@ -50,7 +51,7 @@ _PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
 
 
 _Spin = Callable[[Callable[[], bool], str], None]
-"""Spins until something is so; what is waited for is named in the error."""
+"""Spins until a condition holds; the error names what was waited for."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Outcome:
     Parameters
     ----------
     rests : int
-        Orientations compared.
+        Number of orientations.
     rms_before_mg, rms_after_mg : float
         RMS of |a| - 1 g [mg].
     max_before_mg, max_after_mg : float
@@ -69,7 +70,7 @@ class Outcome:
     tilt_before_deg, tilt_after_deg : float
         RMS angle between the measured and the true direction of up [°].
     seconds : float
-        Of the whole demonstration.
+        Duration of the demonstration.
 
     """
 
@@ -111,7 +112,7 @@ class _User(Node):
         return keep
 
     def is_flat(self) -> bool:
-        """Tell whether the robot lies flat at this moment."""
+        """Return whether the robot lies flat now."""
         truth = self.messages['truth']
         return bool(truth) and truth[max(truth)] == (0.0, 0.0, STANDARD_GRAVITY)
 
@@ -125,7 +126,7 @@ def _at_least(user: _User, count: int) -> bool:
 
 
 class DemoError(AccelCalibError):
-    """The demonstration did not come to its end."""
+    """The demonstration did not reach its end."""
 
 
 def demonstrate(tell: Callable[[str], None]) -> Outcome:
@@ -135,17 +136,17 @@ def demonstrate(tell: Callable[[str], None]) -> Outcome:
     Parameters
     ----------
     tell : callable
-        Is given a line for each step.
+        Called with a line for each step.
 
     Returns
     -------
     Outcome
-        What came of it.
+        The comparison.
 
     Raises
     ------
     DemoError
-        If a step does not happen in time.
+        If a step takes too long.
 
     """
     began = time.monotonic()
@@ -172,7 +173,7 @@ def demonstrate(tell: Callable[[str], None]) -> Outcome:
 
 
 def _set_environment(folder: Path) -> None:
-    """Keep this demonstration to itself: its own domain, this machine, its own files."""
+    """Isolate this demonstration: a domain of its own, this machine only, files of its own."""
     os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
                       ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
                       ROS_LOG_DIR=str(folder / 'log'))
@@ -204,7 +205,7 @@ def _in_yaml(value: Any) -> str:
 
 @contextmanager
 def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User, _Spin]]:
-    """Give the user of the nodes, and a function that spins until something is so."""
+    """Yield the user of the nodes, and a function that spins until a condition holds."""
     rclpy.init(args=[])
     user = _User()
     executor = SingleThreadedExecutor()
@@ -214,11 +215,11 @@ def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User,
         ends = time.monotonic() + _PATIENCE
         while not until():
             if any(process.poll() is not None for process in processes):
-                raise DemoError('a node has ended', 'see what it said above')
+                raise DemoError('a node has ended', 'see its output above')
             if time.monotonic() > ends:
                 raise DemoError(f'{what} did not come within {_PATIENCE:.0f} s, '
                                 f'{user.poses} poses so far',
-                                'see whether a firewall stops DDS on this machine')
+                                'check whether a firewall blocks DDS on this machine')
             look_again = time.monotonic() + _LOOK_EVERY
             while time.monotonic() < look_again:
                 executor.spin_once(timeout_sec=_LOOK_EVERY)
@@ -249,7 +250,7 @@ def _call(user: _User, spin: _Spin, name: str) -> str:
 
 
 def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
-    """Call a service again until the sensor has been still for long enough."""
+    """Call a service until the sensor has been still for long enough."""
     while user.is_flat():
         answer = _request(user, spin, name)
         if answer.success:
@@ -259,7 +260,7 @@ def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
 
 
 def _rests(user: _User) -> list[dict[str, Floats]]:
-    """Give the mean of raw, corrected and true acceleration over each whole rest, in g."""
+    """Return the means of raw, corrected and true acceleration over each whole rest, in g."""
     common = sorted(set.intersection(*(set(kept) for kept in user.messages.values())))
     if len(common) < 2:
         return []

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses on the unit sphere, for rviz: those captured, and the next one asked for."""
+"""Poses on the unit sphere, for rviz: the captured ones and the next one."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from geometry_msgs.msg import Point
 import numpy as np
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
-
-from .conversion import vector3
 
 if TYPE_CHECKING:
     from ..calibrate import NextPose
@@ -27,23 +25,23 @@ _ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 
-def pose_markers(directions: Floats, asked: NextPose | None, frame_id: str) -> MarkerArray:
+def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerArray:
     """
     Draw poses.
 
     Parameters
     ----------
     directions : (n, 3) array
-        Unit vectors that point up, in the axes of the sensor.
-    asked : NextPose or None
-        The next pose to turn to, or the word that more poses no longer pay.
+        Directions of up in the sensor axes, unit vectors.
+    asked : NextPose
+        The next pose, or that more poses no longer help.
     frame_id : str
         Frame of the sensor.
 
     Returns
     -------
     MarkerArray
-        Replaces all drawn before: namespaces ``sphere``, ``poses``, ``numbers``, ``next``.
+        It replaces what was drawn before: namespaces ``sphere``, ``poses``, ``numbers``, ``next``.
 
     """
     markers = [Marker(action=Marker.DELETEALL),
@@ -51,9 +49,9 @@ def pose_markers(directions: Floats, asked: NextPose | None, frame_id: str) -> M
     for k, direction in enumerate(directions):
         markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
         markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
-    if asked is not None and asked.direction is None:
+    if asked.direction is None:
         markers.append(_text('next', 1, asked.words, _ABOVE))
-    elif asked is not None and asked.direction is not None:
+    else:
         arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
         arrow.points = [Point(), _point(asked.direction)]
         markers += [arrow, _text('next', 1, asked.words, asked.direction * _WORDS_AT)]
@@ -86,5 +84,5 @@ def _at(marker: Marker, position: Floats) -> Marker:
 
 
 def _point(position: Floats) -> Point:
-    vector = vector3(position)
-    return Point(x=vector.x, y=vector.y, z=vector.z)
+    x, y, z = position.tolist()
+    return Point(x=x, y=y, z=z)

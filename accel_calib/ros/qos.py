@@ -11,11 +11,11 @@ At depth 10 a busy machine loses a few messages in 10,000 at 1 kHz, at depth 100
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 SENSOR = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""For what comes from drivers: takes reliable publishers too."""
+"""For messages of drivers; reliable publishers match too."""
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""For what goes out: serves best-effort subscribers too."""
+"""For outgoing messages; best-effort subscribers match too."""
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""The last one is given to all who come later."""
+"""Late subscribers get the last message."""

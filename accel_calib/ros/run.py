@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start, spin and end a node; every way a user can end it is a clean one."""
+"""Start, spin and end a node cleanly, however the user ends it."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 _OK, _BAD_INPUT = 0, 2
 
 _LOOK_EVERY = 0.25
-"""How often it is looked whether ROS was shut down [s]."""
+"""Interval at which the shutdown of ROS is checked [s]."""
 
 _SWITCH = 1e-4
-"""After this a message has the interpreter, when another thread is at work [s]."""
+"""Time after which another thread gives the interpreter to a message [s]."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
     """
-    Run a node until it is told to end.
+    Run a node until it is ended.
 
     Parameters
     ----------
     node : str
         ``module:class`` of the node, in this package.
     args : sequence of str, optional
-        Command line with the program's name first; default: that of the process.
+        Command line with the name of the program first; default: that of the process.
 
     Returns
     -------
     int
-        Exit status: 0, or 2 where the input or ROS itself is missing or wrong.
+        Exit status: 0, or 2 if the input or ROS itself is missing or wrong.
 
     """
     try:
@@ -55,14 +55,14 @@ def _run(node: str, args: Sequence[str] | None) -> int:
     try:
         import rclpy
     except ImportError as error:
-        return _refuse(f'ROS 2 is not here ({error}), expected rclpy of ROS 2 Jazzy; source '
+        return _refuse(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy; source '
                        "/opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'")
     from rclpy.executors import ExternalShutdownException
     try:
         rclpy.init(args=args)
     except RuntimeError as error:
-        return _refuse(f'ROS 2 does not start: {str(error).splitlines()[0]}; look at the '
-                       'parameters and arguments given')
+        return _refuse(f'ROS 2 does not start: {str(error).splitlines()[0]}; check the '
+                       'parameters and arguments')
     try:
         _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -77,7 +77,7 @@ def _run(node: str, args: Sequence[str] | None) -> int:
 
 
 def _spin(node: str) -> None:
-    """Make the node and spin it."""
+    """Create the node and spin it."""
     from rclpy.executors import ExternalShutdownException
     from rclpy.task import Future
     module, name = node.split(':')
@@ -85,11 +85,11 @@ def _spin(node: str) -> None:
     executor = _executor()
     executor.add_node(instance)
     sys.setswitchinterval(_SWITCH)
-    gc.freeze()  # what is there stays: to look through it again would take tens of ms
+    gc.freeze()  # what exists now stays; to scan it again would take tens of ms
     try:
         instance.start()
         while instance.context.ok():
-            # EventsExecutor.spin() hears no signal, and a future would keep each of these calls.
+            # EventsExecutor.spin() ignores signals, and one future would keep each of these calls.
             executor.spin_until_future_complete(Future(), timeout_sec=_LOOK_EVERY)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -104,7 +104,7 @@ def _spin(node: str) -> None:
 
 
 def _executor() -> Executor:
-    """Make the executor that costs least."""
+    """Return the executor that costs least."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:

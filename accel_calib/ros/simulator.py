@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the simulator until it is told to end; give the exit status."""
+    """Run the simulator until it is ended; return the exit status."""
     return run('.simulator_node:SimulatorNode', args)
 
 

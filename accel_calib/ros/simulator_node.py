@@ -4,18 +4,18 @@
 """
 The simulator node: an Imu, and its temperature, that turns through poses.
 
-All samples are made before the first is sent, by `accel_calib.simulate`; a timer sends those that
-are due, with stamps exactly 1/rate apart. Acceleration is in m/s². ``~/truth`` has the specific
-force of the robot, without any effect, noise or mounting.
+All samples are simulated before the first is sent, by `accel_calib.simulate`; a timer sends those
+that are due, with stamps exactly 1/rate apart. Acceleration is in m/s². ``~/truth`` is the
+specific force of the robot, without any effect, noise or mounting.
 
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import time
-from typing import TYPE_CHECKING
 
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import Vector3, Vector3Stamped
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -24,21 +24,50 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Header
 
 from . import qos
-from .conversion import vector3
 from .declare import declared
-from .settings import SimulatorSettings
+from ..session.parameters import parameter
 from ..simulate import model_with, parse_effect, simulate_recording
 from ..sphere import rotation_from_rpy, spread_directions
-
-if TYPE_CHECKING:
-    from ..table import Recording
+from ..table import Floats, Recording
+from ..units import STANDARD_GRAVITY
 
 _FLAT = np.array([[0.0, 0.0, 1.0]])
 _TEMPERATURE_EVERY = 0.1
-"""Between messages of temperature [s]."""
+"""Time between messages of temperature [s]."""
 
 _LONGEST_TICK = 0.005
-"""Between looks at the clock [s]."""
+"""Longest time between checks of the clock [s]."""
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """Parameters of the simulator."""
+
+    frame_id: str = parameter('imu', 'frame_id of the messages')
+    rate: float = parameter(200.0, 'Messages a second [Hz]', limits=(1.0, 10000.0))
+    poses: int = parameter(12, 'Poses, spread evenly over the sphere', limits=(1, 1000))
+    dwell: float = parameter(3.0, 'Time in each pose [s]', limits=(0.01, 3600.0))
+    turn: float = parameter(1.0, 'Time of the turn between poses [s]', limits=(0.01, 3600.0))
+    wait: float = parameter(
+        0.0, 'Before the first pose, wait this long for listeners [s]. 0: start at once',
+        limits=(0.0, 3600.0))
+    listeners: int = parameter(1, 'Listeners to wait for', limits=(1, 100))
+    loop: bool = parameter(False, 'Start again after the last pose')
+    hold: bool = parameter(True, 'Hold the last pose; otherwise the node ends after it')
+    flat_first: bool = parameter(False, 'Lie flat (z of the robot up) before the poses')
+    flat_last: bool = parameter(True, 'Lie flat (z of the robot up) after the poses')
+    mounting: list[float] = parameter(
+        [0.0, 0.0, 0.0], 'Roll, pitch and yaw of the sensor on the robot [°]')
+    effects: list[str] = parameter(
+        [''], "What is wrong with the sensor, as 'offset=0.1,-0.2,0.3' in the units of the "
+        'catalogue (g)')
+    noise: float = parameter(0.02, 'Standard deviation of a sample [m/s²]', limits=(0.0, 10.0))
+    gyro_noise: float = parameter(0.002, 'Standard deviation of a sample [rad/s]',
+                                  limits=(0.0, 10.0))
+    gravity: float = parameter(STANDARD_GRAVITY, 'Local gravity [m/s²]', limits=(1.0, 30.0))
+    temperature: list[float] = parameter(
+        [25.0, 25.0], 'Temperature at the first and the last sample [°C]')
+    seed: int = parameter(1, 'Seed of the noise', limits=(0, 2 ** 31 - 1))
 
 
 class SimulatorNode(Node):
@@ -63,7 +92,7 @@ class SimulatorNode(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_tick(self) -> None:
-        """Send what is due."""
+        """Send the samples that are due."""
         now = time.monotonic()
         if self._sent == 0:
             listeners = self._imu.get_subscription_count()
@@ -80,7 +109,7 @@ class SimulatorNode(Node):
             self._sent += 1
 
     def _row(self, number: int) -> int | None:
-        """Give the row of the n-th sample; None where it is over."""
+        """Return the row of the n-th sample; None after the last one."""
         count = len(self._recording)
         if number < count or self.settings.loop:
             return number % count
@@ -103,12 +132,12 @@ class SimulatorNode(Node):
                 header=header, temperature=float(recording['temperature'][row])))
 
     def close(self) -> None:
-        """Nothing is left to finish."""
+        """Do nothing: there is nothing to finish."""
 
 
 def recording_of(settings: SimulatorSettings) -> Recording:
     """
-    Make all samples.
+    Simulate all samples.
 
     Returns
     -------
@@ -134,9 +163,14 @@ def recording_of(settings: SimulatorSettings) -> Recording:
 
 
 def _empty_message(settings: SimulatorSettings) -> Imu:
-    """Make a message with all that stays the same."""
+    """Return a message with the fields that stay the same."""
     message = Imu()
     message.orientation_covariance[0] = -1.0
     message.angular_velocity_covariance = (np.eye(3) * settings.gyro_noise ** 2).ravel()
     message.linear_acceleration_covariance = (np.eye(3) * settings.noise ** 2).ravel()
     return message
+
+
+def vector3(numbers: Floats) -> Vector3:
+    """Return a (3,) array as a message."""
+    return Vector3(x=float(numbers[0]), y=float(numbers[1]), z=float(numbers[2]))

@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The one thread for all that takes longer than a message: files, and waiting for `apart`.
+The thread of a node for jobs: files, and waiting for the worker process.
 
-A job runs in that thread, in the order given, and what it found comes back as a callback in the
-thread of the executor, so that only callbacks change the state of the node. A service whose
-answer waits for a job returns a `Promise` in place of the response; it is sent when kept. That
-way callbacks never wait, and it works with every executor: coroutines as service callbacks,
-which rclpy has for this, do not work with EventsExecutor, nor do guard conditions.
+Jobs run in that thread, in the order given, and finish as callbacks in the thread of the executor,
+so that only callbacks change the session.
 
 """
 
@@ -18,88 +15,67 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from traceback import format_exc
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING
 
-from .apart import Apart
+from ..errors import AccelCalibError
+from ..session import Job
+from ..session.worker_process import WorkerProcess
 
 if TYPE_CHECKING:
     from rclpy.node import Node
-    from rclpy.service import Service
 
-Found = TypeVar('Found')
-
-
-class Promise:
-    """A response that comes later."""
-
-    def __init__(self) -> None:
-        self._response: Future[Any] = Future()
-
-    def keep(self, response: Any) -> None:
-        """Send this response."""
-        self._response.set_result(response)
-
-    def when_kept(self, send: Callable[[Any], None]) -> None:
-        """Have `send` called with the response."""
-        self._response.add_done_callback(lambda kept: send(kept.result()))
+Answer = Callable[[bool, str], object]
+"""Takes whether a job succeeded, and its result in words."""
 
 
 class Worker:
     """
     A thread beside the executor of a node.
 
-    What computes is for ``apart.call`` in a job.
+    Parameters
+    ----------
+    node : Node
+        The node.
+    on_events : callable
+        Called after each job, in the thread of the executor.
 
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, on_events: Callable[[], None]) -> None:
+        self._node, self._on_events = node, on_events
         self._pool = ThreadPoolExecutor(1, 'accel_calib')
         self._done: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self.apart = Apart()
+        self._process = WorkerProcess()
 
-    def run(self, job: Callable[[], Found], then: Callable[[Future[Found]], None]) -> None:
-        """
-        Do a job in the thread, then call back in the executor.
+    def run(self, job: Job, answer: Answer) -> None:
+        """Run a job in the thread, finish it in the executor, and answer."""
+        future = self._pool.submit(job.run, self._process.call)
+        future.add_done_callback(lambda done: self._call_back(job, answer, done))
 
-        Parameters
-        ----------
-        job : callable
-            Takes and changes nothing of the node.
-        then : callable
-            Takes the future of what the job gave or raised.
-
-        """
-        self._pool.submit(job).add_done_callback(lambda done: self._call_back(then, done))
-
-    def _call_back(self, then: Callable[[Future[Found]], None], done: Future[Found]) -> None:
-        self._done.put(lambda: self._finish(then, done))
+    def _call_back(self, job: Job, answer: Answer, done: Future[Any]) -> None:
+        self._done.put(lambda: self._finish(job, answer, done))
         executor = self._node.executor
         if executor is not None:
             # The executor may run tasks in any order; the queue keeps that of the jobs.
             executor.create_task(lambda: self._done.get()())
 
-    def _finish(self, then: Callable[[Future[Found]], None], done: Future[Found]) -> None:
-        """Call back; a fault of the program is told of, and does not stop the stream."""
+    def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
+        """Finish a job and answer; a fault of the program is logged, and the stream goes on."""
         try:
-            then(done)
-        except Exception:
+            words, success = job.finish(done.result()), True
+        except AccelCalibError as error:
+            words, success = str(error), False
+        except OSError as error:
+            words = f'{error}; correct the permissions, or set calibration_file'
+            success = False
+        except Exception as error:
             self._node.get_logger().error(f'a fault in accel_calib:\n{format_exc()}')
+            words = f'a fault in accel_calib ({error!r}); please report it with the log'
+            success = False
+        answer(success, words)
+        self._on_events()
 
     def close(self) -> None:
-        """Give up what is being computed and kept, and finish what else is being written."""
-        self.apart.close()
+        """End what is being computed, and finish what is being written."""
+        self._process.close()
         self._pool.shutdown(wait=True)
-
-
-def answer_later(service: Service) -> None:
-    """Let the callback of this service return a `Promise`."""
-    send = service.send_response
-
-    def send_response(response: Any, header: Any) -> None:
-        if isinstance(response, Promise):
-            response.when_kept(lambda kept: send(kept, header))
-        else:
-            send(response, header)
-
-    service.send_response = send_response

@@ -1,0 +1,527 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The public functions; ``import accel_calib as ac`` has them as ``ac.fit`` and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from datetime import datetime, timezone
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, overload, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import calibrate
+from .calibrate import FrameName, level_by_rows, Method, Verification
+from .capture import capture as find_still
+from .capture import settings_from
+from .compare import compare as compare_calibrations
+from .compare import Comparison
+from .errors import InputError
+from .files import (
+    is_bag,
+    open_recording,
+    read_calibration,
+    write_calibration,
+)
+from .files import read_poses as read_pose_table
+from .files import read_recording as read_whole_recording
+from .refine import refine as find_effects
+from .refine import Refinement
+from .simulate import model_with, simulate_poses, simulate_recording
+from .sphere import rotation_from_rpy, spread_directions
+from .table import columns_from, Floats, numbered, Poses, Recording, Table
+from .units import STANDARD_GRAVITY, UnitName, Units, units_of
+
+__all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
+           'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+
+Source = str | PathLike[str]
+Data = Any
+"""A table, an (n, 3) array of readings, or a DataFrame with columns by their names in a file."""
+
+_Table = TypeVar('_Table', bound=Table)
+
+
+class Calibration(calibrate.Calibration):
+    """
+    A fitted model, ready to correct.
+
+    Attributes
+    ----------
+    offset : (3,) array
+        V, the zero-g offset, in the unit of the readings.
+    gain : (3, 3) array
+        W, dimensionless, or native units per g.
+    matrix : (3, 3) array
+        W⁻¹, in units of the reading.
+    rotation : (3, 3) array
+        ΔR, from the levelled frame to the sensor frame.
+    covariance : (p, p) array
+        Of the values named by `parameters` [g].
+    quality : Quality
+        Figures over the poses used.
+    warnings : tuple of str
+        What a user should know.
+
+    """
+
+    def save(self, path: Source) -> None:
+        """
+        Store it as YAML; the previous file is kept as ``<name>.before``.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Raises
+        ------
+        RefusedFitError
+            If it is not one that a sensor can have.
+        OSError
+            If it cannot be written.
+
+        """
+        write_calibration(Path(path), self)
+
+    def report(self, path: Source) -> Refinement:
+        """
+        Write a page about what it lacks (HTML), from its own poses.
+
+        Parameters
+        ----------
+        path : str or Path
+            The page.
+
+        Returns
+        -------
+        Refinement
+            What the page is about.
+
+        Raises
+        ------
+        RefusedFitError
+            If its poses leave nothing to find an effect with.
+        InputError
+            If matplotlib is not installed.
+        OSError
+            If the page cannot be written.
+
+        """
+        from .report import check_matplotlib, write_page
+
+        check_matplotlib()
+        result = find_effects(self.used_poses, self.units, base=self)
+        write_page(Path(path), result, f'poses of {self!r}')
+        return result
+
+
+def load(path: Source) -> Calibration:
+    """
+    Read a stored calibration.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML that `Calibration.save`, a command or the node wrote.
+
+    Returns
+    -------
+    Calibration
+        With a warning if the file was edited by hand.
+
+    Raises
+    ------
+    StoredCalibrationError
+        If it is damaged, newer than this package, or not one that a sensor can have.
+    OSError
+        If it cannot be read.
+
+    """
+    return _public(read_calibration(Path(path)))
+
+
+def read_poses(path: Source) -> Poses:
+    """
+    Read a pose table (CSV).
+
+    Parameters
+    ----------
+    path : str or Path
+        The table.
+
+    Returns
+    -------
+    Poses
+        In the unit of the table.
+
+    Raises
+    ------
+    InputError
+        If it is empty, lacks columns, or holds something that is not a finite number.
+    OSError
+        If it cannot be read.
+
+    """
+    return read_pose_table(Path(path))
+
+
+def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Recording:
+    """
+    Read a recording: a CSV table, a rosbag2 (folder, mcap, db3) or a ROS 1 bag.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder.
+    topic : str
+        Imu topic, for a bag with several.
+    sensor : str
+        frame_id of the messages to read, for a topic with several sensors.
+
+    Returns
+    -------
+    Recording
+        All samples.
+
+    Raises
+    ------
+    InputError
+        If it is not what its name says, holds no samples, or samples of several sensors.
+    OSError
+        If it cannot be read.
+
+    """
+    return read_whole_recording(Path(path), topic, sensor)
+
+
+def capture(recording: Source | Recording | Data, *, units: UnitName | None = None,
+            gravity: float = STANDARD_GRAVITY, topic: str = '', sensor: str = '',
+            **settings: Any) -> Poses:
+    """
+    Find the still poses of a recording.
+
+    Parameters
+    ----------
+    recording : str, Path, Recording or DataFrame
+        The samples, with ``time``.
+    units : {'m/s2', 'g', 'native'}, optional
+        Unit of the readings; by default that of the recording, or m/s².
+    gravity : float
+        Local gravity [m/s²].
+    topic, sensor : str
+        As `read_recording`.
+    **settings
+        Of `accel_calib.capture.CaptureSettings`, such as ``min_dwell=2.0``; ``still_std_max``
+        is in the unit of the readings.
+
+    Returns
+    -------
+    Poses
+        In the unit of the readings, in order of time.
+
+    Raises
+    ------
+    InputError
+        If there is no still stretch, the readings are clearly in another unit, or a setting is
+        out of range.
+
+    """
+    if isinstance(recording, str | PathLike):
+        path = Path(recording)
+        with open_recording(path, topic, sensor) as opened:
+            known = _units(units, gravity, opened.units, str(path))
+            found = find_still(opened.blocks, known, settings_from(settings, known))
+    else:
+        samples = _table(recording, Recording, 'the recording')
+        known = _units(units, gravity, samples.units, 'the recording')
+        calibrate.check_units(samples, known)
+        found = find_still(samples, known, settings_from(settings, known))
+    if not len(found.poses):
+        raise InputError(f'there is no still stretch in {found.recorded} samples',
+                         'hold the sensor still in each pose for some seconds, or give '
+                         'still_std_max and min_dwell')
+    return replace(found.poses, units=known.name)
+
+
+def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
+        gravity: float = STANDARD_GRAVITY, model: str = 'auto', method: Method = 'ml',
+        flat: int | None = None, nose_down: int | None = None, frame: FrameName = 'ros',
+        sensor: str = '') -> Calibration:
+    """
+    Fit a calibration to still poses.
+
+    Parameters
+    ----------
+    poses : str, Path, Poses, DataFrame or (n, 3) array
+        The poses.
+    units : {'m/s2', 'g', 'native'}, optional
+        Unit of the readings; by default that of the poses, or m/s².
+    gravity : float
+        Local gravity [m/s²].
+    model : {'auto', '4', '7', '9', '10', '12'}
+        Number of parameters, or the smallest of 4, 7 and 10 that the poses support.
+    method : {'ml', 'algebraic'}
+        Maximum likelihood, or the cost functions of AN5286 and the ESGI'95 report.
+    flat : int, optional
+        Row of the pose in which the robot was level, from 1: the mounting ΔR follows from it.
+    nose_down : int, optional
+        Row of a pose in which the nose of the robot was tilted straight down, from 1: the heading
+        of the mounting follows from it.
+    frame : {'ros', 'ned', 'android', 'win8'}
+        The levelled frame.
+    sensor : str
+        Name of the sensor; by default that of the poses.
+
+    Returns
+    -------
+    Calibration
+        With its uncertainty, quality and warnings.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses do not determine the model, or the result is not plausible.
+    InputError
+        If the readings are clearly in another unit, or there is no such row.
+
+    """
+    table = _poses(poses)
+    known = _units(units, gravity, table.units, 'the pose table')
+    calibration = calibrate.fit_poses(table, known, model=model, method=method, sensor=sensor,
+                                      date=_now())
+    return _public(level_by_rows(calibration, table, frame, flat, nose_down))
+
+
+def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
+           units: UnitName | None = None, gravity: float = STANDARD_GRAVITY, sensor: str = ''
+           ) -> Refinement:
+    """
+    Find what a calibration lacks, name it, add it, and show how the residual shrinks.
+
+    Parameters
+    ----------
+    poses : str, Path, Poses, DataFrame or (n, 3) array
+        The poses, with as many columns of context as are known.
+    base : {'auto', 'ideal', '4', '7', '10', '12'} or Calibration
+        The model to begin with. A Calibration is compared as it is stored.
+    units : {'m/s2', 'g', 'native'}, optional
+        Unit of the readings; by default that of the base or of the poses, or m/s².
+    gravity : float
+        Local gravity [m/s²].
+    sensor : str
+        Name of the sensor; by default that of the poses.
+
+    Returns
+    -------
+    Refinement
+        The verdict, the steps, and the refined calibration.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses do not determine the base, or leave nothing to find an effect with.
+    InputError
+        If the readings are clearly in another unit.
+
+    """
+    table = _poses(poses)
+    known = (base.units if isinstance(base, calibrate.Calibration)
+             else _units(units, gravity, table.units, 'the pose table'))
+    found = find_effects(table, known, base=base, sensor=sensor, date=_now())
+    return replace(found, calibration=_public(found.calibration))
+
+
+def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibration
+           ) -> Verification:
+    """
+    Evaluate a calibration on poses that it was not fitted to.
+
+    Parameters
+    ----------
+    poses : str, Path, Poses, DataFrame or (n, 3) array
+        The poses, in the unit of the calibration.
+    calibration : str, Path or Calibration
+        The calibration.
+
+    Returns
+    -------
+    Verification
+        Residual before and after [mg], largest error [%], and noise floor [mg].
+
+    Raises
+    ------
+    InputError
+        If the readings are clearly in another unit, or the effects need another column.
+
+    """
+    table = _poses(poses)
+    known = (calibration if isinstance(calibration, calibrate.Calibration)
+             else load(calibration))
+    _units(known.units.name, known.units.per_g, table.units, 'the pose table')
+    calibrate.check_units(table, known.units)
+    return calibrate.verify(known, table)
+
+
+def compare(calibrations: Sequence[Source | calibrate.Calibration]) -> Comparison:
+    """
+    Test whether calibrations of one sensor agree within their uncertainties.
+
+    Parameters
+    ----------
+    calibrations : sequence of str, Path or Calibration
+        At least two.
+
+    Returns
+    -------
+    Comparison
+        Whether they agree, and where they differ.
+
+    Raises
+    ------
+    InputError
+        If they cannot be compared.
+
+    """
+    return compare_calibrations([each if isinstance(each, calibrate.Calibration) else load(each)
+                                 for each in calibrations])
+
+
+@overload
+def simulate(effects: Mapping[str, ArrayLike] = ..., *, recording: Literal[False] = ...,
+             **options: Any) -> Poses: ...
+
+
+@overload
+def simulate(effects: Mapping[str, ArrayLike] = ..., *, recording: Literal[True],
+             **options: Any) -> Recording: ...
+
+
+def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, poses: int = 24,
+             directions: ArrayLike | None = None, noise: float = 0.003, samples: int = 100,
+             rate: float = 100.0, dwell: float = 3.0, turn: float = 1.0,
+             temperature: ArrayLike = (), mounting: ArrayLike = (0.0, 0.0, 0.0),
+             reference: bool = False, units: UnitName = 'm/s2',
+             gravity: float = STANDARD_GRAVITY, seed: int = 0, **context: ArrayLike
+             ) -> Poses | Recording:
+    """
+    Simulate poses, or a recording, of a sensor with known effects.
+
+    Parameters
+    ----------
+    effects : mapping of str to array
+        Values of effects, in the units of the catalogue (g); one value serves all axes.
+    recording : bool
+        Simulate samples of a sensor that is turned, instead of pose means.
+    poses : int
+        Number of poses, spread evenly over the sphere; the first is flat.
+    directions : (n, 3) array, optional
+        Directions of up in the levelled frame, instead of these.
+    noise : float
+        Standard deviation of a sample [g].
+    samples : int
+        Samples per pose.
+    rate, dwell, turn : float
+        Of a recording: samples per second, duration of each rest and of each turn [s].
+    temperature : (2,) or (n,) array
+        First and last temperature, or that of each pose [°C].
+    mounting : (3,) array
+        Roll, pitch and yaw of the sensor on the robot [°].
+    reference : bool
+        Add the true specific force as ``reference`` (known orientation).
+    units : {'m/s2', 'g', 'native'}
+        Unit of the result.
+    gravity : float
+        Local gravity [m/s²].
+    seed : int
+        Seed of the noise.
+    **context : array
+        What is known beside the poses, such as ``time`` [s]; n rows each.
+
+    Returns
+    -------
+    Poses or Recording
+        In that unit; a recording with angular rate.
+
+    Raises
+    ------
+    InputError
+        If an effect is not in the catalogue, or needs context that is not given.
+
+    """
+    known = units_of(units, gravity)
+    # ΔR takes the axes of the robot to those of the sensor, the attitude of the sensor back.
+    rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
+    model = model_with(effects, rotation)
+    up = _directions(poses) if directions is None else np.asarray(directions, float)
+    rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
+    if recording:
+        found: Table = simulate_recording(model, up, rng, noise_g=noise, rate_hz=rate, dwell=dwell,
+                                          turn=turn, temperatures=warm.tolist())
+    else:
+        columns = {key: np.asarray(values, float) for key, values in context.items()}
+        if len(warm):
+            columns['temperature'] = warm if len(warm) == len(up) else np.linspace(
+                warm[0], warm[-1], len(up))
+        found = simulate_poses(model, up, rng, noise_g=noise, samples=samples,
+                               context={'reference': up, **columns})
+    kept = {key: values for key, values in found.columns.items()
+            if reference or key != 'reference'}
+    scaled: dict[str, NDArray[Any]] = {
+        key: known.from_g(kept[key]) for key in ('reading', 'std', 'reference')
+        if key in kept and (key != 'reference' or units != 'native')}
+    return replace(found, columns={**kept, **scaled}, units=units)  # type: ignore[return-value]
+
+
+def _directions(count: int) -> Floats:
+    """Return directions spread over the sphere, the first flat."""
+    return np.vstack([[[0.0, 0.0, 1.0]], spread_directions(count)[1:]])
+
+
+def _poses(given: Source | Poses | Data) -> Poses:
+    """Return poses from what a user has."""
+    if isinstance(given, str | PathLike):
+        path = Path(given)
+        if is_bag(path):
+            raise InputError(f'{path} is a recording, expected a pose table',
+                             'capture the poses first')
+        return read_pose_table(path)
+    return _table(given, Poses, 'the pose table')
+
+
+def _table(given: Data, kind: type[_Table], source: str) -> _Table:
+    """Return a table from a table, an array or a DataFrame."""
+    if isinstance(given, kind):
+        return given
+    needed = ('time', 'reading') if kind is Recording else ('reading',)
+    if hasattr(given, 'columns') and not isinstance(given, Table):
+        columns = columns_from({str(name): given[name] for name in given.columns}, needed, source)
+        return kind(columns, numbered(columns))
+    readings = np.asarray(given, float)
+    if readings.ndim != 2 or readings.shape[1] != 3 or kind is Recording:
+        raise InputError(f'{source} has shape {readings.shape}, expected (n, 3) readings, or '
+                         'columns by name', 'give a table or a DataFrame')
+    columns = columns_from(dict(zip(('ax', 'ay', 'az'), readings.T)), needed, source)
+    return kind(columns, numbered(columns))
+
+
+def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> Units:
+    """Return the unit that was asked for, or that a file states."""
+    if asked and stated and asked != stated:
+        raise InputError(f'{source} is in {stated}, not in {asked}', f'give units={stated!r}')
+    name: Any = asked or stated or 'm/s2'
+    return units_of(name, gravity)
+
+
+def _public(calibration: calibrate.Calibration) -> Calibration:
+    return Calibration(**{each.name: getattr(calibration, each.name)
+                          for each in fields(calibrate.Calibration)})
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')

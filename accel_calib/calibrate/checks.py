@@ -1,0 +1,304 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Checks of what poses are given as: wrong units, and faults of the wiring.
+
+|force| = 1 g cannot see a wrong sign, swapped axes or a turned sensor: the sphere of poses is the
+same. Known orientations can. A least squares fit reading = X force + y needs no small errors, and
+the orthogonal part Q of X = S Q (polar decomposition) gives the axes: near the identity if each
+reads its own force, otherwise near one of the 24 rotations and 24 mirror images that permute the
+axes, or a turn by any angle. A rotation may be intended, a mirror image never is.
+
+One flat pose gives the direction of up and no more: an upside-down sensor and a wrong sign look
+the same.
+
+"""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .mounting import flat_direction
+from ..errors import InputError, RefusedFitError
+from ..estimate.closed_form import fit_12
+from ..table import Floats, Table
+from ..units import STANDARD_GRAVITY, Units
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+
+_LIKELY_G = (0.5, 2.0)
+_ABOUT = 1.3
+"""Factor within which a unit is named."""
+
+_OTHERS = {'g': 1.0, 'm/s2': STANDARD_GRAVITY, 'ft/s2': 32.174, 'cm/s2': 100.0 * STANDARD_GRAVITY,
+           'mg': 1e3, 'µg': 1e6}
+"""1 g in units that sensors give."""
+
+_TAKEN = ('g', 'm/s2')
+
+
+def check_units(poses: Table, units: Units) -> None:
+    """
+    Check that still readings are about 1 g long, and known forces in the right unit.
+
+    Raises
+    ------
+    InputError
+        If they are not; names the unit that they look like.
+
+    """
+    if len(poses) == 0:
+        return
+    if units.name != 'native':
+        _check_readings(_median_length(poses.reading), units)
+    if 'reference' in poses:
+        _check_reference(_median_length(poses['reference']), units)
+
+
+def _median_length(vectors: Floats) -> float:
+    with np.errstate(over='ignore'):
+        return float(np.median(np.linalg.norm(vectors, axis=1)))
+
+
+def _check_readings(length: float, units: Units) -> None:
+    if _is_likely(length, units.per_g):
+        return
+    likely = _likely(length)
+    taken = next((name for name in likely if name in _TAKEN), None)
+    if taken:
+        advice = f'give the units of the readings: {taken}'
+    else:
+        look = f'they look like {" or ".join(likely)}: ' if likely else ''
+        advice = f'{look}give the units of the readings: native, and the fit finds their scale'
+    raise InputError(f'the readings are about {length:.4g} long, expected about '
+                     f'{units.per_g:.4g} at rest in {units.name}', advice)
+
+
+def _check_reference(length: float, units: Units) -> None:
+    per_g, words = ((1.0, 'in g, as known forces beside native readings are')
+                    if units.name == 'native' else
+                    (units.per_g, f'in {units.name}, the unit of the readings'))
+    if _is_likely(length, per_g):
+        return
+    likely = _likely(length)
+    look = f'they look like {" or ".join(likely)}: ' if likely else ''
+    raise InputError(f'the known forces ref_x,ref_y,ref_z are about {length:.4g} long, expected '
+                     f'about {per_g:.4g} {words}',
+                     f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
+                     if length > 0.0 else 'fill the columns, or leave them out')
+
+
+def _is_likely(length: float, per_g: float) -> bool:
+    return _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]
+
+
+def _likely(length: float) -> list[str]:
+    """Return the units in which that is about 1 g: those that fit well, or else the nearest."""
+    fits = {name: max(length / per_g, per_g / max(length, 1e-300))
+            for name, per_g in _OTHERS.items()}
+    well = [name for name, factor in fits.items() if factor <= _ABOUT]
+    nearest = min(fits, key=lambda name: fits[name])
+    return well or ([nearest] if fits[nearest] <= _LIKELY_G[1] else [])
+
+
+FLAT = 'the flat pose'
+"""First words of the warning about a flat pose."""
+
+_AXES = 'xyz'
+_NEAR = 25.0
+"""Axes within this of a permutation are called that; within it of their own they are right [°]."""
+
+_ON_ITS_SIDE = 45.0
+"""A flat pose further from the expected axis than this is worth a warning [°]."""
+
+_LEAST_SPREAD = 0.1
+"""Least singular value of the centred known forces over the largest, to determine the axes."""
+
+_ADVICE = 'check the wiring, the driver and the signs of ref_x,ref_y,ref_z'
+
+
+def wiring_warnings(calibration: Calibration) -> tuple[str, ...]:
+    """
+    Return a warning about the wiring, from known orientations.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its poses.
+
+    Returns
+    -------
+    tuple of str
+        One warning, or none; none if the orientations are not known.
+
+    """
+    poses, name = calibration.poses, calibration.name
+    if 'reference' not in poses:
+        return ()
+    mat_q = axes_of(poses.reading, poses['reference'])
+    found = None if mat_q is None else fault_of(mat_q)
+    if mat_q is None or found is None:
+        return ()
+    mirrored = np.linalg.det(mat_q) < 0.0
+    if name == '12':
+        effect = 'model 12 corrects for it'
+    elif mirrored:
+        effect = f'model {name} does not correct for it: |force| = 1 g cannot see it'
+    elif np.array_equal(calibration.model.rotation, np.eye(3)):
+        effect = f'model {name} leaves it as it is'
+    else:
+        effect = 'the mounting takes it out'
+    advice = _ADVICE if mirrored else f'if that is not how it is mounted, {_ADVICE}'
+    return (f'against the known orientations {found}; {effect}; {advice}',)
+
+
+def axes_of(reading: Floats, reference: Floats) -> Floats | None:
+    """
+    Return how the axes of the readings lie in those of the known forces.
+
+    Parameters
+    ----------
+    reading, reference : (n, 3) array
+        In any units.
+
+    Returns
+    -------
+    (3, 3) array or None
+        The orthogonal matrix from the known forces to the axes of the readings, det ±1; None
+        if the known forces do not determine it.
+
+    """
+    scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)
+    if len(scales) < 3 or scales[2] < _LEAST_SPREAD * scales[0]:
+        return None
+    try:
+        left, _, right = np.linalg.svd(fit_12(reading, reference)[0])
+    except RefusedFitError:
+        return None
+    mat_q: Floats = left @ right
+    return mat_q
+
+
+def fault_of(mat_q: Floats) -> str | None:
+    """
+    Return what is wrong with axes that lie like this.
+
+    Parameters
+    ----------
+    mat_q : (3, 3) array
+        Orthogonal, det ±1, from true forces to the axes of the readings.
+
+    Returns
+    -------
+    str or None
+        None if each axis reads its own force.
+
+    """
+    if _angle(mat_q) <= _NEAR:
+        return None
+    nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
+    if _angle(mat_q @ nearest.T) <= _NEAR:
+        return _words(nearest)
+    if np.linalg.det(mat_q) > 0.0:
+        return f'the sensor is turned by {_turn(mat_q.T)}: a rotation'
+    return ('the readings are a mirror image: an axis has the wrong sign, or two are swapped, and '
+            'the sensor is turned besides')
+
+
+def _signed_permutations() -> list[Floats]:
+    return [np.diag(signs) @ np.eye(3)[list(order)]
+            for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+
+
+_PERMUTATIONS = _signed_permutations()
+"""The 48 ways to permute the axes, mirror images included."""
+
+
+def _angle(mat_q: Floats) -> float:
+    """Return the angle of a rotation [°]; 180 for a mirror image."""
+    if np.linalg.det(mat_q) < 0.0:
+        return 180.0
+    return float(np.degrees(np.arccos(np.clip((np.trace(mat_q) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+def _words(permutation: Floats) -> str:
+    """Return the words for a signed permutation that is not the identity."""
+    reads = _mapping(permutation)
+    if np.linalg.det(permutation) > 0.0:
+        return (f'the sensor is turned by {_turn(permutation.T)} ({reads}): a rotation')
+    diagonal = np.diag(permutation)
+    if np.all(diagonal == -1.0):
+        return ('all three axes have the wrong sign: the sensor reports gravity, which '
+                'points down, and not the force that holds it up')
+    if np.count_nonzero(diagonal) == 3:
+        return f'the {_AXES[int(np.argmin(diagonal))]} axis has the wrong sign ({reads})'
+    if np.all(permutation >= 0.0):
+        swapped = [axis for axis, own in zip(_AXES, diagonal, strict=True) if own == 0.0]
+        return f'{" and ".join(swapped)} are swapped'
+    return f'the axes are mixed up: {reads}, a mirror image'
+
+
+def _mapping(permutation: Floats) -> str:
+    """Return what each axis reads, where that is not its own force."""
+    parts = []
+    for axis, row in zip(_AXES, permutation, strict=True):
+        other = int(np.argmax(np.abs(row)))
+        sign = '-' if row[other] < 0.0 else '+'
+        if f'{sign}{_AXES[other]}' != f'+{axis}':
+            parts.append(f'{axis} reads {sign}{_AXES[other]}')
+    return ', '.join(parts)
+
+
+def _turn(rotation: Floats) -> str:
+    """Return a rotation of the sensor as an angle about an axis."""
+    from scipy.spatial.transform import Rotation
+
+    vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle
+    axis = axis if axis[np.argmax(np.abs(axis))] > 0.0 or angle < 179.0 else -axis
+    largest = int(np.argmax(np.abs(axis)))
+    if abs(axis[largest]) > np.cos(np.radians(_NEAR)):
+        signed = angle if axis[largest] > 0.0 else -angle
+        return f'{signed:.0f}° about {_AXES[largest]}'
+    return f'{angle:.0f}° about ({", ".join(f"{part:.2g}" for part in axis)})'
+
+
+def flat_warnings(rotation: Floats, frame: str) -> tuple[str, ...]:
+    """
+    Return a warning about the wiring, from a flat pose.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+        ΔR of that pose.
+    frame : {'ros', 'ned', 'android', 'win8'}
+        The levelled frame.
+
+    Returns
+    -------
+    tuple of str
+        One warning, or none if the expected axis reads about 1 g.
+
+    """
+    expected = flat_direction(frame)
+    force = rotation @ expected
+    off = np.degrees(np.arccos(np.clip(force @ expected, -1.0, 1.0)))
+    if off <= _ON_ITS_SIDE:
+        return ()
+    face = int(np.argmax(np.abs(force)))
+    seen = f'{"-" if force[face] < 0.0 else "+"}{_AXES[face]}'
+    own = f'{"-" if expected[2] < 0.0 else "+"}z'
+    begin = (f'{FLAT} reads {force[face]:+.2f} g on {_AXES[face]}, where a sensor that lies flat '
+             f'reads 1 g on {own}: ')
+    if face == 2:
+        return (f'{begin}it is mounted upside down, or z (or every axis) has the wrong sign: '
+                'one flat pose cannot tell which; if it is not upside down, correct the sign: '
+                'a rotation cannot',)
+    return (f'{begin}it is mounted with {seen} up, or {_AXES[face]} and z are swapped, which one '
+            'flat pose cannot tell apart; if it lies flat, correct the wiring or the driver',)

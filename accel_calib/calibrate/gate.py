@@ -1,0 +1,237 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The gate before every calibration that is stored, loaded or used, whoever made it.
+
+A fit reaches it only if it converged (`accel_calib.estimate.solve`) and its poses determine the
+model (`.refusal`). The gate checks what a calibration says of itself: shapes, finite values, a
+proper rotation, a covariance, sizes that an accelerometer can have, and an uncertainty that leaves
+the result a meaning. The limits are far beyond what working sensors show; they keep out nonsense.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .calibration import Calibration, Rejected
+from ..effects import LADDER
+from ..errors import RefusedFitError
+from ..model import Model
+from ..sphere import spread_directions, unit
+from ..table import Floats, Poses
+from ..units import MG, Units
+
+LARGEST_OFFSET_G = 1.0
+"""Zero-g offset of a working accelerometer [g]; native readings may have any."""
+
+GAINS = (0.5, 2.0)
+"""Gains of a working accelerometer, over the scale of its units."""
+
+LARGEST_RESIDUAL_G = 0.05
+"""Residual of poses that lie on one ellipsoid [g]."""
+
+LARGEST_UNCERTAINTY_G = 0.1
+"""Uncertainty of |force| beyond which a calibration says nothing [g]."""
+
+_WORTH_A_WARNING_G = 0.005
+_ROTATION_TOLERANCE = 1e-6
+_COVARIANCE_TOLERANCE = 1e-6
+
+_LARGEST_REST_G = 3.0
+_NATIVE_SPREADS = 20.0
+"""Readings further out are no rest of an accelerometer: |reading| [g], and for native units the
+distance from the median over the median of these distances."""
+
+_UNCERTAIN = 'the calibration leaves |a| uncertain by up to'
+_CHECK_POSES = 'check the poses for mistakes, take others, and fit again'
+
+
+def gated(calibration: Calibration) -> Calibration:
+    """
+    Check a calibration before it is stored or used.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Any.
+
+    Returns
+    -------
+    Calibration
+        The same, with a warning added if its uncertainty is large.
+
+    Raises
+    ------
+    RefusedFitError
+        If it is not one that an accelerometer can have.
+
+    """
+    _check_numbers(calibration)
+    _check_rotation(calibration.model.rotation)
+    _check_covariance(calibration.covariance)
+    _check_gain(calibration)
+    _check_effects(calibration)
+    residual = calibration.quality.rms_after_mg / MG
+    if residual > LARGEST_RESIDUAL_G:
+        raise RefusedFitError(
+            f'|a| is {residual * MG:.3g} mg (RMS) off 1 g after the fit, expected less than '
+            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses lie on no ellipsoid', _CHECK_POSES)
+    return _with_warning(calibration)
+
+
+def _check_numbers(calibration: Calibration) -> None:
+    model = calibration.model
+    for what, values in (('value', model.vector), ('rotation', model.rotation),
+                         ('covariance', calibration.covariance)):
+        if not np.all(np.isfinite(values)):
+            raise RefusedFitError(f'the calibration has a {what} that is not a finite number',
+                                  _CHECK_POSES)
+
+
+def _check_rotation(rotation: Floats) -> None:
+    proper = (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
+              and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE))
+    if not proper:
+        raise RefusedFitError('the mounting ΔR is not a rotation: its rows are not orthonormal, '
+                              'or it is a mirror image', 'level the mounting again')
+
+
+def _check_covariance(covariance: Floats) -> None:
+    """Refuse what is not symmetric and positive semidefinite, each value in its own unit."""
+    root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    with np.errstate(over='ignore', invalid='ignore'):
+        scaled = covariance / root / root[:, np.newaxis]
+    sound = (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
+             and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
+             and (not len(root)
+                  or np.min(np.linalg.eigvalsh(scaled)) >= -_COVARIANCE_TOLERANCE * len(root)))
+    if not sound:
+        raise RefusedFitError('the covariance is not symmetric and positive semidefinite',
+                              'fit again')
+
+
+def _check_gain(calibration: Calibration) -> None:
+    mat_w, vec_v = calibration.model.linear_part
+    gains = np.linalg.svd(mat_w, compute_uv=False)
+    if np.linalg.det(mat_w) <= 0.0 and calibration.name != '12':
+        raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
+                              _CHECK_POSES)
+    if gains[-1] < GAINS[0] or gains[0] > GAINS[1]:
+        raise RefusedFitError('the poses lie on no ellipsoid of an accelerometer: its gains are '
+                              f'{gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
+                              f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
+    offset = float(np.linalg.norm(vec_v))
+    if calibration.units.name != 'native' and offset > LARGEST_OFFSET_G:
+        raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
+                              f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
+
+
+def _check_effects(calibration: Calibration) -> None:
+    """Refuse effects that add more to a pose of the calibration than is plausible."""
+    used = calibration.used_poses
+    for name, values in calibration.model.values.items():
+        model = Model({name: values})
+        effect = model.terms.effects[0]
+        if name in LADDER or effect.output is not None or not len(used):
+            continue
+        if any(key not in used for key in effect.needs if key != 'previous'):
+            continue
+        added = _contribution(model, used, calibration.units)
+        if added > effect.plausible_g:
+            raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
+                                  f'than {effect.plausible_g:g} g', _CHECK_POSES)
+
+
+def _contribution(model: Model, used: Poses, units: Units) -> float:
+    """Return the largest reading that an effect adds at poses [g]."""
+    context = {**used.columns}
+    if 'std' in used:
+        context['std'] = units.to_g(used['std'])
+    context.setdefault('previous', unit(used.reading))
+    directions = unit(used.reading)
+    added = model.at(context).reading(directions) - directions
+    return float(np.max(np.linalg.norm(added, axis=1)))
+
+
+def uncertainty_g(calibration: Calibration) -> float:
+    """Return the largest standard deviation of |force| over the sphere [g]."""
+    up, per_g = spread_directions(300), calibration.force_per_g
+    context = {key: np.full(len(up), sum(limits) / 2.0)
+               for key, limits in calibration.ranges.items()}
+    none = np.zeros((len(up), 3))
+    known = {'std': none, 'previous': none, 'rate': none, **context}
+    if any(key not in known for key in calibration.model.needs):
+        return 0.0
+    covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
+    return float(np.sqrt(np.max(np.einsum('ni,nij,nj->n', up, covariance, up))))
+
+
+def _with_warning(calibration: Calibration) -> Calibration:
+    uncertain = uncertainty_g(calibration)
+    if uncertain > LARGEST_UNCERTAINTY_G:
+        raise RefusedFitError(
+            f'the poses do not determine the calibration: |a| stays uncertain by up to '
+            f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
+            'take poses with each side of the sensor up and down')
+    others = tuple(line for line in calibration.warnings if not line.startswith(_UNCERTAIN))
+    if uncertain < _WORTH_A_WARNING_G:
+        return replace(calibration, warnings=others)
+    return replace(calibration, warnings=(*others, f'{_UNCERTAIN} {uncertain * MG:.2g} mg: take '
+                                          'more poses, spread over the sphere'))
+
+
+def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
+    """
+    Separate poses from rows that no accelerometer at rest can give.
+
+    Parameters
+    ----------
+    poses : Poses
+        In the unit of the readings.
+    units : Units
+        That unit.
+
+    Returns
+    -------
+    Poses, tuple of Rejected
+        The poses, and the other rows.
+
+    """
+    if not len(poses):
+        return poses, ()
+    with np.errstate(over='ignore'):
+        length = np.linalg.norm(poses.reading, axis=1)
+        centre = np.median(poses.reading, axis=0)
+        away = np.linalg.norm(poses.reading - centre, axis=1)
+    scale = units.per_g
+    if units.name == 'native':
+        scale = float(np.median(away)) * _NATIVE_SPREADS / _LARGEST_REST_G
+        length = away
+    wild = ~(length <= _LARGEST_REST_G * scale)
+    noisy = np.zeros(len(poses), bool)
+    if poses.noise is not None and scale > 0.0:
+        noisy = ~(np.max(poses.noise, axis=1) <= LARGEST_OFFSET_G * scale)
+    rejected = [Rejected(int(poses.row[k]), _why(poses, int(k), bool(wild[k])))
+                for k in np.flatnonzero(wild | noisy)]
+    return (poses.take(~(wild | noisy)), tuple(rejected)) if rejected else (poses, ())
+
+
+def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
+    """Separate poses from those in which the sensor may have moved, as the capture marked them."""
+    if 'doubtful' not in poses or not np.any(poses['doubtful']):
+        return poses, ()
+    doubtful = poses['doubtful'] > 0.0
+    return poses.take(~doubtful), tuple(
+        Rejected(int(row), 'doubtful: the sensor may have moved') for row in poses.row[doubtful])
+
+
+def _why(poses: Poses, index: int, wild: bool) -> str:
+    if wild:
+        reading = ', '.join(f'{value:.4g}' for value in poses.reading[index])
+        return f'the reading ({reading}) is not one of an accelerometer at rest'
+    noise = float(np.max(poses.noise[index])) if poses.noise is not None else np.nan
+    return f'the mean is uncertain by {noise:.3g}, so the sensor was not at rest'

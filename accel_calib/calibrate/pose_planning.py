@@ -1,0 +1,264 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Which pose to take next, and when more poses no longer help.
+
+The next pose is one of the 26 attitudes that a person can find by eye: the 6 faces, 12 edges and
+8 corners of the sensor. It is the one that adds most to det M (D-optimal design, Fedorov 1972),
+with M the information of the poses so far (see `accel_calib.estimate.geometry`) plus that of one
+pose spread over the whole sphere, which stands for the poses to come: without it the first poses
+would be chosen as if they were the last. `benchmarks/next_pose.py` compares it with other orders.
+
+n poses spread well leave |force| uncertain by the noise of a pose times √(p / n), RMS over the
+sphere. Another pose lowers that by 1 / 2n: more poses no longer help when the next one would lower
+it by less than `_LEAST_GAIN`, and the dilution is below `_GOOD_DILUTION`.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+
+from .calibration import Calibration
+from ..estimate.geometry import (
+    information_of,
+    over_the_sphere,
+    pose_noise,
+    poses_needed,
+    relative_weights,
+    rows_of,
+)
+from ..estimate.identifiability import Identifiability, identifiability
+from ..sphere import spread_directions, unit
+from ..table import Floats
+from ..units import MG
+
+_LEAST_GAIN = 0.03
+"""Part of the expected error that a pose must remove to pay: 17 poses spread well."""
+
+_GOOD_DILUTION = 3.0
+"""Poses are asked for until the dilution has come down to this."""
+
+_TAKEN = np.cos(np.radians(17.0))
+"""An attitude this near to a pose has been taken: the next one is 35° away."""
+
+_SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
+
+
+@dataclass(frozen=True)
+class NextPose:
+    """
+    The pose that would help the fit most, or none.
+
+    Parameters
+    ----------
+    direction : (3,) array or None
+        Direction to point up, a unit vector in the sensor axes; None: more poses no longer help.
+    words : str
+        The same for a person.
+    error : float
+        Expected error of |force| after a fit to the poses so far, RMS over the sphere, over the
+        noise of a pose; infinite if they leave a parameter open.
+
+    """
+
+    direction: Floats | None
+    words: str
+    error: float
+
+
+@lru_cache(maxsize=8)
+def _mean_information(name: str) -> Floats:
+    """Return the information of one pose spread over the sphere, (p, p)."""
+    rows = over_the_sphere(name)
+    mean: Floats = np.einsum('nip,niq->pq', rows, rows) / len(rows)
+    return mean
+
+
+@lru_cache(maxsize=1)
+def _attitudes() -> Floats:
+    """Return the signs of the axes that point up, (26, 3), the faces first."""
+    signs = np.array([s for s in product((0, 1, -1), repeat=3) if any(s)], float)
+    return signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')]
+
+
+def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
+              noise_g: float | None = None) -> NextPose:
+    """
+    Return the pose that would help the fit most.
+
+    Parameters
+    ----------
+    directions : (n, 3) array
+        Unit vectors of force so far, in the axes of the sensor; n may be 0.
+    name : {'4', '7', '9', '10', '12'}
+        The model to fit; for 12 the poses are the six faces.
+    noise : (n,) array, optional
+        Noise of each pose in any unit; equal if it is not given.
+    noise_g : float, optional
+        Median noise of the poses [g], for the words.
+
+    Returns
+    -------
+    NextPose
+        One of the 6 faces, 12 edges and 8 corners of the sensor, each only once; or none.
+
+    """
+    information = information_of(name, directions, relative_weights(noise, len(directions)))
+    error = _error(name, information, len(directions))
+    best = _best(name, directions, information)
+    if best is None:
+        return NextPose(None, _enough(len(directions), error, noise_g), error)
+    signs = _attitudes()[best]
+    up = unit(signs[np.newaxis])
+    after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
+    if after > (1.0 - _LEAST_GAIN) * error and not _stretched(name, information):
+        return NextPose(None, _enough(len(directions), error, noise_g), error)
+    return NextPose(up[0], f'turn the sensor so that {words_of(signs)} points up '
+                    f'({_axes(signs)})', error)
+
+
+def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
+    """
+    Return the poses to add, in order, so that they determine a model well.
+
+    Parameters
+    ----------
+    name, directions, noise
+        As `next_pose`.
+
+    Returns
+    -------
+    list of str
+        Sides, edges and corners to point up, such as ``the left side (+y)``.
+
+    """
+    weights = relative_weights(noise, len(directions))
+    named = []
+    while len(directions) < poses_needed(name) or _stretched(
+            name, information_of(name, directions, weights)):
+        best = _best(name, directions, information_of(name, directions, weights))
+        if best is None:
+            break
+        signs = _attitudes()[best]
+        directions = np.vstack([directions, unit(signs[np.newaxis])])
+        weights = np.append(weights, 1.0)
+        named.append(f'{words_of(signs)} ({_axes(signs)})')
+    return named
+
+
+def _stretched(name: str, information: Floats) -> bool:
+    """Return whether a fit of poses with this information would be poor somewhere."""
+    if np.linalg.matrix_rank(information, hermitian=True) < len(information):
+        return True
+    rows = over_the_sphere(name)
+    errors = np.einsum('nip,pq,niq->n', rows, np.linalg.inv(information), rows)
+    return bool(np.max(errors) > _GOOD_DILUTION ** 2)
+
+
+def _best(name: str, directions: Floats, information: Floats) -> int | None:
+    """Return the attitude that adds most to det M, among those that have not been taken."""
+    attitudes = _attitudes()[:6] if name == '12' else _attitudes()
+    up = unit(attitudes)
+    free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
+    if not np.any(free):
+        return None
+    rows = rows_of(name, up)
+    to_come = np.linalg.inv(information + _mean_information(name))
+    gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
+    return int(np.argmax(np.where(free, np.round(gains, 6), -1.0)))  # the first of equals
+
+
+def _error(name: str, information: Floats, count: int) -> float:
+    """Return the RMS over the sphere of the error of |force|, over the noise of a pose."""
+    if count < poses_needed(name) or (
+            np.linalg.matrix_rank(information, hermitian=True) < len(information)):
+        return np.inf
+    return float(np.sqrt(np.trace(np.linalg.solve(information, _mean_information(name)))))
+
+
+def _enough(count: int, error: float, noise_g: float | None) -> str:
+    """Return the words for no further pose."""
+    certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
+               else f'{error:.2g} times the noise of a pose')
+    return f'more poses no longer help: {count} poses determine |a| to {certain}'
+
+
+def words_of(signs: Floats) -> str:
+    """Return the words for the side, edge or corner with these signs of the axes."""
+    sides = [pair[0 if sign > 0 else 1] for pair, sign in zip(_SIDES, signs, strict=True) if sign]
+    what = {1: 'the {} side', 2: 'the edge between {} and {}',
+            3: 'the corner of {}, {} and {}'}[len(sides)]
+    return what.format(*sides)
+
+
+def _axes(signs: Floats) -> str:
+    """Return the axes of these signs, such as ``+x -y``."""
+    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
+                    for axis, sign in zip('xyz', signs, strict=True) if sign)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """
+    What the poses of a calibration determine, and which pose would improve it most.
+
+    Parameters
+    ----------
+    identifiability : Identifiability
+        Of the model that was asked for; of the largest if the choice was free.
+    next_pose : NextPose
+        Planned for that model.
+    uncertainty_mg : float or None
+        Stated error of a corrected |force| (model 12: of the force), RMS over the sphere [mg];
+        None if the poses leave nothing to judge it by.
+
+    """
+
+    identifiability: Identifiability
+    next_pose: NextPose
+    uncertainty_mg: float | None
+
+
+def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
+    """
+    Return what the poses of a calibration determine, from its result.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the linear models, as `accel_calib.calibrate.fit_poses` returns it.
+    asked : {'auto', '4', '7', '9', '10', '12'}
+        The model that was asked for.
+
+    """
+    poses = calibration.used_poses
+    mat_w, vec_v = calibration.model.linear_part
+    force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
+    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
+    noise = pose_noise(poses.noise, directions)
+    uncertainty = _uncertainty(calibration)
+    planned = asked
+    if asked in ('auto', '12'):  # with wrong orientations 12 became a norm model
+        planned = '12' if calibration.name == '12' else '10'
+    fitted = identifiability(calibration.name, directions, noise).mean_dilution
+    known = np.isfinite(uncertainty)
+    noise_g = uncertainty / fitted if known and np.isfinite(fitted) else None
+    return Outlook(identifiability(planned, directions, noise),
+                   next_pose(directions, planned, noise, noise_g=noise_g),
+                   uncertainty * MG if known else None)
+
+
+def _uncertainty(calibration: Calibration) -> float:
+    """Return the stated error of a corrected force, RMS over the sphere [g]."""
+    up: Floats = spread_directions(300)
+    per_g = calibration.force_per_g
+    covariance = calibration.force_covariance(up * per_g) / per_g ** 2
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.name == '12'
+              else np.einsum('ni,nij,nj->n', up, covariance, up))
+    return float(np.sqrt(np.mean(errors)))

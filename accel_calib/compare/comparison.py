@@ -1,0 +1,241 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Whether calibrations of one sensor agree within their uncertainties.
+
+The calibrations are compared in parameters that do not depend on their axes (`.rotation_free`),
+with covariances on one scale (`.common_scale`), by the test of `.agreement`. A run with a smaller
+model keeps its values; its uncertainty is that of the largest model.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .agreement import LEVEL, outlier, p_values, Runs, SAME_G
+from .common_scale import on_one_scale
+from .comparability import contexts_of, notes_of, refuse_if_unlike, with_largest_model
+from .rotation_free import rotation_free, RotationFree
+from ..calibrate import Calibration
+from ..effects import Context
+from ..model import length_rows, sensor_force
+from ..sphere import spread_directions
+from ..table import Floats
+from ..units import MG
+
+_DIRECTIONS = spread_directions(300)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter over the runs.
+
+    Parameters
+    ----------
+    name : str
+        ``offset.x``, ``gain.xy``, …: of V, and of the symmetric gain.
+    values, stated_sd : (n,) array
+        Of each run [g].
+    spread : float
+        Standard deviation over the runs [g].
+    ratio : float or None
+        The spread over the stated deviation, RMS; None if that is zero.
+
+    """
+
+    name: str
+    values: Floats
+    stated_sd: Floats
+    spread: float
+    ratio: float | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One calibration against the others.
+
+    Parameters
+    ----------
+    rms_mg, expected_mg : float
+        Difference of the corrected |a| to the mean of the others, RMS over all directions, and
+        what the uncertainties predict [mg].
+    largest_mg : float
+        The largest such difference [mg].
+    direction : (3,) array
+        Where that is: what points up, in the axes of the sensor.
+    p_value : float
+        Probability of a difference as large, if this run agrees with the others.
+
+    """
+
+    rms_mg: float
+    expected_mg: float
+    largest_mg: float
+    direction: Floats
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    Whether calibrations agree.
+
+    Parameters
+    ----------
+    agree : bool
+        Whether they do, at `LEVEL`.
+    p_value : float
+        Probability of differences as large, if they are of one sensor that has not changed.
+    chi2 : float
+        T², the squared differences over their variances.
+    dof : int
+        What T² is on average, if they agree.
+    outlier : int or None
+        The one run without which the others agree, from 0.
+    runs : tuple of Run
+        Each against the others.
+    parameters : tuple of Parameter
+        Spread over the runs.
+    tilt_deg : float or None
+        Largest angle between the directions of up of two levelled runs [°]; None with fewer.
+    notes : tuple of str
+        What else to know.
+
+    """
+
+    agree: bool
+    p_value: float
+    chi2: float
+    dof: int
+    outlier: int | None
+    runs: tuple[Run, ...]
+    parameters: tuple[Parameter, ...]
+    tilt_deg: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A calibration, its fit with the largest model, its context and common parameters."""
+
+    calibration: Calibration
+    sure: Calibration
+    context: Context
+    said: RotationFree
+    slope: Floats
+    covariance: Floats
+
+    def length(self, reading: Floats) -> tuple[Floats, Floats]:
+        """Return the corrected |a| of (n, 3) readings in the common unit, and its variance."""
+        here = {key: np.repeat(column, len(reading), 0) for key, column in self.context.items()}
+        u = sensor_force(self.calibration.model, reading / self.said.reading_scale, here)
+        model = self.sure.model
+        rows = model.basis(u, here).along(length_rows(model, u, here))
+        variance = np.maximum(np.einsum('np,pq,nq->n', rows, self.covariance, rows), 0.0)
+        scale = self.said.force_scale
+        return np.linalg.norm(u, axis=1) * scale, variance * scale ** 2
+
+    def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
+        """Return the (t, t) covariance of the common parameters."""
+        slope = _into(names, self.said, self.slope)
+        carried: Floats = slope @ covariance @ slope.T
+        return carried
+
+
+def compare(calibrations: Sequence[Calibration]) -> Comparison:
+    """
+    Test whether calibrations of one sensor agree within their uncertainties.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        Two or more, of any models.
+
+    Returns
+    -------
+    Comparison
+        The result, and what differs by how much.
+
+    Raises
+    ------
+    InputError
+        If they cannot be compared: fewer than two, other sensors, other units, no uncertainty.
+
+    """
+    refuse_if_unlike(calibrations)
+    sure = with_largest_model(calibrations)
+    scaled = on_one_scale(sure)
+    looked = _looked_at(calibrations, sure, scaled.covariances)
+    names = tuple(dict.fromkeys(name for run in looked for name in run.said.names))
+    values = np.array([_into(names, run.said, run.said.values) for run in looked])
+    runs = Runs(values, np.array([run.spread(names, run.covariance) for run in looked]),
+                scaled.dof)
+    stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.sure.covariance))
+                                 for run in looked], 0.0))
+    (chi2, rank), p_value = runs.squared, runs.p_value
+    return Comparison(
+        p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
+        _each(looked, p_values(runs)),
+        tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
+        _tilt_deg(looked), notes_of(calibrations, sure, names, stated, scaled.noisier))
+
+
+def _looked_at(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
+               covariances: Sequence[Floats]) -> list[_Run]:
+    """Return each calibration in the common unit and context."""
+    per_g = float(np.mean([run.units.per_g for run in calibrations]))
+    return [_Run(run, one, context, rotation_free(run, context, per_g),
+                 rotation_free(one, context, per_g).slope, covariance)
+            for run, one, context, covariance in
+            zip(calibrations, sure, contexts_of(calibrations), covariances, strict=True)]
+
+
+def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
+    """Return (t, …) rows in the order of the common names; those that a run lacks are zero."""
+    found = np.zeros((len(names), *rows.shape[1:]))
+    found[[names.index(name) for name in run.names]] = rows
+    return found
+
+
+def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
+    spread, typical = float(np.std(values, ddof=1)), float(np.sqrt(np.mean(stated ** 2)))
+    return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
+
+
+def _each(looked: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
+    """Compare the corrected |a| of each run with that of the others, over all directions."""
+    reading = (np.mean([run.said.vec_v for run in looked], axis=0)
+               + _DIRECTIONS @ np.mean([run.said.mat_s for run in looked], axis=0))
+    found = [run.length(reading) for run in looked]
+    length, variance = (np.array(part) for part in zip(*found, strict=True))
+    weight = 1.0 / (np.mean(variance, axis=1) + SAME_G ** 2)
+    runs = []
+    for k, chance in enumerate(chances):
+        others = np.delete(weight, k) / np.sum(np.delete(weight, k))
+        away = length[k] - others @ np.delete(length, k, 0)
+        expected = variance[k] + others ** 2 @ np.delete(variance, k, 0)
+        largest = int(np.argmax(np.abs(away)))
+        runs.append(Run(_rms(away) * MG, _rms(np.sqrt(expected)) * MG,
+                        float(np.abs(away[largest])) * MG, _DIRECTIONS[largest], float(chance)))
+    return tuple(runs)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def _tilt_deg(looked: Sequence[_Run]) -> float | None:
+    """Return the largest angle between the directions of up of levelled runs [°]."""
+    up = [run.said.axes[:, 2] for run in looked
+          if not np.array_equal(run.calibration.model.rotation, np.eye(3))]
+    if len(up) < 2:
+        return None
+    apart = np.linalg.norm(np.array(up)[:, np.newaxis] - np.array(up), axis=2)
+    return float(np.degrees(2.0 * np.arcsin(np.max(apart) / 2.0)))

@@ -1,0 +1,249 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Outliers: poses that were knocked or not still. A fault of the data, found and left out.
+
+The pose whose residual is largest against what the other poses say (externally studentised, with
+the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. As
+many are then outliers as the generalised extreme studentised deviate test (Rosner 1983) finds at
+`LEVEL`; that test is not masked when several poses are disturbed. Between the removals the fit is
+followed to first order. Above `_MANY` poses outliers no longer mask each other, and all that are
+extreme against the median are removed at once.
+
+A gross outlier can spoil the fit that this begins with. `.robust` begins with poses that agree.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fit import Fit
+from .noise import belief_in
+from ..table import Floats
+
+LEVEL = 0.007
+"""Probability that a clean set loses a pose."""
+
+LARGEST_SHARE = 0.25
+"""Part of the poses that may be left out."""
+
+_LEAST_OWN = 1e-6
+"""1 - leverage below this: this pose alone fixes a parameter, and nothing can contradict it."""
+
+_MANY = 200
+
+_MEDIAN_OF_CHI2 = {1: 0.454936, 3: 2.365974}
+"""Median of chi² with so many degrees of freedom."""
+
+_DOUBTED = 1.0
+_DOUBT_BELOW = 0.01
+"""Degrees of freedom that measured noise counts as when the poses left contradict it, and the
+probability of their chi² below which they do."""
+
+
+@dataclass(frozen=True)
+class ByPose:
+    """
+    The equations of a fit, by pose.
+
+    Parameters
+    ----------
+    residual : (n, k) array
+        Residuals per noise, padded with 0.
+    columns : (n, k, q) array
+        Derivative of the prediction, padded with 0.
+    rows : (n,) array of int
+        Equations of each pose.
+
+    """
+
+    residual: Floats
+    columns: Floats
+    rows: NDArray[np.int64]
+
+    @property
+    def spread(self) -> Floats:
+        """(q, q) array, (JᵀJ)⁻¹."""
+        flat = self.flat
+        return np.linalg.pinv(flat.T @ flat, hermitian=True)
+
+    @property
+    def flat(self) -> Floats:
+        """(n k, q) array, the derivative without the axis of poses."""
+        return self.columns.reshape(self.residual.size, self.columns.shape[2])
+
+    def own(self, spread: Floats) -> Floats:
+        """Return I less the leverage of each pose, (n, k, k)."""
+        return (np.eye(self.columns.shape[1])
+                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
+
+
+def by_pose(fit: Fit) -> ByPose:
+    """Return the equations of a fit by pose."""
+    pose, count = fit.equations.pose, len(fit.poses_g)
+    rows = np.bincount(pose, minlength=count)
+    if len(pose) == count:
+        order = np.argsort(pose)
+        return ByPose(fit.residual[order][:, np.newaxis], fit.columns[order][:, np.newaxis], rows)
+    order = np.argsort(pose, kind='stable')
+    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
+    residual = np.zeros((count, int(rows.max())))
+    columns = np.zeros((*residual.shape, fit.columns.shape[1]))
+    residual[pose[order], slot] = fit.residual[order]
+    columns[pose[order], slot] = fit.columns[order]
+    return ByPose(residual, columns, rows)
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Poses to leave out, (d,) indices among those of a fit, and the chi² of the others."""
+
+    poses: NDArray[np.intp]
+    chi2: float
+
+
+def outliers(fit: Fit, total: int) -> Outliers:
+    """
+    Find the poses to leave out.
+
+    Parameters
+    ----------
+    fit : Fit
+        To the poses that are kept so far.
+    total : int
+        Poses before any was left out.
+
+    Returns
+    -------
+    Outliers
+        In all no more than a quarter of the poses, and no more than leave enough equations to
+        find which they are.
+
+    """
+    data = by_pose(fit)
+    limit = most_outliers(fit, total, int(data.rows.max())) - (total - len(data.rows))
+    if limit <= 0:
+        return Outliers(np.zeros(0, np.intp), fit.chi2)
+    if len(data.rows) > _MANY:
+        return _far_out(data, fit, limit)
+    order = _removed_in_turn(data, fit, limit)
+    count = order.extreme(belief_in(fit.noise_known))
+    if count:
+        left = fit.dof - int(np.sum(order.rows[:count]))
+        count = order.extreme(belief_beside(left, order.rss[count], fit.noise_known))
+    return Outliers(np.sort(order.pose[:count]), float(order.rss[count]))
+
+
+def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
+    """Return the degrees of freedom that the noise counts as, given the chi² of what is kept."""
+    from scipy.special import chdtrc
+
+    if noise_known and chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
+        return _DOUBTED
+    return belief_in(noise_known)
+
+
+def most_outliers(fit: Fit, total: int, rows: int = 1) -> int:
+    """Return how many of all poses may be left out, each with so many equations."""
+    spare = fit.dof + rows * (total - len(fit.poses_g))
+    return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
+
+
+@dataclass(frozen=True)
+class _Removed:
+    """
+    Poses removed in turn.
+
+    Parameters
+    ----------
+    pose, rows : (k,) array of int
+        The most extreme of those left, and its equations.
+    size : (k,) array
+        Its squared residual against the others, in units of its variance.
+    rss : (k + 1,) array
+        Sum of squared residuals before each removal, and at the end.
+    dof, count : int
+        Degrees of freedom and poses at the beginning.
+
+    """
+
+    pose: NDArray[np.intp]
+    rows: NDArray[np.int64]
+    size: Floats
+    rss: Floats
+    dof: int
+    count: int
+
+    def extreme(self, belief: float) -> int:
+        """Return how many of them are outliers."""
+        removed = np.concatenate([[0], np.cumsum(self.rows)])
+        dof = np.maximum(belief + self.dof - removed[1:], 1e-9)
+        others = np.maximum(belief + self.rss[:-1] - self.size, 1e-300) / dof
+        chance = beyond(self.size / self.rows / others, self.rows, dof)
+        found = np.flatnonzero(chance < LEVEL / (self.count - np.arange(len(self.pose))))
+        return int(found[-1]) + 1 if len(found) else 0
+
+
+def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Floats:
+    """Return the probability that a ratio of variances is as large by chance (F distribution)."""
+    from scipy.special import fdtrc
+
+    chance: Floats = fdtrc(rows, np.maximum(dof, 1.0), ratio)
+    return chance
+
+
+def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
+    """Remove the most extreme pose again and again, following the fit to first order."""
+    spread = data.spread
+    flat = data.flat
+    residual = data.residual - (flat @ (spread @ (flat.T @ data.residual.ravel()))).reshape(
+        data.residual.shape)
+    own, left = data.own(spread), np.ones(len(residual), bool)
+    poses, sizes = [], []
+    rss = [float(np.sum(residual ** 2))]
+    for _ in range(most):
+        size = _squared(own, residual) * left
+        at = int(np.argmax(size / data.rows))
+        poses.append(at)
+        sizes.append(float(size[at]))
+        rss.append(max(rss[-1] - sizes[-1], 0.0))
+        moved = spread @ data.columns[at].T @ np.linalg.pinv(own[at])
+        along = data.columns @ moved
+        residual = residual + (along @ residual[at][:, np.newaxis])[:, :, 0]
+        onto = data.columns @ (spread @ data.columns[at].T)
+        own = own - along @ np.swapaxes(onto, 1, 2)
+        spread = spread + moved @ data.columns[at] @ spread
+        left[at] = False
+    return _Removed(np.array(poses, np.intp), data.rows[poses], np.array(sizes), np.array(rss),
+                    fit.dof, len(left))
+
+
+def _squared(own: Floats, residual: Floats) -> Floats:
+    """Return the squared residual of each pose against the others; 0 where nothing contradicts."""
+    if residual.shape[1] == 1:
+        alone = own[:, 0, 0]
+        return np.where(alone > _LEAST_OWN,
+                        residual[:, 0] ** 2 / np.maximum(alone, _LEAST_OWN), 0.0)
+    size, axes = np.linalg.eigh(own)
+    along = (np.swapaxes(axes, 1, 2) @ residual[:, :, np.newaxis])[:, :, 0]
+    told = size > _LEAST_OWN
+    return np.sum(np.where(told, along ** 2 / np.where(told, size, 1.0), 0.0), axis=1)
+
+
+def _far_out(data: ByPose, fit: Fit, limit: int) -> Outliers:
+    """Find outliers among many poses: all at once, against the median."""
+    alone = _squared(data.own(data.spread), data.residual)
+    size = alone / data.rows
+    usual = np.array([_MEDIAN_OF_CHI2[int(rows)] / rows for rows in data.rows])
+    belief = belief_in(fit.noise_known)
+    scale = float(np.median(size / usual))
+    size = size * (belief + fit.dof) / (belief + scale * fit.dof)
+    extreme = beyond(size, data.rows, belief + fit.dof) < LEVEL / len(size)
+    largest = np.argsort(-size, kind='stable')[:limit]
+    found = np.sort(largest[extreme[largest]])
+    return Outliers(found, max(fit.chi2 - float(np.sum(alone[found])), 0.0))

@@ -1,0 +1,136 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Damped least squares (Levenberg 1944, Marquardt 1963) within bounds.
+
+`scipy.optimize.least_squares` solves the same problem; for a dozen poses it takes several times as
+long, most of it overhead (`benchmarks/fits.py`).
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RefusedFitError
+from ..table import Floats
+
+_MOST_STEPS = 60
+_FIRST_DAMPING = 1e-3
+_LARGEST_DAMPING = 1e9
+
+_NEAR = 1e-12
+"""The solution is reached when a full step would lower the cost by less than this part of it."""
+
+_NEAR_ENOUGH = 1e-5
+"""Where rounding keeps it from that, this part of the cost per degree of freedom is accepted."""
+
+_ROUNDING = 1e-20
+"""Falls of the cost below this are rounding errors [noise²]."""
+
+_SINGULAR = 1e-6
+"""Relative square of a singular value below which the residuals do not determine a combination."""
+
+
+class NotConvergedError(RefusedFitError):
+    """The fit did not converge, so it has no result."""
+
+    def __init__(self) -> None:
+        super().__init__('the fit did not converge',
+                         'check the poses for mistakes, or take more of them')
+
+
+class Point(NamedTuple):
+    """Values with (m,) residuals and the (m, q) derivative of the prediction there."""
+
+    residual: Floats
+    columns: Floats
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals; infinite where they are not finite."""
+        cost = float(self.residual @ self.residual)
+        return cost if np.isfinite(cost) and np.all(np.isfinite(self.columns)) else np.inf
+
+
+NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
+"""A point without a prediction; its cost is infinite."""
+
+
+def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats
+          ) -> tuple[Floats, Point]:
+    """
+    Find the values that minimise the sum of squared residuals.
+
+    Parameters
+    ----------
+    point_at : callable
+        (q,) values -> residuals and columns there; residual = columns · (change of the values).
+    start : (q,) array
+        Where to begin.
+    lower, upper : (q,) array
+        Bounds of the values.
+
+    Returns
+    -------
+    (q,) array, Point
+        The solution.
+
+    Raises
+    ------
+    NotConvergedError
+        If there is no solution near enough after `_MOST_STEPS` steps.
+
+    """
+    values = np.clip(start, lower, upper)
+    now, damping = point_at(values), 0.0
+    if not np.isfinite(now.cost):
+        raise NotConvergedError
+    for _ in range(_MOST_STEPS):
+        free = _free(values, now, lower, upper)
+        full, fall = _step(now, free, 0.0)
+        if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
+            break
+        step = full if damping == 0.0 else _step(now, free, damping)[0]
+        tried_at = np.clip(values + step, lower, upper)
+        tried = point_at(tried_at)
+        if tried.cost < now.cost:
+            values, now, damping = tried_at, tried, damping / 10.0
+            damping = 0.0 if damping < _FIRST_DAMPING else damping
+        else:
+            damping = max(10.0 * damping, _FIRST_DAMPING)
+    _, fall = _step(now, _free(values, now, lower, upper), 0.0)
+    spare = max(len(now.residual) - len(values), 1)
+    if not fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING:
+        raise NotConvergedError
+    return values, now
+
+
+def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
+    """Return the values that are not at a bound beyond which the cost would fall."""
+    downhill = now.columns.T @ now.residual
+    held = ((values <= lower) & (downhill < 0.0)) | ((values >= upper) & (downhill > 0.0))
+    return ~held
+
+
+def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
+    """
+    Return the damped Gauss-Newton step, (q,), and by how much the cost would fall.
+
+    Combinations of values that the residuals do not determine stay as they are.
+
+    """
+    columns = now.columns * free
+    size = np.sqrt(np.sum(columns ** 2, axis=0))
+    size[size == 0.0] = 1.0
+    columns = columns / size
+    scales, axes = np.linalg.eigh(columns.T @ columns)
+    downhill = axes.T @ (columns.T @ now.residual)
+    told = scales > _SINGULAR * scales[-1]
+    along = np.where(told, downhill, 0.0) / (np.where(told, scales, 1.0) + damping)
+    return axes @ along / size, float(along @ downhill)

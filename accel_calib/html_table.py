@@ -1,0 +1,18 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables in HTML, for the page of the report and for notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html import escape
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '') -> str:
+    """Return a table; the text of the cells is escaped, `kind` is its class."""
+    cells = ''.join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    lines = ''.join('<tr>' + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
+                    for row in rows)
+    return (f'<table class="{kind}">\n<thead><tr>{cells}</tr></thead>\n'
+            f'<tbody>\n{lines}</tbody>\n</table>\n')

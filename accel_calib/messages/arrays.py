@@ -1,0 +1,190 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Many serialized messages as arrays: one buffer for all, and none is deserialized on its own.
+
+The messages of a bag may differ in the length of frame_id and in the byte order, so both are read
+from each message; see `accel_calib.messages.layout`. ROS 1 is always little endian, a CDR message
+if the second byte of its encapsulation is 1.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from .layout import (
+    ACCELERATION,
+    ANGULAR_VELOCITY,
+    ANGULAR_VELOCITY_COVARIANCE,
+    begin_of,
+    LETTERS_AT,
+)
+from ..errors import InputError
+from ..table import Floats
+
+Bytes = NDArray[np.uint8]
+Indices = NDArray[np.int64]
+
+_TRAILING = 3  # bytes of padding that a CDR message may end with
+_NANO = 1e-9
+
+
+@dataclass(frozen=True)
+class Messages:
+    """
+    Serialized messages with a header and doubles, in one buffer; made by `joined`.
+
+    Parameters
+    ----------
+    data : (m,) array of bytes
+        The buffer.
+    start, stop : (n,) array
+        Where each message begins and ends.
+    head : (n, 4) array of uint32
+        The first four words.
+    begin : (n,) array
+        Place of the first double in the buffer.
+    swapped : (n,) array of bool
+        True if the message is big endian.
+    ros2 : bool
+        CDR, otherwise the serialization of ROS 1.
+
+    """
+
+    data: Bytes
+    start: Indices
+    stop: Indices
+    head: NDArray[np.uint32]
+    begin: Indices
+    swapped: NDArray[np.bool_]
+    ros2: bool
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def each(self) -> Iterator[memoryview]:
+        """Yield the messages one by one."""
+        data = self.data.data
+        for start, stop in zip(self.start.tolist(), self.stop.tolist(), strict=True):
+            yield data[start:stop]
+
+
+def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2: bool = True,
+           before: int = 0) -> Messages:
+    """
+    Copy messages into one buffer, which can be written to.
+
+    Parameters
+    ----------
+    raws : sequence of bytes
+        At least one message, of a type with a header and this number of doubles.
+    doubles : int
+        Number of doubles.
+    name : str
+        Name of the topic, for errors.
+    ros2 : bool
+        CDR, otherwise the serialization of ROS 1.
+    before : int
+        Messages of the topic before these.
+
+    Raises
+    ------
+    InputError
+        If a message is shorter or longer than its header says, or is not plain CDR.
+
+    """
+    stop = np.cumsum(np.fromiter(map(len, raws), np.int64, len(raws)))
+    start = np.concatenate([np.zeros(1, np.int64), stop])[:-1]
+    data = np.frombuffer(bytearray().join(raws), np.uint8)
+    size = stop - start
+    _check(size >= LETTERS_AT + 8 * doubles, size, name, before)
+    head = _rows_at(data, start, LETTERS_AT).view('<u4')
+    swapped = np.zeros(len(raws), dtype=bool)
+    if ros2:
+        swapped = head[:, 0] & 0xffff == 0
+        _check(swapped | (head[:, 0] & 0xffff == 0x100), size, name, before)
+        if np.any(swapped):
+            head[swapped] = head[swapped].byteswap()
+    begin = begin_of(head[:, 3].astype(np.int64), ros2=ros2)
+    extra = size - begin - 8 * doubles
+    _check((extra >= 0) & (extra <= (_TRAILING if ros2 else 0)), size, name, before)
+    return Messages(data, start, stop, head, start + begin, swapped, ros2)
+
+
+def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> None:
+    """Refuse messages that are not sound, and name the first."""
+    if not np.all(sound):
+        first = int(np.argmin(sound))
+        raise InputError(f'{name}: message {before + first + 1}, of {size[first]} bytes, is not '
+                         'whole', 'remove it from the bag, or record again')
+
+
+def stamps_of(messages: Messages) -> Floats:
+    """Return the header stamps [s]."""
+    seconds = messages.head[:, 1]
+    signed = seconds.view(np.int32) if messages.ros2 else seconds
+    return signed + messages.head[:, 2] * _NANO
+
+
+def frame_ids(messages: Messages) -> list[str]:
+    """Return the frame_id of each message, or of all in a list of one."""
+    length = messages.head[:, 3].astype(np.int64)
+    if np.all(length == length[0]):
+        names = _rows_at(messages.data, messages.start + LETTERS_AT, int(length[0]))
+        if np.all(names == names[0]):
+            return [_text(names[0].tobytes())]
+    places = zip((messages.start + LETTERS_AT).tolist(), length.tolist(), strict=True)
+    return [_text(messages.data[place:place + size].tobytes()) for place, size in places]
+
+
+def _text(name: bytes) -> str:
+    return name.rstrip(b'\0').decode(errors='replace')
+
+
+def doubles_at(messages: Messages, which: slice) -> Floats:
+    """Return these of the doubles, (n, k)."""
+    width = 8 * (which.stop - which.start)
+    values = _rows_at(messages.data, messages.begin + 8 * which.start, width).view('<f8')
+    if np.any(messages.swapped):
+        values[messages.swapped] = values[messages.swapped].byteswap()
+    return values
+
+
+def put_doubles(messages: Messages, values: Floats) -> None:
+    """Write all doubles, (n, k), into the buffer of the messages."""
+    stored = np.ascontiguousarray(values, '<f8')
+    if np.any(messages.swapped):
+        stored = np.where(messages.swapped[:, np.newaxis], stored.byteswap(), stored)
+    rows = stored.view(np.uint8)
+    sliding_window_view(messages.data, rows.shape[1], writeable=True)[messages.begin] = rows
+
+
+def samples_of(messages: Messages) -> dict[str, Floats]:
+    """
+    Return Imu messages as columns of `accel_calib.table`.
+
+    Returns
+    -------
+    dict
+        ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s], the rate NaN if a
+        message has none.
+
+    """
+    rate = doubles_at(messages, ANGULAR_VELOCITY)
+    first = ANGULAR_VELOCITY_COVARIANCE.start
+    absent = doubles_at(messages, slice(first, first + 1))[:, 0] == -1.0
+    rate[absent | ~np.isfinite(rate).all(axis=1)] = np.nan
+    return {'time': stamps_of(messages), 'reading': doubles_at(messages, ACCELERATION),
+            'rate': rate}
+
+
+def _rows_at(data: Bytes, place: Indices, width: int) -> Bytes:
+    """Return `width` bytes from each place on, (n, width)."""
+    return sliding_window_view(data, width)[place]

@@ -1,0 +1,242 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Drift of a calibrated sensor: every rest is compared with 1 g and the stated uncertainty.
+
+A rest has the error e = |force| - 1. Its variance is the sum of the noise of its mean along the
+force, the uncertainty of the calibration (shared by rests in similar attitudes), and the part by
+which the poses of the calibration repeat worse than their samples. Few poses determine the last,
+so the scatter of the rests is learned too: the factor by which they repeat worse than stated
+follows the median of the differences of successive rests, which a shift does not change.
+`change_detection` decides from the last rests; the state is one record of bounded size.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .change_detection import Change, change, is_over, MEMORY
+from ..calibrate import Calibration
+from ..effects import Context
+from ..model import length_rows, sensor_force
+from ..table import Floats
+from ..units import MG
+
+_LEAST_NOISE = 2e-5   # [g] smallest noise of a rest
+_LEARN = 0.02         # relative step of the scatter per rest; larger at first
+_MEDIAN = 0.6745      # of the absolute value, standard normal
+_WARMER = 2.0         # [°C] change of temperature that counts
+
+
+@dataclass(frozen=True)
+class Rest:
+    """
+    One rest.
+
+    Parameters
+    ----------
+    error : float
+        |force| - 1 [g].
+    variance : float
+        Of its noise [g²].
+    slope : (p,) array
+        Derivative of the error by the values of the model.
+    up : (3,) array
+        Direction of up, unit vector in the sensor axes.
+    temperature : float
+        [°C]; NaN if it is not known.
+
+    """
+
+    error: float
+    variance: float
+    slope: Floats
+    up: Floats
+    temperature: float
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    The rests since a calibration.
+
+    Parameters
+    ----------
+    covariance : (p, p) array
+        Of the calibration [g²].
+    repeats : float
+        Variance by which its poses repeat worse than their samples say [g²].
+    temperatures : tuple of float
+        Lowest and highest at which it was made [°C]; empty if that is not known.
+    rests : tuple of Rest
+        The last ones.
+    count : int
+        Rests so far.
+    scatter : float
+        Factor by which the rests scatter more than stated.
+    change : Change or None
+        None: the sensor is as calibrated.
+    since : int
+        Number of the first rest that showed the change, from 1; 0 without one.
+
+    """
+
+    covariance: Floats
+    repeats: float
+    temperatures: tuple[float, ...]
+    rests: tuple[Rest, ...] = ()
+    count: int = 0
+    scatter: float = 1.0
+    change: Change | None = None
+    since: int = 0
+
+    @property
+    def stated(self) -> float:
+        """Stated standard deviation of the error of the last rest [g]."""
+        return float(np.sqrt(_covariance(self, self.rests[-1:])[0, 0])) if self.rests else np.nan
+
+    @property
+    def error(self) -> float:
+        """Median of | |a| - 1 | over the last rests [g]; NaN without any."""
+        return float(np.median([abs(rest.error) for rest in self.rests])) if self.rests else np.nan
+
+    @property
+    def lasted(self) -> int:
+        """Rests since the change began; 0 without one."""
+        return self.count - self.since + 1 if self.since else 0
+
+    @property
+    def temperature(self) -> float:
+        """Temperature of the last rest [°C]; NaN if it is not known."""
+        return self.rests[-1].temperature if self.rests else np.nan
+
+
+def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
+             ) -> list[Rest]:
+    """
+    Return rests as errors from 1 g.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration in use.
+    reading, noise : (n, 3) array
+        Mean readings and the noise of these means, in the unit of the readings.
+    context : mapping of str to array
+        What the effects need, n rows.
+
+    """
+    model, units = calibration.model, calibration.units
+    u = sensor_force(model, units.to_g(reading), context)
+    length = np.linalg.norm(u, axis=1)
+    rows = length_rows(model, u, context)
+    variance = np.sum((rows * units.to_g(noise)) ** 2, axis=1)
+    slope = -model.basis(u, context).along(rows)
+    temperature = np.asarray(context.get('temperature', np.full(len(u), np.nan)), float)
+    return [Rest(float(length[k]) - 1.0, float(variance[k]) + _LEAST_NOISE ** 2, slope[k],
+                 u[k] / length[k], float(temperature[k])) for k in range(len(u))]
+
+
+def monitor(calibration: Calibration) -> Drift:
+    """Return the state of a sensor that has just been calibrated."""
+    poses = calibration.poses
+    temperatures: tuple[float, ...] = ()
+    if 'temperature' in poses and len(poses):
+        known = poses['temperature']
+        temperatures = (float(np.min(known)), float(np.max(known)))
+    return Drift(calibration.covariance, _repeats(calibration), temperatures)
+
+
+def _repeats(calibration: Calibration) -> float:
+    """Return the variance of pose means that their samples do not account for [g²]."""
+    quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
+    spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
+    excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
+    return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
+
+
+def compared(before: Drift, rest: Rest, least: float) -> Drift:
+    """
+    Return the state after one more rest.
+
+    Parameters
+    ----------
+    before : Drift
+        The rests so far.
+    rest : Rest
+        The next one.
+    least : float
+        Smaller changes are ignored [g].
+
+    """
+    rests = (*before.rests, rest)
+    scatter = _scatter(before, rests[:2]) if len(rests) > MEMORY else before.scatter
+    after = replace(before, rests=rests[-MEMORY:], count=before.count + 1, scatter=scatter)
+    covariance = _covariance(after, after.rests)
+    if not np.all(np.isfinite(covariance)):
+        return after
+    seen = (np.array([each.error for each in after.rests]), covariance,
+            np.array([each.up for each in after.rests]))
+    found = change(*seen)
+    if found is not None and abs(found.error) >= least:
+        since = before.since or after.count - found.rests + 1
+        return replace(after, change=found, since=since)
+    if before.change is not None and is_over(before.change, *seen):
+        return replace(after, change=None, since=0)
+    return after
+
+
+def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
+    """Return the (n, n) covariance of the errors of these rests, if nothing changed [g²]."""
+    slope = np.array([rest.slope for rest in rests])
+    noise = np.array([rest.variance + state.repeats for rest in rests])
+    covariance: Floats = slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise)
+    return covariance
+
+
+def _scatter(state: Drift, rests: tuple[Rest, ...]) -> float:
+    """Return the scatter after the difference of two rests that are older than a change."""
+    covariance = _covariance(state, rests)
+    stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+    step = max(_LEARN, 2.0 / (state.count + 4.0))
+    more = abs(rests[0].error - rests[1].error) > _MEDIAN * stated
+    return max(1.0, state.scatter * float(np.exp(step if more else -step)))
+
+
+def status(state: Drift) -> str:
+    """Return the state of the sensor in a line, and what to do."""
+    if not state.count:
+        return 'no rest since the calibration yet'
+    if not np.isfinite(state.stated):
+        return 'the calibration states no uncertainty to compare rests with'
+    if state.change is None:
+        return (f'{state.error * MG:.2f} mg off 1 g at rest since the calibration, '
+                f'{state.stated * MG:.2f} mg stated')
+    found = state.change
+    return (f'|a| at rest is {found.error * MG:+.2f} mg off 1 g, for {state.lasted} rests, '
+            f'where {state.stated * MG:.2f} mg is stated{_kind(found)}: {_advice(state)}')
+
+
+def _kind(found: Change) -> str:
+    """Return what changed, if the attitudes of the rests show it."""
+    if not found.clear:
+        return ''
+    if found.kind == 'gain':
+        return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
+    x, y, z = found.shift * MG
+    return f'; the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'
+
+
+def _advice(state: Drift) -> str:
+    """Return what to do about a change."""
+    if state.temperatures:
+        low, high = state.temperatures
+        now = state.temperature
+        if now < low - _WARMER or now > high + _WARMER:
+            return (f'the temperature is {now:.1f} °C, it was {low:.1f} to {high:.1f} °C when '
+                    'calibrated: capture poses at this temperature and call ~/refine')
+    return 'call ~/reset, capture poses and call ~/fit'

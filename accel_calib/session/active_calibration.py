@@ -1,0 +1,196 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The calibration in use, and its agreement with the rests since.
+
+Gravity is the mean corrected force of the last rest, held and subtracted while the sensor moves
+(Intan RHD2000 application note): good for motion near the attitude of that rest.
+
+Every rest is compared with 1 g (`accel_calib.monitor`) as soon as it counts; its final average
+replaces that. A robot may stand for weeks: each `LONG_REST` of a long rest counts as one rest.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+
+from .live_capture import LONG_REST
+from .pose_book import overlap
+from ..calibrate import Calibration
+from ..capture import Dwell
+from ..effects import Context
+from ..monitor import compared, Drift, monitor, rests_of
+from ..table import Floats
+from ..units import Units
+
+_SHORT_REST = 30.0
+"""The remainder of a rest of which a part was counted is ignored if it is shorter [s]."""
+
+_NONE = np.zeros((1, 3))
+
+
+class ActiveCalibration:
+    """
+    A calibration, whether it is switched on, and the last rest.
+
+    Parameters
+    ----------
+    gravity : float
+        Local gravity [m/s²].
+
+    Attributes
+    ----------
+    calibration : Calibration or None
+        The one in use.
+    drift : Drift or None
+        What the rests show; None without a calibration.
+    scale : float
+        m/s² in one unit of corrected force.
+    gravity : (3,) array or None
+        Corrected force of the last rest [m/s²].
+
+    """
+
+    def __init__(self, gravity: float) -> None:
+        self._g = gravity
+        self._past: Drift | None = None
+        self._counted: Dwell | None = None
+        self.drift: Drift | None = None
+        self.calibration: Calibration | None = None
+        self.scale = 1.0
+        self.enabled = True
+        self.rest: Dwell | None = None
+        self.gravity: Floats | None = None
+
+    def adopt(self, calibration: Calibration | None) -> None:
+        """Use this calibration from now on; drift begins anew, unless it is only levelled."""
+        if not _only_levelled(self.calibration, calibration):
+            self._past = None if calibration is None else monitor(calibration)
+            self._counted = self.rest
+        self.calibration, self.drift = calibration, self._past
+        self.scale = 1.0 if calibration is None else output_scale(calibration, self._g)
+        self._hold()
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether the sensor has changed since the calibration."""
+        return self.drift is not None and self.drift.change is not None
+
+    def update(self, rest: Dwell, least: float) -> None:
+        """
+        Compare an ongoing rest.
+
+        Parameters
+        ----------
+        rest : Dwell
+            The latest rest, as it is known so far.
+        least : float
+            Smaller changes are ignored [g].
+
+        """
+        self.rest = rest
+        self._hold()
+        part = self._uncounted(rest)
+        if part is not None and part.end - part.start >= LONG_REST:
+            self._past, self._counted = self._with(part, least), _as_noisy_as(part, rest)
+        self._compare(least)
+
+    def end(self, rest: Dwell, least: float) -> None:
+        """Compare a rest that ended; arguments as `update`."""
+        part = self._uncounted(rest)
+        self._past = self._past if part is None else self._with(part, least)
+        self._counted = rest
+        self._compare(least)
+
+    def _compare(self, least: float) -> None:
+        """Set the drift with the ongoing rest."""
+        part = None if self.rest is None else self._uncounted(self.rest)
+        self.drift = self._past if part is None else self._with(part, least)
+
+    def _uncounted(self, rest: Dwell) -> Dwell | None:
+        """Return the part of a rest that was not counted yet; None if it is too short."""
+        before = self._counted
+        if before is None or not overlap(before, rest) or rest.samples < before.samples:
+            return rest
+        return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
+
+    def _with(self, rest: Dwell, least: float) -> Drift | None:
+        """Return the drift with one more rest."""
+        context = self._context(rest)
+        if self._past is None or self.calibration is None or context is None:
+            return self._past
+        noise = rest.std[np.newaxis] / math.sqrt(rest.count)
+        found = rests_of(self.calibration, rest.mean[np.newaxis], noise, context)
+        return compared(self._past, found[0], least)
+
+    def _hold(self) -> None:
+        self.gravity = None if self.rest is None else self._force(self.rest)
+
+    def _force(self, rest: Dwell) -> Floats | None:
+        """Return the corrected force of a rest [m/s²]; None if it cannot be corrected."""
+        context = self._context(rest)
+        if self.calibration is None or context is None:
+            return None
+        return self.calibration.correct(rest.mean[np.newaxis], context)[0] * self.scale
+
+    def _context(self, rest: Dwell) -> Context | None:
+        """Return the context of a rest; None if the calibration needs more."""
+        if self.calibration is None:
+            return None
+        context = context_of_rest(rest, self.calibration.units)
+        known = all(key in context for key in self.calibration.model.needs)
+        return context if known else None
+
+    @property
+    def residual(self) -> float:
+        """Return |a| - 1 g at the last rest [g]; NaN if it is not known."""
+        if self.gravity is None:
+            return math.nan
+        return float(np.linalg.norm(self.gravity)) / self._g - 1.0
+
+
+def context_of_rest(rest: Dwell, units: Units) -> Context:
+    """Return the context of a rest as one row; from which pose it came is taken as none."""
+    known = {key: np.array([value]) for key, value in rest.context.items()}
+    return {'previous': _NONE, 'rate': _NONE, **known, 'time': np.array([rest.time]),
+            'std': units.to_g(rest.std)[np.newaxis]}
+
+
+def output_scale(calibration: Calibration, gravity: float) -> float:
+    """Return m/s² in one unit of corrected force; `gravity` is the local gravity [m/s²]."""
+    return 1.0 if calibration.units.name == 'm/s2' else gravity / calibration.force_per_g
+
+
+def rest_after(part: Dwell, whole: Dwell) -> Dwell:
+    """Return the remainder of a rest after a part of it, with the noise of the part."""
+    samples = whole.samples - part.samples
+    share = samples / whole.samples
+
+    def mean(before: Any, all_of_it: Any) -> Any:
+        return (all_of_it - (1.0 - share) * before) / share
+
+    context = {key: mean(part.context.get(key, value), value)
+               for key, value in whole.context.items()}
+    rest = replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
+                   mean=mean(part.mean, whole.mean), context=context)
+    return _as_noisy_as(part, rest)
+
+
+def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
+    """Return a rest with the noise of a part of it, because a slow change is not noise."""
+    return replace(rest, std=part.std, count=part.count / part.samples * rest.samples)
+
+
+def _only_levelled(before: Calibration | None, after: Calibration | None) -> bool:
+    """Return whether two calibrations differ in the mounting alone."""
+    return (before is not None and after is not None
+            and before.model.effects == after.model.effects
+            and np.array_equal(before.model.vector, after.model.vector)
+            and np.array_equal(before.covariance, after.covariance)
+            and not np.array_equal(before.model.rotation, after.model.rotation))

@@ -1,0 +1,207 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The state of the calibrator, judged in one place.
+
+`Health` is shown on ``/diagnostics`` and answers ``~/self_test``.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+import math
+
+from .stream_statistics import StreamStatistics
+from ..monitor import Drift, status
+from ..units import MG
+
+_DROPPED_SHOWN_FOR = 60.0
+"""Time for which dropped messages are warned of [s]."""
+
+_LIKELY_G = (0.2, 5.0)
+"""Range of |a| outside of which the unit is probably wrong [g]."""
+
+
+class Level(IntEnum):
+    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Health:
+    """
+    The state of the calibrator.
+
+    Parameters
+    ----------
+    sensor, state, problem : str
+        Name; what it does now; why it does not correct, or empty.
+    calibration : str
+        Model and date, or empty.
+    outside : str
+        Which conditions are outside of what the calibration has seen, or empty.
+    file : str
+        File of the calibration.
+    writable : bool
+        Whether it can be written.
+    statistics : StreamStatistics
+        Counts of the stream.
+    length : float
+        |a| of the last message [g]; NaN: not known.
+    rest_ago : float
+        Time since the last rest, by the header stamps [s]; NaN: there was none.
+    residual : float
+        |a| - 1 g at the last rest [g]; NaN: not known.
+    drift : Drift or None
+        What the rests show; None without a calibration.
+    poses, doubtful : int
+        Poses captured; of these doubtful.
+    interruptions : int
+        Interruptions of the header stamps.
+    last_interruption : str
+        The last of them, or empty.
+    threshold : float
+        Largest standard deviation of a still axis [m/s², or native].
+    next_pose : str
+        Which pose helps most next, or that more no longer help.
+
+    """
+
+    sensor: str
+    state: str
+    problem: str
+    calibration: str
+    outside: str
+    file: str
+    writable: bool
+    statistics: StreamStatistics
+    length: float
+    rest_ago: float
+    residual: float
+    drift: Drift | None
+    poses: int
+    doubtful: int
+    interruptions: int
+    last_interruption: str
+    threshold: float
+    next_pose: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was checked: its name, its severity, and the result in words."""
+
+    name: str
+    level: Level
+    words: str
+
+
+def findings(health: Health) -> list[Finding]:
+    """Return one finding for each thing checked."""
+    return [_messages(health), _values(health), _calibration(health), _drift(health),
+            _storage(health)]
+
+
+def worst(health: Health) -> Finding:
+    """Return the most severe finding, or the state if all is well."""
+    found = max(findings(health), key=lambda finding: finding.level)
+    return Finding('state', Level.OK, health.state) if found.level == Level.OK else found
+
+
+def _messages(health: Health) -> Finding:
+    if health.statistics.rate > 0.0:
+        return Finding('messages', Level.OK, f'{health.statistics.rate:.1f} Hz')
+    return Finding('messages', Level.WARN, 'no Imu messages on imu/data_raw: start the driver, or '
+                                           'remap the topic')
+
+
+def _values(health: Health) -> Finding:
+    counts = health.statistics
+    dropped = [words for count, words in (
+        (counts.not_finite, f'{counts.not_finite} readings were NaN or infinite and were dropped: '
+                            'check the driver'),
+        (counts.foreign, f'{counts.foreign} messages were of another sensor and were dropped: '
+                         'give each sensor a topic of its own'),
+        (counts.implausible, f'{counts.implausible} corrected messages were not plausible and '
+                             'were dropped: check the calibration')) if count]
+    if dropped and counts.dropped_ago < _DROPPED_SHOWN_FOR:
+        return Finding('values', Level.WARN, '; '.join(dropped))
+    if health.length < _LIKELY_G[0] or health.length > _LIKELY_G[1]:
+        return Finding('values', Level.WARN, f'|a| is {health.length:.3g} g, expected about 1 g '
+                                             'at rest: set the parameter units')
+    return Finding('values', Level.OK, 'finite, and about 1 g')
+
+
+def _calibration(health: Health) -> Finding:
+    if health.problem:
+        return Finding('calibration', Level.ERROR, health.problem)
+    if not health.calibration:
+        return Finding('calibration', Level.WARN, f'no calibration yet, {health.poses} poses '
+                       f'captured: {health.next_pose or "turn the sensor"}')
+    if health.outside:
+        return Finding('calibration', Level.WARN, f'{health.outside}: the correction is held at '
+                       'that limit; capture poses there and call ~/refine')
+    return Finding('calibration', Level.OK, health.calibration)
+
+
+def _drift(health: Health) -> Finding:
+    if health.drift is None:
+        return Finding('drift', Level.OK, 'no calibration yet')
+    changed = health.drift.change is not None
+    return Finding('drift', Level.WARN if changed else Level.OK, status(health.drift))
+
+
+def _storage(health: Health) -> Finding:
+    if health.writable:
+        return Finding('storage', Level.OK, health.file)
+    return Finding('storage', Level.ERROR, f'{health.file} cannot be written: correct the '
+                                           'permissions, or set calibration_file')
+
+
+def figures(health: Health) -> Iterable[tuple[str, str]]:
+    """Yield names and values of the figures."""
+    counts = health.statistics
+    yield 'state', health.state
+    yield 'sensor', health.sensor
+    yield 'calibration', health.calibration or 'none'
+    yield 'calibration file', health.file
+    yield 'rate [Hz]', f'{counts.rate:.1f}'
+    yield 'messages', str(counts.messages)
+    yield 'readings not finite', str(counts.not_finite)
+    yield 'messages of another sensor', str(counts.foreign)
+    yield 'corrected messages not plausible', str(counts.implausible)
+    yield 'residual |a| - 1 g at last rest [mg]', _number(health.residual * MG)
+    yield from _drift_figures(health.drift)
+    yield 'since last rest [s]', _number(health.rest_ago)
+    yield 'poses captured', str(health.poses)
+    yield 'poses doubtful', str(health.doubtful)
+    yield 'next pose', health.next_pose
+    yield 'interruptions of the clock', str(health.interruptions)
+    yield 'last interruption', health.last_interruption or 'none'
+    yield 'temperature [°C]', _number(counts.temperature)
+    yield 'still below [m/s² or native]', f'{health.threshold:.4g}'
+
+
+def _drift_figures(drift: Drift | None) -> Iterable[tuple[str, str]]:
+    if drift is None:
+        return
+    yield 'drift since calibration [mg]', _number(drift.error * MG)
+    yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
+    yield 'rests since calibration', str(drift.count)
+    yield 'rests since it changed', str(drift.lasted)
+    if drift.change is not None:
+        yield 'changed by [mg]', _number(drift.change.error * MG)
+    if drift.temperatures:
+        low, high = drift.temperatures
+        yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
+
+
+def _number(value: float) -> str:
+    return f'{value:.3f}' if math.isfinite(value) else 'not known'

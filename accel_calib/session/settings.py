@@ -1,0 +1,107 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The parameters of the calibrator.
+
+A field is a parameter: name, default, description and limits. It is declared in the node, checked
+(`accel_calib.session.parameters`), and listed in ``config/calibrator.yaml`` from here.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from .parameters import parameter
+from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
+from ..capture import CaptureSettings, REPEATED, Repeated
+from ..errors import InputError
+from ..units import STANDARD_GRAVITY, UNIT_NAMES, UnitName
+
+_MODELS = tuple(name for name in MODEL_NAMES if name != '12')  # needs known orientations
+_CAPTURE = CaptureSettings()
+
+
+@dataclass(frozen=True)
+class CalibratorSettings:
+    """Parameters of the calibrator."""
+
+    sensor: str = parameter(
+        '', 'Name of the sensor. It names the stored files, and a calibration of another sensor '
+        'is refused. Empty: the frame_id of the messages names the sensor, topic and frame_id '
+        'name the files')
+    units: UnitName = parameter(
+        'm/s2', 'Unit of the incoming linear_acceleration; the outgoing one is in m/s²',
+        choices=UNIT_NAMES)
+    gravity: float = parameter(STANDARD_GRAVITY, 'Local gravity [m/s²]', limits=(1.0, 30.0))
+    model: str = parameter(
+        'auto', 'Model that ~/fit fits: its number of parameters, or auto for the smallest model '
+        'that the poses support', choices=_MODELS, live=True)
+    method: Method = parameter(
+        'ml', 'Fit by maximum likelihood (weighs poses by their noise, leaves out outliers), or '
+        'by the algebraic cost of AN5286', choices=METHODS, live=True)
+    frame: FrameName = parameter(
+        'ros', 'Levelled frame that ~/set_level turns to', choices=FRAMES)
+    output_frame_id: str = parameter(
+        '', 'frame_id of corrected messages. Empty: that of the incoming ones', live=True)
+    calibration_file: str = parameter(
+        '', 'File of the calibration; the poses are stored beside it. Empty: '
+        '$ROS_HOME/accel_calib/<topic>@<frame_id>.yaml, or <sensor>.yaml if sensor is set; '
+        'ROS_HOME is ~/.ros by default')
+    passthrough: bool = parameter(
+        False, 'Publish raw messages unchanged until there is a calibration', live=True)
+    auto_capture: bool = parameter(
+        True, 'Capture a pose whenever the sensor rests', live=True)
+    auto_fit: bool = parameter(
+        False, 'Fit automatically, at auto_fit_poses poses and at each later one', live=True)
+    auto_fit_poses: int = parameter(12, 'Number of poses at which auto_fit begins',
+                                    limits=(4, 1000), live=True)
+    still_window: float = parameter(
+        _CAPTURE.still_window, 'Length of the window that is judged to be still [s]',
+        limits=(0.05, 10.0))
+    still_std_max: float = parameter(
+        _CAPTURE.still_std_max, 'Largest standard deviation of a still axis [m/s², or native '
+        'units]. 0: derived from the noise of the sensor', limits=(0.0, 1e6))
+    still_gyro_max: float = parameter(
+        _CAPTURE.still_gyro_max, 'Largest mean angular rate of a still sensor [rad/s]. 0: not '
+        'checked, because gyros have biases', limits=(0.0, 10.0))
+    still_norm_tolerance: float = parameter(
+        _CAPTURE.still_norm_tolerance, 'Largest distance of |a| of a still sensor from 1 g [g]',
+        limits=(0.01, 1.0))
+    min_dwell: float = parameter(
+        _CAPTURE.min_dwell, 'Shortest rest that makes a pose [s]', limits=(0.1, 600.0))
+    max_dwell: float = parameter(
+        0.0, 'Longer rests are cut into several poses [s]. 0: never', limits=(0.0, 3600.0))
+    min_pose_angle: float = parameter(
+        _CAPTURE.min_pose_angle, 'Poses closer than this are repeated poses [rad]',
+        limits=(0.0, 1.5))
+    repeated: Repeated = parameter(
+        'merge', 'Repeated poses are kept, merged with the earlier one or refused: a robot that '
+        'parks repeats its pose. A pose at another temperature is not repeated',
+        choices=REPEATED)
+    drift_warn: float = parameter(
+        0.01, 'Smallest lasting change of |a| at rest that is warned of, if it also exceeds the '
+        'stated uncertainty of the calibration [m/s²]', limits=(0.0, 100.0), live=True)
+
+
+def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
+    """
+    Return the settings of the capture, in its units.
+
+    Raises
+    ------
+    InputError
+        If they contradict each other.
+
+    """
+    std_max = settings.still_std_max
+    try:
+        return CaptureSettings(
+            settings.still_window,
+            std_max if settings.units == 'native' else std_max / settings.gravity,
+            settings.still_gyro_max, settings.still_norm_tolerance, settings.min_dwell,
+            settings.max_dwell or math.inf, settings.min_pose_angle, settings.repeated)
+    except ValueError as error:
+        raise InputError(f'the parameters contradict each other: {error}', 'change one') from error

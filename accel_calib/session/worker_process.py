@@ -1,0 +1,166 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A process beside the node that computes: fits with their files, refinements, the next pose.
+
+In a thread of the node they would share its interpreter with the stream, and a message would wait
+up to 5 ms for each piece of them. Here they have an interpreter of their own and use the processor
+only while nothing else does: a nice value is not enough, because the scheduler lets a nice process
+that was asleep finish its slice of 3 ms. If others leave it too little, it is started again with
+the usual priority.
+
+Functions, arguments and results are pickled between the processes and never stored. The process
+ends with the node, however that ends, because its standard input does. If it cannot be started or
+dies, the node computes for itself.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+import os
+import pickle
+from queue import SimpleQueue
+from select import select
+import signal
+import subprocess
+import sys
+from threading import Thread
+from typing import Any, BinaryIO, TypeVar
+
+from ..errors import InputError
+
+Found = TypeVar('Found')
+
+_PATIENCE = 10.0
+"""Time without an answer after which the process gets its share of a busy machine [s]."""
+
+_IDLE = 'idle'
+"""Argument of a process that runs only while the processor is idle."""
+
+_ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+"""Arrays are small: more threads would only wait for each other."""
+
+_IMPORTED = ('accel_calib.refine', 'scipy.optimize', 'scipy.special')
+"""Modules imported at the start, so that the first fit takes no longer than the next."""
+
+
+class WorkerProcess:
+    """The process, as the node uses it; for one thread at a time."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._closed = False
+        self._idle = True
+
+    def start(self) -> None:
+        """Start the process, unless it is running, and return at once."""
+        if self._closed or (self._process is not None and self._process.poll() is None):
+            return
+        command = [sys.executable, '-m', __name__, *([_IDLE] if self._idle else [])]
+        path = os.pathsep.join(filter(None, sys.path))
+        environment = {**os.environ, 'PYTHONPATH': path, **dict.fromkeys(_ONE_THREAD, '1')}
+        try:
+            # In a session of its own it does not get the Ctrl-C of a terminal.
+            self._process = subprocess.Popen(
+                command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                start_new_session=True)
+        except OSError:
+            self._process = None
+
+    def call(self, function: Callable[..., Found], *given: Any) -> Found:
+        """
+        Call a function in the process and wait for its result.
+
+        Parameters
+        ----------
+        function : callable
+            Of a module, so that it can be imported by name.
+        *given
+            Its arguments, which can be pickled.
+
+        Returns
+        -------
+        object
+            Its result; what it raises is raised here.
+
+        Raises
+        ------
+        InputError
+            If the node is ending.
+
+        """
+        self.start()
+        try:
+            good, found = self._ask(function, given)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            if self._closed:
+                raise InputError('the node is ending', 'start it again') from None
+            self._end()
+            return function(*given)
+        if not good:
+            raise found
+        return found
+
+    def _ask(self, function: Callable[..., Any], given: tuple[Any, ...]) -> tuple[bool, Any]:
+        process = self._process
+        if process is None or process.stdin is None or process.stdout is None:
+            raise EOFError
+        process.stdin.write(pickle.dumps((function, given)))
+        process.stdin.flush()
+        if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
+            self._idle = False  # without privileges the priority of a process cannot be raised
+            self._end()
+            self.start()
+            return self._ask(function, given)
+        answer: tuple[bool, Any] = pickle.load(process.stdout)
+        return answer
+
+    def close(self) -> None:
+        """End the process; a call that waits for it is refused."""
+        self._closed = True
+        self._end()
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+
+def main() -> None:
+    """Answer calls until standard input ends; the code of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if _IDLE in sys.argv:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), 'wb')
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is not an answer
+    calls: SimpleQueue[Any] = SimpleQueue()
+    Thread(target=_read, args=(sys.stdin.buffer, calls), daemon=True).start()
+    for name in _IMPORTED:
+        import_module(name)
+    while True:
+        answers.write(pickle.dumps(_answer(calls.get())))
+        answers.flush()
+
+
+def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
+    """Read calls; end the process with the node, even while it computes."""
+    try:
+        while True:
+            calls.put(pickle.load(stream))
+    finally:
+        os._exit(0)
+
+
+def _answer(call: Any) -> tuple[bool, Any]:
+    function, given = call
+    try:
+        return True, function(*given)
+    except Exception as error:  # raised again in the node, by `call`
+        return False, error
+
+
+if __name__ == '__main__':
+    main()

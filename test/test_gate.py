@@ -1,0 +1,230 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""No wrong calibration: bad rows, absurd numbers and edited files never pass for a result."""
+
+from contextlib import suppress
+from dataclasses import replace
+import json
+from pathlib import Path
+
+from accel_calib.calibrate import fit_poses, gated
+from accel_calib.cli.main import main
+from accel_calib.errors import AccelCalibError, RefusedFitError, StoredCalibrationError
+from accel_calib.files import format_calibration, parse_calibration, read_calibration, read_poses
+from accel_calib.files.calibration_yaml import EDITED
+from accel_calib.model import Model, predict
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import data, sensor
+
+G, MPS2 = units_of('g'), units_of('m/s2')
+STORED = Path(__file__).parent / 'data'
+
+TWELVE = np.array([
+    (-5, -7.9, 3), (7.3, 6.2, -2), (-0.5, -2, 9.6), (7.6, 0.5, 6.2), (7.5, 2.1, -6),
+    (-0.4, -2.5, -9.5), (-8.7, 0.6, -4.4), (3.4, -6.5, 6.5), (5.6, 2.4, -7.6), (-6.8, 7.1, -0.2),
+    (8.5, -1, -4.9), (0, -9.8, 0.4)])
+
+
+def table(reading):
+    return Poses({'reading': np.asarray(reading, float)}, np.arange(1, len(reading) + 1))
+
+
+def left_out(calibration):
+    return [each.row for each in calibration.rejected]
+
+
+def assert_same(found, expected):
+    np.testing.assert_allclose(found.offset, expected.offset, rtol=1e-6)
+    np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-6)
+
+
+@pytest.mark.parametrize('model', ['auto', '4', '7', '10'])
+def test_a_row_of_zeros_is_left_out_and_named(model):
+    expected = fit_poses(table(TWELVE), MPS2, model=model)
+    found = fit_poses(table([*TWELVE, (0, 0, 0)]), MPS2, model=model)
+    assert left_out(found) == [13]
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize(('name', 'row'), [('esgi95_dataset1_huawei', (0, 0, 0)),
+                                           ('esgi95_dataset2', (1, 1, 1)),
+                                           ('esgi95_dataset3_gt', (0, 0, 0))])
+def test_a_bad_row_among_real_poses_is_left_out_and_named(name, row):
+    poses, units = read_poses(data(f'{name}.csv')), units_of('m/s2', 9.8061)
+    found = fit_poses(table([*poses.reading, row]), units)
+    assert left_out(found) == [len(poses) + 1]
+    assert_same(found, fit_poses(poses, units))
+
+
+def bad_row(rng, reading, kind):
+    """Make a row that has nothing to do with the poses."""
+    k = rng.integers(len(reading))
+    return {'zeros': np.zeros(3), 'any': rng.normal(size=3) * 10.0 ** rng.uniform(-2, 3),
+            'other unit': reading[k] / 9.80665, 'swapped': reading[k][[1, 0, 2]],
+            'upside down': -reading[k],
+            'off': reading[k] + rng.normal(size=3) * 10.0 ** rng.uniform(-3, 1),
+            'huge': rng.normal(size=3) * 10.0 ** rng.uniform(3, 150)}[kind]
+
+
+@pytest.mark.parametrize('kind', ['zeros', 'any', 'other unit', 'swapped', 'upside down', 'off',
+                                  'huge'])
+@pytest.mark.parametrize('with_noise', [True, False])
+def test_one_bad_row_never_moves_the_result_silently(kind, with_noise):
+    for seed in range(12):
+        rng = np.random.default_rng((seed, 9))
+        count, model = int(rng.integers(12, 30)), sensor(rng)
+        poses = simulate_poses(model, spread_directions(count), rng)
+        rows = np.append(np.arange(count), 0)
+        bad = Poses({key: poses[key][rows] * (9.80665 if key != 'count' else 1.0)
+                     for key in ('reading', 'std', 'count')[:3 if with_noise else 1]},
+                    np.arange(1, count + 2))
+        bad.reading[-1] = bad_row(rng, bad.reading, kind)
+        found = fit_poses(bad, MPS2, model='10')
+        if count + 1 in left_out(found):
+            continue
+        fresh = random_directions(200, rng)
+        force = found.correct(predict(model, fresh, {}) * 9.80665)
+        spread = found.force_covariance(fresh * 9.80665)
+        stated = np.einsum('ni,nij,nj->n', fresh, spread, fresh)
+        wrong = np.linalg.norm(force, axis=1) - 9.80665
+        assert np.mean(wrong ** 2) < 3.0 ** 2 * np.mean(stated), (kind, seed)
+
+
+@pytest.mark.parametrize('value', [1e150, -1e300, 1e20, 1e6])
+@pytest.mark.parametrize('model', ['auto', '4', '7', '9', '10'])
+def test_an_absurd_cell_is_left_out_or_refused_in_words(value, model):
+    reading = TWELVE.copy()
+    reading = np.vstack([reading, reading[3]])
+    reading[12, 1] = value
+    found = fit_poses(table(reading), MPS2, model=model)
+    assert left_out(found) == [13]
+    with pytest.raises(RefusedFitError, match='row 13: the reading'):
+        fit_poses(table(reading), MPS2, model='4', method='algebraic')
+
+
+@pytest.mark.parametrize('value', [1e300, 1e150, 1e5])
+def test_an_absurd_deviation_is_left_out_and_named(value):
+    poses = simulate_poses(sensor(np.random.default_rng(1)), spread_directions(14),
+                           np.random.default_rng(2))
+    std = poses['std'].copy()
+    std[5] = value
+    found = fit_poses(poses.with_columns(std=std), G)
+    assert left_out(found) == [6]
+    assert 'not at rest' in found.rejected[0].reason
+
+
+def test_what_is_no_sphere_at_all_is_refused_in_words():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        reading = rng.normal(size=(int(rng.integers(6, 20)), 3)) * 6.0
+        with suppress(AccelCalibError):
+            assert fit_poses(table(reading), MPS2).quality.rms_after_mg < 50.0
+
+
+@pytest.fixture(scope='module')
+def calibration():
+    poses = simulate_poses(sensor(np.random.default_rng(5)), spread_directions(14),
+                           np.random.default_rng(6))
+    return fit_poses(poses, G, model='10', sensor='imu')
+
+
+@pytest.mark.parametrize(('values', 'says'), [
+    ({'axis_gain': [-1.0, 0.0, 0.0]}, 'singular or a mirror image'),
+    ({'axis_gain': [-2.0, 0.0, 0.0]}, 'singular or a mirror image'),
+    ({'axis_gain': [30.0, 0.0, 0.0]}, 'no ellipsoid of an accelerometer'),
+    ({'offset': [50.0, 0.0, 0.0]}, 'zero-g offset is 50 g'),
+    ({'cross_axis': [0.9, 0.9, 0.9]}, 'singular or a mirror image|no ellipsoid'),
+])
+def test_values_that_no_accelerometer_has_are_refused(values, says, calibration):
+    changed = {name: np.array(part) for name, part in {**calibration.model.values,
+                                                       **values}.items()}
+    with pytest.raises(RefusedFitError, match=says):
+        gated(replace(calibration, model=Model(changed)))
+
+
+@pytest.mark.parametrize(('change', 'says'), [
+    (lambda c: -c, 'positive semidefinite'),
+    (lambda c: c * np.where(np.eye(9) > 0, 1.0, 1e3), 'positive semidefinite'),
+    (lambda c: c + np.triu(np.full((9, 9), 1.0), 1) * c[0, 0], 'symmetric'),
+    (lambda c: c * np.nan, 'not a finite number'),
+    (lambda c: c * 1e9, 'do not determine the calibration'),
+])
+def test_a_covariance_that_is_none_is_refused(change, says, calibration):
+    with pytest.raises(RefusedFitError, match=says):
+        gated(replace(calibration, covariance=change(calibration.covariance)))
+
+
+@pytest.mark.parametrize('rotation', [np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.01,
+                                      np.zeros((3, 3))])
+def test_a_mounting_that_is_no_rotation_is_refused(rotation, calibration):
+    with pytest.raises(RefusedFitError, match='not a rotation'):
+        gated(replace(calibration, model=Model(calibration.model.values, rotation)))
+
+
+def test_a_file_edited_by_hand_is_used_and_said_to_be(calibration):
+    text = format_calibration(calibration)
+    assert EDITED not in parse_calibration(text, 'x.yaml').warnings
+    edited = parse_calibration(text.replace('sensor: imu', 'sensor: other'), 'x.yaml')
+    assert edited.sensor == 'other'
+    assert EDITED in edited.warnings
+    assert EDITED not in parse_calibration(format_calibration(edited), 'x.yaml').warnings
+
+
+@pytest.mark.parametrize(('old', 'new'), [
+    ('covariance:', 'covariance: [[.nan]]\nwas:'), ('per_g: 1.0', 'per_g: -1.0'),
+    ('per_g: 1.0', 'per_g: 1e400'), ('per_g: 1.0', 'per_g: [1.0]'),
+    ('method: ml', 'method: [ml]'), ('warnings:', 'warnings: 3\nwas:'),
+    ('rejected: []', 'rejected: [{row: one, reason: x}]'), ("date: ''", 'date: 2026-11-02'),
+    ('row: [1, 2', 'row: [1.5, 2'), ('row: [1, 2', 'row: [[1], 2')])
+def test_a_file_with_a_value_of_another_kind_is_refused_in_one_line(old, new, calibration):
+    text = format_calibration(calibration)
+    assert old in text
+    with pytest.raises(StoredCalibrationError) as refusal:
+        parse_calibration(text.replace(old, new, 1), 'x.yaml')
+    assert '\n' not in str(refusal.value)
+
+
+def test_calibrations_of_version_1_still_load_and_correct_as_they_did():
+    corrected = json.loads((STORED / 'calibration_1_corrected.json').read_text())
+    assert len(corrected) == 4
+    context = {'temperature': np.array([22.0]), 'time': np.array([600.0])}
+    for name, force in corrected.items():
+        found = read_calibration(STORED / name)
+        reading = np.array([[0.3, -0.4, 0.8]]) * found.units.per_g
+        np.testing.assert_allclose(found.correct(reading, context)[0], force, rtol=1e-9)
+        assert np.all(np.isfinite(found.covariance))
+        assert parse_calibration(format_calibration(found), name).model.effects == (
+            found.model.effects)
+
+
+def test_effects_of_the_context_are_held_at_the_edge_of_what_was_seen():
+    rng, count = np.random.default_rng(7), 40
+    model = model_with({'offset_temperature': np.array([1e-3, -5e-4, 8e-4])})
+    poses = simulate_poses(model, spread_directions(count), rng,
+                           context={'temperature': np.linspace(20.0, 30.0, count)})
+    calibration = replace(fit_poses(poses, G, model='10'), model=model,
+                          covariance=np.eye(3) * 1e-10)
+    assert calibration.ranges == {'temperature': (20.0, 30.0)}
+    reading = np.tile([[0.0, 0.0, 1.0]], (4, 1))
+    force = calibration.correct(reading, {'temperature': np.array([30.0, 80.0, 20.0, -40.0])})
+    np.testing.assert_array_equal(force[0], force[1])
+    np.testing.assert_array_equal(force[2], force[3])
+    assert not np.array_equal(force[0], force[2])
+
+
+def test_the_command_leaves_a_row_of_zeros_out(tmp_path):
+    poses, stored, result = (tmp_path / name for name in ('p.csv', 'c.yaml', 'f.json'))
+    poses.write_text('ax,ay,az\n' + '\n'.join(','.join(map(str, row)) for row in
+                                              [*TWELVE.tolist(), (0, 0, 0)]))
+    assert main(['fit', str(poses), '-o', str(stored), '--json', str(result)]) == 0
+    found = json.loads(result.read_text())
+    assert [each['row'] for each in found['poses_rejected']] == [13]
+    assert found['poses_used'] == 12
+    assert main(['verify', str(poses), '-c', str(stored), '--json', str(result)]) == 0
+    assert json.loads(result.read_text())['rms_after_mg'] > 100.0

@@ -1,0 +1,313 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses captured while samples arrive, and rests compared with the calibration in use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from accel_calib.calibrate import fit_poses, level
+from accel_calib.capture import CaptureSettings, Dwell, poses_from
+from accel_calib.files import read_calibration
+from accel_calib.session import CalibratorSettings
+from accel_calib.session.active_calibration import ActiveCalibration, rest_after
+from accel_calib.session.live_capture import LiveCapture
+from accel_calib.session.pose_book import dwells_of, PoseBook, with_temperature
+from accel_calib.session.work import asked_for, fitted
+from accel_calib.simulate import model_with, simulate_recording
+from accel_calib.sphere import spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+
+UNITS = units_of('m/s2')
+GRAVITY = 9.80665
+FACES = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+
+Readings = Callable[..., Any]
+
+
+def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: float = 50.0,
+             capture: bool = True, omega: Any = None) -> list[Any]:
+    """Push readings in small blocks, and return the changes."""
+    samples = np.full((len(readings), 9), np.nan)
+    samples[:, 0], samples[:, 1:4] = start + np.arange(len(readings)) / rate, readings
+    if omega is not None:
+        samples[:, 4:7] = omega
+    blocks = np.array_split(samples, max(1, len(samples) // 5))
+    return [change for block in blocks for change in live.push(block, capture)]
+
+
+def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
+    return Dwell(time, time + 1.0, time + 0.5, np.array(direction, float) * GRAVITY,
+                 np.full(3, 0.01), count, 50, {}, round(time))
+
+
+def test_rest_counts_before_it_ends_and_is_updated_later(readings: Readings) -> None:
+    live = LiveCapture(CaptureSettings(), UNITS)
+    changes = push_all(live, readings([[0, 0, 1]], dwell=9.0))
+    counts = [change.rest.samples for change in changes if change.poses]
+    assert len(live.book.poses()) == 1
+    assert counts == sorted(counts)
+    assert counts[0] < 80
+    assert counts[-1] > 150
+
+
+def test_poses_held_are_replaced_by_their_final_average(readings: Readings) -> None:
+    live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
+    changes = push_all(live, readings(FACES, dwell=2.0))
+    assert len(live.book.poses()) == 3
+    assert sum(len(change.ended) for change in changes) >= 1
+    assert np.all(np.diff(live.book.poses()['time']) > 1.5)
+
+
+@pytest.mark.parametrize('dwell', [1.5, 3.0, 10.0])
+@pytest.mark.parametrize('turn', [0.2, 1.0, 5.0])
+@pytest.mark.parametrize('rate', [25.0, 400.0])
+def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate: float) -> None:
+    live = LiveCapture(CaptureSettings(), UNITS)
+    recording = simulate_recording(
+        model_with({}), np.array(FACES, float), np.random.default_rng(1), noise_g=0.002,
+        rate_hz=rate, dwell=dwell, turn=turn)
+    changes = push_all(live, recording.reading * GRAVITY, rate=rate, omega=recording['rate'])
+    assert len(live.book.poses()) == 3
+    assert sum(change.doubted for change in changes) == 0
+    assert 'doubtful' not in live.book.poses()
+
+
+def test_time_that_jumps_back_ends_a_rest_and_no_more(readings: Readings) -> None:
+    live = LiveCapture(CaptureSettings(repeated='merge'), UNITS)
+    for _ in range(3):
+        push_all(live, readings(FACES, dwell=2.0), start=100.0)
+    assert len(live.book.poses()) == 3
+    assert len(live.detector.interruptions) == 2
+
+
+def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
+    live = LiveCapture(CaptureSettings(), UNITS)
+    rest = readings([[0, 0, 1]], dwell=12.0)
+    push_all(live, rest[:150])
+    assert live.undo()
+    push_all(live, rest[150:], start=3.0)
+    push_all(live, readings(FACES[1:], dwell=2.0), start=12.0)
+    assert len(live.book.poses()) == 2
+
+
+def test_without_auto_capture_only_the_pose_asked_for_is_kept(readings: Readings) -> None:
+    live = LiveCapture(CaptureSettings(), UNITS)
+    turned = readings(FACES, dwell=2.0)
+    push_all(live, turned[:90], capture=False)
+    assert live.capture_now() is not None
+    push_all(live, turned[90:], start=1.8, capture=False)
+    poses = live.book.poses()
+    assert len(poses) == 1
+    assert poses['reading'][0, 2] > 9.0
+
+
+def test_moving_sensor_is_no_pose() -> None:
+    live = LiveCapture(CaptureSettings(), UNITS)
+    rng = np.random.default_rng(1)
+    push_all(live, [0, 0, GRAVITY] + rng.normal(size=(500, 3)) * 3.0)
+    assert len(live.book.poses()) == 0
+    assert live.capture_now() is None
+
+
+def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
+    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    for time, direction in ((0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])):
+        book.end(dwell(time, direction))
+    assert len(book.poses()) == 2
+    assert book.poses()['count'].max() == pytest.approx(100.0)
+    assert book.undo()
+    assert book.poses()['count'].max() == pytest.approx(50.0)
+    assert len(book.poses()) == 2
+
+
+def test_book_of_a_robot_that_parks_for_years_stays_small() -> None:
+    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    directions = spread_directions(6)
+    for k in range(600):
+        book.end(dwell(10.0 * k, directions[k % 6]))
+    assert len(book.poses()) == 6
+    assert book.poses()['count'].sum() == pytest.approx(600 * 50.0)
+    assert len(book._earlier) + len(book._dwells) < 80
+
+
+def test_stored_poses_are_added_as_they_were() -> None:
+    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    for k, direction in enumerate(spread_directions(8)):
+        book.end(dwell(10.0 * k, direction))
+    poses = book.poses()
+    again = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    again.add_stored(poses)
+    for key in poses.columns:
+        np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
+    assert len(dwells_of(poses)) == 8
+
+
+def test_fit_keeps_what_was_flat_before(stored: Callable[..., Path]) -> None:
+    flat = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
+    before = read_calibration(stored(flat=flat))
+    again = fitted(before.poses, UNITS, CalibratorSettings(model='10'), '', before, {})
+    np.testing.assert_allclose(again.model.rotation, before.model.rotation, atol=1e-6)
+    new = fitted(before.poses, UNITS, CalibratorSettings(model='10'), '', None, {})
+    np.testing.assert_array_equal(new.model.rotation, np.eye(3))
+
+
+@pytest.mark.parametrize('unit', ['m/s2', 'native'])
+@pytest.mark.parametrize('count', [0, 1, 5])
+def test_a_next_pose_is_asked_for_with_any_number_of_poses(unit: Any, count: int) -> None:
+    book = PoseBook(CaptureSettings(), UNITS)
+    for k in range(count):
+        book.end(dwell(10.0 * k, [0, 0, 1]))
+    poses = book.poses()
+    assert 'turn the sensor' in asked_for(poses, units_of(unit), 'auto').words
+
+
+def test_drift_is_that_of_the_rests_since_the_calibration(stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    active = ActiveCalibration(GRAVITY)
+    assert active.drift is None
+    active.adopt(calibration)
+    for k, direction in enumerate(spread_directions(5)):
+        reading = calibration.predict((direction * GRAVITY * 1.01)[None])[0]
+        rest = dwell(10.0 * k, reading / GRAVITY)
+        active.update(rest, 0.001)
+        active.end(rest, 0.001)
+    assert active.residual == pytest.approx(0.01, abs=1e-6)
+    assert active.drift.error == pytest.approx(0.01, abs=1e-6)
+    active.adopt(calibration)
+    assert active.drift.count == 0
+    assert active.residual == pytest.approx(0.01, abs=1e-6)
+
+
+def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
+        stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    active = ActiveCalibration(GRAVITY)
+    active.adopt(calibration)
+
+    def rest(time: float, off: float) -> Dwell:
+        reading = calibration.predict(np.array([[0.0, 0.0, (1.0 + off) * GRAVITY]]))[0]
+        return dwell(time, reading / GRAVITY)
+
+    for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
+        active.update(rest(time, off), 0.001)
+        active.end(rest(time, off), 0.001)
+        assert active.drift is not None
+        assert active.drift.change is None
+    active.update(rest(50.0, 0.005), 0.001)
+    assert active.drift.change is not None
+    active.update(rest(50.0, 0.0), 0.001)
+    assert active.drift.change is None
+    active.end(rest(50.0, 0.005), 0.001)
+    assert active.drift.change is not None
+    assert active.drift.count == 6
+    flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
+    active.adopt(level(calibration, flat, 'ros'))
+    assert active.drift.change is not None
+    active.adopt(None)
+    assert active.drift is None
+
+
+def test_rest_that_ends_late_does_not_hide_the_ongoing_one(
+        stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    active = ActiveCalibration(GRAVITY)
+    active.adopt(calibration)
+    early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
+    active.update(early, 0.001)
+    active.update(late, 0.001)
+    active.end(early, 0.001)
+    assert active.drift is not None
+    assert active.drift.count == 2
+    active.end(late, 0.001)
+    assert active.drift.count == 2
+
+
+def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
+    rng = np.random.default_rng(1)
+    first, second = rng.normal(size=(200, 3)), rng.normal(size=(100, 3))
+    part = Dwell(0.0, 2.0, 1.0, first.mean(axis=0), np.ones(3), 100.0, 200,
+                 {'temperature': 20.0}, 1)
+    both = np.vstack([first, second])
+    whole = Dwell(0.0, 3.0, 1.5, both.mean(axis=0), 2.0 * np.ones(3), 90.0, 300,
+                  {'temperature': 22.0}, 1)
+    rest = rest_after(part, whole)
+    np.testing.assert_allclose(rest.mean, second.mean(axis=0))
+    assert (rest.start, rest.end, rest.samples) == (2.0, 3.0, 100)
+    assert rest.count == pytest.approx(50.0)
+    np.testing.assert_array_equal(rest.std, np.ones(3))
+    assert rest.time == pytest.approx(2.5)
+    assert rest.context['temperature'] == pytest.approx(26.0)
+
+
+def test_robot_that_stands_for_hours_is_liveed_all_the_while(stored: Callable[..., Path]) -> None:
+    calibration = read_calibration(stored())
+    active, live = ActiveCalibration(GRAVITY), LiveCapture(CaptureSettings(), UNITS)
+    active.adopt(calibration)
+    rng = np.random.default_rng(1)
+    counts, left_at = [], 0.0
+    base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
+    for k in range(0, 4 * 5000, 4):  # at 4 Hz; the offset begins to change after 2500 s
+        time = (k + np.arange(4)) / 4.0
+        shift = GRAVITY * 0.000003 * np.maximum(0.0, time - 2500.0)
+        readings = base + 0.01 * rng.normal(size=(4, 3)) + shift[:, np.newaxis] * [0.0, 0.0, 1.0]
+        for change in push_all(live, readings, start=time[0], rate=4.0, capture=False):
+            if change.rest is not None:
+                active.update(change.rest, 0.001)
+        if active.drift is not None and active.drift.change is not None:
+            left_at = left_at or time[0]
+        counts.append(0 if active.drift is None else active.drift.count)
+    assert max(counts) > 12
+    assert 2500.0 < left_at < 4500.0
+
+
+def test_pose_from_before_the_first_temperature_gets_that_of_the_next() -> None:
+    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    book.end(dwell(0.0, [0, 0, 1]))
+    for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
+        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + 0.1 * time}))
+    np.testing.assert_allclose(book.poses()['temperature'], [31.5, 31.0])
+    early = replace(dwell(-500.0, [0, 1, 0]), context={})
+    assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))
+
+
+@pytest.mark.parametrize(('repeated', 'count'), [('merge', 100.0), ('refuse', 50.0)])
+def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float) -> None:
+    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
+    for time, temperature in ((0.0, 24.0), (10.0, 25.0), (20.0, 38.0)):
+        book.end(replace(dwell(time, [0, 0, 1]), context={'temperature': temperature}))
+    np.testing.assert_allclose(book.poses()['count'], [count, 50.0])
+    assert book.poses()['temperature'][1] == 38.0
+
+
+def test_poses_of_a_noisier_time_are_marked_and_stay() -> None:
+    rng = np.random.default_rng(3)
+    live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
+    start, changes = 0.0, []
+    for noise in (0.004, 0.0004):
+        for direction in spread_directions(12):
+            moving = GRAVITY * (direction + 0.4 * rng.normal(size=(50, 3)))
+            held = GRAVITY * (direction + 0.004 * np.sin(0.9 * np.arange(150))[:, np.newaxis]
+                              * (noise > 0.001) + noise * rng.normal(size=(150, 3)))
+            changes += push_all(live, np.vstack([moving, held]), start=start)
+            start += 4.0
+    poses = live.book.poses()
+    doubted = sum(change.doubted for change in changes)
+    assert len(poses) == 24
+    assert doubted == np.sum(poses['doubtful']) == 12
+    assert np.all(poses['doubtful'][:12] == 1.0)
+    again = LiveCapture(CaptureSettings(), UNITS)
+    again.book.add_stored(poses)
+    np.testing.assert_array_equal(again.book.poses()['doubtful'], poses['doubtful'])
+    calibration = fit_poses(poses, UNITS, model='10')
+    assert [each.row for each in calibration.rejected] == list(range(1, 13))
+    assert 'doubtful' in calibration.rejected[0].reason
+    needed = fit_poses(poses.take(slice(0, 13)), UNITS, model='10')
+    assert not needed.rejected
+    assert 'the sensor may have moved in the poses 1, 2, 3' in ' '.join(needed.warnings)

@@ -1,0 +1,253 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Serialized Imu messages: their layout, and what a calibration changes in them."""
+
+from dataclasses import replace
+import struct
+
+from accel_calib.calibrate import fit_poses, level
+from accel_calib.errors import InputError
+from accel_calib.messages import layout as imu
+from accel_calib.messages.arrays import doubles_at, frame_ids, joined, samples_of
+from accel_calib.messages.correction import corrected
+from accel_calib.messages.layout import layout_of, layout_with
+from accel_calib.messages.rewriter import motion_of, Rewriter
+from accel_calib.model import Model, predict
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.units import STANDARD_GRAVITY, units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+UNITS = units_of('m/s2')
+NAMES = ['', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'übung', 'x' * 300]
+COVARIANCES = ['absent', 'unknown', 'known', 'full', 'other']
+EFFECTS = {'quadratic': [1e-3, -2e-3, 1e-3], 'gain_temperature': [3e-4, -2e-4, 1e-4],
+           'offset_temperature': [1e-3, 2e-3, -1e-3], 'lever_arm': [0.1, -0.05, 0.02],
+           'warm_up': [0.01, 0.005, -0.01, 900.0, 600.0]}
+
+
+@pytest.fixture
+def calibration():
+    rng = np.random.default_rng(1)
+    poses = simulate_poses(sensor(rng), spread_directions(20), rng)
+    poses = poses.with_columns(reading=UNITS.from_g(poses.reading), std=UNITS.from_g(poses['std']))
+    return fit_poses(poses, UNITS)
+
+
+@pytest.fixture
+def levelled(calibration):
+    flat = rotation_from_rpy(0.4, 0.2, -1.0) @ np.array([0, 0, 1.0])
+    return level(calibration, calibration.predict(flat[np.newaxis] * UNITS.per_g)[0], 'ros')
+
+
+def messages(count=6):
+    fields = np.random.default_rng(2).normal(size=(count, imu.IMU_DOUBLES))
+    for part in (imu.ANGULAR_VELOCITY_COVARIANCE, imu.ACCELERATION_COVARIANCE):
+        root = fields[:, part].reshape(-1, 3, 3) * 0.01
+        fields[:, part] = (root @ np.swapaxes(root, 1, 2)).reshape(-1, 9)
+    return fields
+
+
+def test_without_a_mounting_only_the_acceleration_changes(calibration):
+    fields = messages()
+    found = corrected(calibration, fields)
+    np.testing.assert_allclose(found[:, imu.ACCELERATION],
+                               calibration.correct(fields[:, imu.ACCELERATION]))
+    rest = np.r_[0:imu.ACCELERATION.start]
+    np.testing.assert_array_equal(found[:, rest], fields[:, rest])
+
+
+def test_with_a_mounting_the_message_speaks_of_one_frame(levelled):
+    fields, rotation = messages(), levelled.model.rotation
+    found = corrected(levelled, fields)
+    np.testing.assert_allclose(found[:, imu.ANGULAR_VELOCITY],
+                               fields[:, imu.ANGULAR_VELOCITY] @ rotation)
+    turned = found[:, imu.ANGULAR_VELOCITY_COVARIANCE].reshape(-1, 3, 3)
+    given = fields[:, imu.ANGULAR_VELOCITY_COVARIANCE].reshape(-1, 3, 3)
+    np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
+    kept = np.r_[imu.ORIENTATION, imu.ORIENTATION_COVARIANCE]
+    np.testing.assert_array_equal(found[:, kept], fields[:, kept])
+
+
+def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
+    fields = messages()
+    found = corrected(levelled, fields)
+    inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
+    own = inverse @ fields[:, imu.ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
+    added = found[:, imu.ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
+    np.testing.assert_allclose(added, levelled.force_covariance(found[:, imu.ACCELERATION]),
+                               atol=1e-15)
+    assert np.all(np.linalg.eigvalsh(added) > 0)
+
+
+@pytest.mark.parametrize('first', [-1.0, 0.0])
+def test_conventions_for_no_covariance_are_kept(levelled, first):
+    fields = messages()
+    for part in (imu.ANGULAR_VELOCITY_COVARIANCE, imu.ACCELERATION_COVARIANCE):
+        fields[:, part] = 0.0
+        fields[:, part.start] = first
+    found = corrected(levelled, fields)
+    for part in (imu.ANGULAR_VELOCITY_COVARIANCE, imu.ACCELERATION_COVARIANCE):
+        np.testing.assert_array_equal(found[:, part], fields[:, part])
+
+
+def test_the_given_messages_are_left_as_they_were(levelled):
+    fields = messages()
+    before = fields.copy()
+    corrected(levelled, fields)
+    np.testing.assert_array_equal(fields, before)
+
+
+def test_corrected_readings_are_the_force(calibration):
+    force = random_directions(5, np.random.default_rng(3)) * UNITS.per_g
+    fields = messages(5)
+    fields[:, imu.ACCELERATION] = UNITS.from_g(
+        predict(calibration.model, UNITS.to_g(force), {}))
+    np.testing.assert_allclose(corrected(calibration, fields)[:, imu.ACCELERATION], force,
+                               atol=1e-12)
+
+
+def covariance(kind, rng):
+    """Return a covariance as drivers send it."""
+    values = np.zeros(9)
+    root = rng.normal(size=(3, 3)) * 0.01
+    if kind == 'absent':
+        values[0] = -1.0
+    elif kind == 'known':
+        values[[0, 4, 8]] = 4e-4
+    elif kind == 'full':
+        values = (root @ root.T).ravel()
+    elif kind == 'other':
+        values[4] = 1e-3
+    return values
+
+
+def random_message(rng, frame_id=None):
+    """Return a serialized message with all fields drawn, and random bytes as padding."""
+    name = (rng.choice(NAMES) if frame_id is None else frame_id).encode() + b'\0'
+    doubles = rng.normal(size=37) * 5.0
+    for part in (imu.ORIENTATION_COVARIANCE, imu.ANGULAR_VELOCITY_COVARIANCE,
+                 imu.ACCELERATION_COVARIANCE):
+        doubles[part] = covariance(rng.choice(COVARIANCES), rng)
+    if rng.uniform() < 0.05:
+        doubles[imu.ANGULAR_VELOCITY.start + 1] = np.nan
+    stamp = struct.pack('<iI', rng.integers(-2 ** 31, 2 ** 31), rng.integers(0, 10 ** 9))
+    head = stamp + struct.pack('<I', len(name)) + name
+    return b'\0\1\0\0' + head + rng.bytes(-len(head) % 8) + doubles.tobytes()
+
+
+def swapped(data):
+    """Return a little-endian message as a big-endian machine writes it."""
+    begin = layout_of(data).begin
+    stamp, doubles = struct.unpack_from('<iII', data, 4), np.frombuffer(data, '<f8', -1, begin)
+    return b'\0\0\0\0' + struct.pack('>iII', *stamp) + data[16:begin] + doubles.astype(
+        '>f8').tobytes()
+
+
+def every(data):
+    return doubles_at(joined([data], 37, 'imu'), slice(0, 37))
+
+
+def with_effects(calibration, *, effects, turned):
+    """Return a calibration with effects and a mounting, if they are asked for."""
+    values = dict(calibration.model.values)
+    if effects:
+        values |= {name: np.array(each) for name, each in EFFECTS.items()}
+    rotation = rotation_from_rpy(0.3, -0.2, 1.0) if turned else np.eye(3)
+    root = np.random.default_rng(1).normal(size=(60, len(np.concatenate([*values.values()]))))
+    return replace(calibration, model=Model(values, rotation), covariance=root.T @ root * 1e-8)
+
+
+@pytest.mark.parametrize('effects', [False, True])
+@pytest.mark.parametrize('turned', [False, True])
+@pytest.mark.parametrize('frame_id', ['', 'base_link'])
+def test_messages_are_corrected_one_by_one_as_they_are_together(calibration, effects, turned,
+                                                                frame_id):
+    calibration = with_effects(calibration, effects=effects, turned=turned)
+    rng = np.random.default_rng(3)
+    rewriters = {}
+    for _ in range(300):
+        data = random_message(rng)
+        layout = layout_of(data)
+        rewriter = rewriters.setdefault(layout, Rewriter(layout, calibration, 1.0,
+                                                         STANDARD_GRAVITY, frame_id))
+        found = rewriter(data, 31.0)
+        context = {**samples_of(joined([data], 37, 'imu')), 'temperature': np.array([31.0])}
+        expected = corrected(calibration, every(data), context)
+        np.testing.assert_allclose(every(found)[:, :28], expected[:, :28], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(every(found)[:, 28:], expected[:, 28:], rtol=1e-9, atol=1e-15)
+        name = frame_id or layout.frame_id
+        assert frame_ids(joined([found], 37, 'imu')) == [name]
+        assert (found[4:12], layout_of(found)) == (data[4:12], layout_with(name))
+        motion = motion_of(found, rewriter.layout, np.array([0.1, -0.2, 9.8]))
+        np.testing.assert_allclose(
+            doubles_at(joined([motion], 3, 'motion'), slice(0, 3)),
+            expected[:, imu.ACCELERATION] - [0.1, -0.2, 9.8], atol=1e-11)
+
+
+def test_readings_in_g_become_m_per_s2(calibration):
+    calibration = replace(calibration, units=units_of('g'))
+    data = random_message(np.random.default_rng(8), 'imu')
+    found = Rewriter(layout_of(data), calibration, STANDARD_GRAVITY, STANDARD_GRAVITY, '')(
+        data, np.nan)
+    force = calibration.correct(every(data)[:, imu.ACCELERATION]) * STANDARD_GRAVITY
+    np.testing.assert_allclose(every(found)[:, imu.ACCELERATION], force, rtol=1e-12)
+
+
+def test_each_message_is_corrected_at_its_own_temperature(calibration):
+    values = {**calibration.model.values, 'offset_temperature': np.array([1e-3, 2e-3, -1e-3])}
+    calibration = replace(calibration, model=Model(values), covariance=np.eye(
+        len(calibration.covariance) + 3) * 1e-8)
+    data = random_message(np.random.default_rng(7))
+    rewriter = Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, '')
+    for temperature in (20.0, 20.0, 35.0, 20.0):
+        expected = corrected(calibration, every(data), {'temperature': np.array([temperature])})
+        np.testing.assert_allclose(every(rewriter(data, temperature)), expected, rtol=1e-9)
+    with pytest.raises(InputError, match='temperature'):
+        rewriter(data, float('nan'))
+
+
+def test_no_force_beyond_100_g_comes_out(calibration):
+    data = bytearray(random_message(np.random.default_rng(9), 'imu'))
+    layout = layout_of(bytes(data))
+    rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, '')
+    place = layout.place(imu.ACCELERATION)
+    for reading in (1e3, -1e300):
+        struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
+        with pytest.raises(InputError, match='expected less than 100 g; check the calibration'):
+            rewriter(bytes(data), 20.0)
+    for reading in (np.nan, np.inf):
+        struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
+        assert rewriter(bytes(data), 20.0) is None
+
+
+def test_messages_together_are_what_each_is():
+    rng = np.random.default_rng(4)
+    raws = [random_message(rng) for _ in range(50)]
+    raws = [swapped(raw) if k % 3 == 0 else raw for k, raw in enumerate(raws)]
+    messages = joined(raws, 37, 'imu')
+    names, samples = frame_ids(messages), samples_of(messages)
+    assert [bytes(each) for each in messages.each()] == raws
+    for k, raw in enumerate(raws):
+        order = '>' if k % 3 == 0 else '<'
+        sec, nanosec, length = struct.unpack_from(f'{order}iII', raw, 4)
+        doubles = np.frombuffer(raw[-296:], f'{order}f8')
+        assert names[k] == raw[16:15 + length].decode()
+        assert samples['time'][k] == sec + nanosec * 1e-9
+        np.testing.assert_array_equal(samples['reading'][k], doubles[25:28])
+        rate = doubles[13:16]
+        absent = doubles[16] == -1.0 or not np.isfinite(rate).all()
+        np.testing.assert_array_equal(samples['rate'][k], np.full(3, np.nan) if absent else rate)
+
+
+def test_only_a_whole_little_endian_imu_has_a_layout():
+    data = random_message(np.random.default_rng(5))
+    assert layout_of(data) is not None
+    for other in (b'', data[:3], data[:15], data[:40], data[:-1], data + b'\0',
+                  swapped(data), b'\0\3' + data[2:], b'\0\7' + data[2:],
+                  data[:12] + struct.pack('<I', 0) + data[16:],
+                  data[:12] + struct.pack('<I', 2 ** 32 - 1) + data[16:]):
+        assert layout_of(other) is None

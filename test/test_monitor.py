@@ -1,0 +1,237 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rests of a calibrated sensor: lasting changes are reported, knocks and noise are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from accel_calib.calibrate import Calibration, fit_poses
+from accel_calib.capture import capture
+from accel_calib.files.recording import read_recording
+from accel_calib.model import Model, predict
+from accel_calib.monitor import compared, Drift, monitor, rests_of, status
+from accel_calib.monitor.change_detection import MEMORY
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import data, sensor
+
+LEAST = 0.001
+NOISE = 0.0003
+UP = np.array([0.0, 0.6, 0.8])
+
+
+def made(truth: Model, rng: np.random.Generator, *, poses: int = 12, noise: float = NOISE,
+         **columns: Any) -> Calibration:
+    table = simulate_poses(truth, spread_directions(poses), rng, noise_g=10.0 * noise, samples=100)
+    return fit_poses(table.with_columns(**columns), units_of('g'), model='10')
+
+
+def rested(before: Drift, calibration: Calibration, truth: Model, up: Any,
+           rng: np.random.Generator, *, shift: Any = 0.0, noise: float = NOISE,
+           temperature: float | None = None) -> Drift:
+    """Return the state after one rest in each attitude, the readings shifted [g]."""
+    mean = predict(truth, np.atleast_2d(np.asarray(up, float)), {}) + shift
+    mean = mean + noise * rng.normal(size=mean.shape)
+    context = {} if temperature is None else {'temperature': np.full(len(mean), temperature)}
+    for rest in rests_of(calibration, mean, np.full(mean.shape, noise), context):
+        before = compared(before, rest, LEAST)
+    return before
+
+
+@pytest.mark.parametrize('noise', [0.0001, 0.0003, 0.0005])
+@pytest.mark.parametrize('seed', range(5))
+def test_shift_of_5_mg_is_reported_at_the_third_rest(noise: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = sensor(rng)
+    calibration = made(truth, rng, noise=noise, poses=24)
+    state = rested(monitor(calibration), calibration, truth, [UP] * 4, rng, noise=noise)
+    state = rested(state, calibration, truth, [UP] * 2, rng, noise=noise, shift=0.005 * UP)
+    assert state.change is None
+    state = rested(state, calibration, truth, UP, rng, noise=noise, shift=0.005 * UP)
+    assert state.change is not None
+    assert state.change.error == pytest.approx(0.005, abs=4.0 * noise)
+    assert (state.since, state.lasted) == (5, 3)
+
+
+def test_noise_and_the_uncertainty_of_the_calibration_are_no_change() -> None:
+    rng = np.random.default_rng(1)
+    for directions in ([UP] * 800, random_directions(800, rng)):
+        truth = sensor(rng)
+        calibration = made(truth, rng)
+        state = rested(monitor(calibration), calibration, truth, directions, rng)
+        assert (state.change, state.count) == (None, 800)
+        assert len(state.rests) == MEMORY
+
+
+@pytest.mark.parametrize('knock', [-0.05, 0.004, 0.05, 0.2])
+def test_one_knock_is_no_change_nor_are_two(knock: float) -> None:
+    rng = np.random.default_rng(2)
+    truth = sensor(rng)
+    calibration = made(truth, rng)
+    state = monitor(calibration)
+    for count in (1, 2):
+        state = rested(state, calibration, truth, [UP] * 6, rng)
+        state = rested(state, calibration, truth, [UP] * count, rng, shift=knock * UP)
+        assert state.change is None
+    assert rested(state, calibration, truth, [UP] * 6, rng).change is None
+
+
+def test_what_poses_leave_open_is_no_change() -> None:
+    rng = np.random.default_rng(3)
+    truth = sensor(rng)
+    near_faces = np.vstack([np.eye(3), -np.eye(3)] * 3) + 0.04 * rng.normal(size=(18, 3))
+    near_faces /= np.linalg.norm(near_faces, axis=1, keepdims=True)
+    calibration = fit_poses(simulate_poses(truth, near_faces, rng, noise_g=0.01), units_of('g'),
+                            model='10')
+    between = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
+    state = rested(monitor(calibration), calibration, truth, between, rng)
+    assert state.stated > 0.003
+    off = (3.0 * state.stated - state.rests[0].error) * between
+    state = rested(monitor(calibration), calibration, truth, [between] * 50, rng, shift=off)
+    assert state.change is None
+    state = rested(monitor(calibration), calibration, truth, [between] * 50, rng, shift=4.0 * off)
+    assert state.change is not None
+
+
+def test_offset_and_gain_are_distinguished_where_the_attitudes_allow() -> None:
+    rng = np.random.default_rng(4)
+    truth = sensor(rng)
+    calibration = made(truth, rng, poses=36)
+    faces = np.vstack([np.eye(3), -np.eye(3)])
+    moved = np.array([0.004, -0.006, 0.005])
+    state = rested(monitor(calibration), calibration, truth, faces, rng, shift=moved)
+    assert state.change is not None
+    assert (state.change.kind, state.change.clear) == ('offset', True)
+    np.testing.assert_allclose(state.change.shift, moved, atol=0.0008)
+    assert 'the offset has changed by (+' in status(state)
+    state = rested(monitor(calibration), calibration, truth, 1.006 * faces, rng)
+    assert state.change is not None
+    assert (state.change.kind, state.change.clear) == ('gain', True)
+    assert 'the gain has changed by +0.6' in status(state)
+    state = rested(monitor(calibration), calibration, truth, [UP] * 5, rng, shift=0.005 * UP)
+    assert state.change is not None
+    assert not state.change.clear
+    assert 'has changed by' not in status(state)
+
+
+def test_change_stays_until_rests_are_clearly_without_it() -> None:
+    rng = np.random.default_rng(5)
+    truth = sensor(rng)
+    calibration = made(truth, rng)
+    z = np.array([0.0, 0.0, 1.0])
+    state = rested(monitor(calibration), calibration, truth, [z] * 3, rng, shift=0.005 * z)
+    aside = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]] * 20
+    state = rested(state, calibration, truth, aside, rng, shift=0.005 * z)
+    assert state.change is not None
+    assert state.lasted == 43
+    state = rested(state, calibration, truth, [z], rng)
+    assert state.change is not None
+    state = rested(state, calibration, truth, [z] * 5, rng)
+    assert (state.change, state.since, state.lasted) == (None, 0, 0)
+
+
+def test_sensor_that_repeats_worse_than_stated_is_not_taken_for_a_changed_one() -> None:
+    rng = np.random.default_rng(6)
+    truth = sensor(rng)
+    calibration = made(truth, rng, noise=0.0001)
+    state = monitor(calibration)
+    reading = predict(truth, random_directions(1500, rng), {})
+    reading = reading + 0.0003 * rng.normal(size=reading.shape)
+    for rest in rests_of(calibration, reading, np.full(reading.shape, 0.0001), {}):
+        state = compared(state, rest, LEAST)
+        assert state.change is None
+    assert state.scatter == pytest.approx(2.5, rel=0.5)
+
+
+def test_poses_that_repeat_badly_widen_what_is_stated() -> None:
+    rng = np.random.default_rng(7)
+    truth = sensor(rng)
+    table = simulate_poses(truth, spread_directions(36), rng, noise_g=0.001)
+    table = table.with_columns(reading=table.reading + 0.001 * rng.normal(size=(36, 3)))
+    calibration = fit_poses(table, units_of('g'), model='10')
+    state = monitor(calibration)
+    assert np.sqrt(state.repeats) == pytest.approx(0.001, rel=0.3)
+    assert rested(state, calibration, truth, UP, rng, noise=0.0001).stated > 0.0009
+
+
+def test_changes_too_small_to_matter_are_ignored() -> None:
+    rng = np.random.default_rng(8)
+    truth = sensor(rng)
+    calibration = made(truth, rng, poses=60, noise=0.0001)
+    shift = 0.0008 * UP
+    state = rested(monitor(calibration), calibration, truth, [UP] * 20, rng, shift=shift,
+                   noise=0.0001)
+    assert state.change is None
+    state = rested(state, calibration, truth, [UP] * 20, rng, shift=2.0 * shift, noise=0.0001)
+    assert state.change is not None
+
+
+@pytest.mark.parametrize(('temperature', 'words'), [
+    (38.2, 'the temperature is 38.2 °C, it was 24.0 to 25.3 °C when calibrated: capture poses at '
+           'this temperature and call ~/refine'),
+    (26.0, 'call ~/reset, capture poses and call ~/fit'),
+    (None, 'call ~/reset, capture poses and call ~/fit')])
+def test_advice_names_the_temperature_where_it_changed(
+        temperature: float | None, words: str) -> None:
+    rng = np.random.default_rng(9)
+    truth = sensor(rng)
+    calibration = made(truth, rng, temperature=np.linspace(24.0, 25.3, 12))
+    state = rested(monitor(calibration), calibration, truth, [UP] * 4, rng,
+                   temperature=temperature)
+    assert 'mg stated' in status(state)
+    state = rested(state, calibration, truth, [UP] * 3, rng, shift=-0.005 * UP,
+                   temperature=temperature)
+    assert status(state).startswith('|a| at rest is -')
+    assert 'for 3 rests' in status(state)
+    assert status(state).endswith(words)
+
+
+def test_calibration_without_uncertainty_is_not_judged() -> None:
+    rng = np.random.default_rng(10)
+    truth = sensor(rng)
+    calibration = made(truth, rng)
+    calibration = replace(calibration, covariance=np.nan * calibration.covariance)
+    state = rested(monitor(calibration), calibration, truth, [UP] * 5, rng, shift=0.02 * UP)
+    assert state.change is None
+    assert 'states no uncertainty' in status(state)
+    assert status(monitor(calibration)) == 'no rest since the calibration yet'
+
+
+def test_readings_in_counts_are_monitored_like_others() -> None:
+    rng = np.random.default_rng(11)
+    truth = sensor(rng)
+    table = simulate_poses(truth, spread_directions(24), rng, noise_g=0.003)
+    counts = table.with_columns(reading=table.reading * 16384.0, std=table['std'] * 16384.0)
+    calibration = fit_poses(counts, units_of('native'), model='10')
+    state = monitor(calibration)
+    mean = predict(truth, np.array([UP] * 3), {}) + 0.005 * UP + NOISE * rng.normal(size=(3, 3))
+    for rest in rests_of(calibration, mean * 16384.0, np.full((3, 3), NOISE * 16384.0), {}):
+        state = compared(state, rest, LEAST)
+    assert state.change is not None
+    assert state.change.error == pytest.approx(0.005, abs=0.001)
+
+
+@pytest.mark.parametrize(('name', 'unit'), [
+    ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
+def test_real_rests_are_no_change_until_they_are_shifted(name: str, unit: Any) -> None:
+    units = units_of(unit)
+    poses = capture(read_recording(data(f'{name}.csv')), units).poses
+    others = np.arange(0, len(poses), 2)
+    calibration = fit_poses(poses.take(others), units, model='10')
+    rests = poses.take(np.delete(np.arange(len(poses)), others))
+    force = calibration.correct(rests.reading)
+    shift = calibration.predict(1.005 * force) - calibration.predict(force)
+    state = monitor(calibration)
+    for rest in rests_of(calibration, rests.reading, rests.noise, {}):
+        state = compared(state, rest, LEAST)
+        assert state.change is None
+    for rest in rests_of(calibration, (rests.reading + shift)[:3], rests.noise[:3], {}):
+        state = compared(state, rest, LEAST)
+    assert state.change is not None
+    assert state.lasted == 3

@@ -1,0 +1,367 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The calibrator without ROS: whose files, which messages, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
+from accel_calib.files import read_calibration, read_poses, write_calibration, write_table
+from accel_calib.model import Model
+from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from accel_calib.session.store import Identity, load, Lock, Store, store_of, StoreInUseError
+from accel_calib.sphere import rotation_from_rpy, spread_directions
+import numpy as np
+import pytest
+
+GRAVITY = 9.80665
+RATE = 50.0
+
+Readings = Callable[..., Any]
+Stored = Callable[..., Path]
+
+
+class Driver:
+    """A session with its jobs done at once, a clock of its own, and the log kept."""
+
+    def __init__(self, topic: str = '/imu/data_raw', **parameters: Any) -> None:
+        self.now = 0.0
+        self.stamp = 1000.0
+        self.log: list[Log] = []
+        self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
+        self.handle()
+
+    def handle(self) -> None:
+        for event in self.session.events():
+            if isinstance(event, Job):
+                words = self.done(event)
+                self.log += [Log('info', words)] if words else []
+            elif isinstance(event, Log):
+                self.log.append(event)
+
+    def done(self, job: Job | str) -> str:
+        """Return the answer of a command."""
+        if isinstance(job, Job):
+            job = job.finish(job.run(lambda function, *given: function(*given)))
+        if self.session is not None:
+            self.handle()
+        return job
+
+    def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
+        """Push readings in m/s², and return how many messages were accepted."""
+        accepted = 0
+        for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
+            self.now += len(block) / RATE
+            if self.session.accepts(frame_id):
+                rows = np.full((len(block), 9), np.nan)
+                rows[:, 0] = self.stamp + np.arange(len(block)) / RATE
+                rows[:, 1:4], rows[:, 7] = block, temperature
+                self.session.push(rows, self.now)
+                accepted += len(block)
+            self.stamp += len(block) / RATE
+            self.handle()
+        return accepted
+
+    def said(self, severity: str = 'error') -> str:
+        return '\n'.join(line.words for line in self.log if line.severity == severity)
+
+    def finding(self, name: str) -> Any:
+        return next(each for each in findings(self.session.health()) if each.name == name)
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    return tmp_path / 'home' / 'accel_calib'
+
+
+@pytest.mark.parametrize(('one', 'other'), [
+    (Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw')),
+    (Identity('left/imu', '/imu'), Identity('left_imu', '/imu')),
+    (Identity('/imu_link', '/imu'), Identity('imu link', '/imu')),
+    (Identity('übung', '/imu'), Identity('ßbung', '/imu')),
+    (Identity('', '/imu'), Identity('imu', '/imu')),
+    (Identity('left/imu', '/imu', True), Identity('left_imu', '/imu', True)),
+    (Identity('x' * 300, '/imu', True), Identity('x' * 301, '/imu', True)),
+    (Identity('a', '/imu'), Identity('imu@a', '/imu', True))])
+def test_each_sensor_has_files_of_its_own(one: Identity, other: Identity) -> None:
+    assert one.file_name != other.file_name
+    for name in (one.file_name, other.file_name):
+        assert name == Path(name).name
+        assert len(name) < 200
+        assert not name.startswith('.')
+
+
+def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    left = Identity('imu_link', '/left/imu/data_raw')
+    assert left.file_name == 'left.imu.data_raw@imu_link.yaml'
+    named = Identity('arm.v2', '/imu', True)
+    assert store_of('', named, 'm/s2').calibration == home / 'arm.v2.yaml'
+    assert store_of('', named, 'm/s2').poses == home / 'arm.v2_poses.csv'
+    monkeypatch.delenv('ROS_HOME')
+    monkeypatch.setenv('HOME', '/me')
+    assert store_of('', named, 'm/s2').calibration == Path('/me/.ros/accel_calib/arm.v2.yaml')
+    assert store_of('~/x.yaml', named, 'm/s2').calibration == Path('/me/x.yaml')
+
+
+def test_files_of_version_1_are_taken_over_once(home: Path, readings: Readings, stored: Stored
+                                                ) -> None:
+    home.mkdir(parents=True)
+    stored(sensor='imu_link').rename(home / 'imu_link.yaml')
+    (home / 'imu_link_poses.csv').write_text('ax,ay,az\n0.1,0.2,9.8\n')
+    left, right = Driver('/left/imu'), Driver('/right/imu')
+    for driver in (left, right):
+        driver.feed(readings([[0, 0, 1]])[:10])
+    assert left.session.active.calibration is not None
+    assert len(left.session.live.book.poses()) == 1
+    assert 'imu_link.yaml is now' in left.said()
+    assert right.session.active.calibration is None
+    assert len(right.session.live.book.poses()) == 0
+    assert {path.name for path in home.iterdir()} == {
+        'left.imu@imu_link.yaml', 'left.imu@imu_link_poses.csv', 'left.imu@imu_link.lock',
+        'right.imu@imu_link.lock'}
+
+
+def test_files_of_version_1_of_another_sensor_stay(home: Path, readings: Readings, stored: Stored
+                                                   ) -> None:
+    home.mkdir(parents=True)
+    stored(sensor='left/imu').rename(home / 'left_imu.yaml')
+    driver = Driver()
+    driver.feed(readings([[0, 0, 1]])[:10], 'left_imu')
+    assert driver.session.active.calibration is None
+    assert (home / 'left_imu.yaml').exists()
+
+
+def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
+        home: Path, readings: Readings) -> None:
+    turned = readings(spread_directions(12))
+    one, other = Driver(sensor='left/imu'), Driver(sensor='left_imu')
+    one.feed(turned)
+    assert one.done(one.session.fit())
+    other.feed(turned[:10])
+    assert other.session.active.calibration is None
+    assert len(other.session.live.book.poses()) == 0
+    found = read_calibration(next(home.glob('left_imu-*.yaml')))
+    assert (found.sensor, found.stream) == ('left/imu', '/imu/data_raw')
+    poses = read_poses(next(home.glob('left_imu-*_poses.csv')))
+    assert (poses.sensor, poses.units) == ('left/imu', 'm/s2')
+
+
+def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
+        stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    before = path.read_bytes()
+    first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
+    for driver in (first, second):
+        driver.feed(readings(spread_directions(12)))
+    assert first.session.publishes
+    assert not second.session.publishes
+    assert second.finding('calibration').level == Level.ERROR
+    assert 'is in use by the node of process' in second.finding('calibration').words
+    for command in (second.session.fit, second.session.save, second.session.load):
+        with pytest.raises(AccelCalibError, match='in use by the node of process'):
+            command()
+    assert path.read_bytes() == before
+    assert len(read_poses(path.with_name('known_poses.csv'))) == 12
+    first.session.close()
+    second.session.tick()
+    second.handle()
+    assert second.session.publishes
+    assert second.session.active.calibration is not None
+    assert second.finding('calibration').level == Level.OK
+
+
+def test_lock_ends_with_its_release(tmp_path: Path) -> None:
+    store = Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
+    lock = Lock(store)
+    with pytest.raises(StoreInUseError):
+        Lock(store)
+    lock.release()
+    Lock(store).release()
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda text: text.replace('sensor: imu_link', 'sensor: 2001-99-99'),
+    lambda text: text[:len(text) // 2],
+    lambda text: text.replace('axis_gain:', 'axis_gain: -1 #'),
+    lambda text: text.replace('covariance:', 'covariances:')])
+def test_damaged_calibration_is_set_aside_and_the_poses_are_used(
+        spoil: Callable[[str], str], stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    driver = Driver(calibration_file=str(path))
+    driver.feed(readings(spread_directions(12)))
+    driver.session.close()
+    text = spoil(path.read_text())
+    path.write_text(text)
+    again = Driver(calibration_file=str(path))
+    again.feed(readings([[0, 0, 1]])[:10])
+    assert again.session.active.calibration is None
+    assert 'known.yaml.damaged1' in again.finding('calibration').words
+    assert path.with_name('known.yaml.damaged1').read_text() == text
+    assert len(again.session.live.book.poses()) == 12
+    assert again.done(again.session.fit())
+    assert again.finding('calibration').level == Level.OK
+
+
+def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored: Stored,
+                                                         readings: Readings) -> None:
+    other = stored('use.yaml', sensor='another').read_text()
+    table = 'ax,ay,az\n1,2,words\n'
+    (tmp_path / 'use_poses.csv').write_text(table)
+    driver = Driver(calibration_file=str(tmp_path / 'use.yaml'))
+    driver.feed(readings(spread_directions(12)))
+    assert "sensor 'another'" in driver.finding('calibration').words
+    assert (tmp_path / 'use.yaml').read_text() == other
+    assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
+    assert driver.done(driver.session.fit())
+    assert (tmp_path / 'use.yaml.other1').read_text() == other
+    assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
+    assert len(read_poses(tmp_path / 'use_poses.csv')) == 12
+
+
+@pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
+def test_poses_of_another_sensor_or_unit_are_set_aside(tmp_path: Path, changes: Any) -> None:
+    store = Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
+    store.save_poses(read_poses(_table(tmp_path / 'poses.csv')))
+    assert len(load(store).poses) == 1
+    write_table(store.poses, replace(load(store).poses, **changes))
+    loaded = load(store)
+    assert loaded.poses is None
+    assert 'arm_poses.csv.damaged1' in loaded.notes[0]
+
+
+def _table(path: Path) -> Path:
+    path.write_text('ax,ay,az\n0.1,0.2,9.8\n')
+    return path
+
+
+def test_nothing_stored_is_no_problem(tmp_path: Path) -> None:
+    loaded = load(Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2'))
+    assert (loaded.calibration, loaded.poses, loaded.problem, loaded.notes) == (None, None, '', ())
+
+
+def test_calibration_in_another_unit_is_refused(stored: Stored) -> None:
+    store = Store(stored(unit='g'), Identity('', '/imu'), 'm/s2')
+    with pytest.raises(StoredCalibrationError, match='for readings in g'):
+        store.load_calibration()
+
+
+def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
+    driver = Driver()
+    rest = readings([[0, 0, 1]], dwell=6.0)
+    driver.feed(rest[:100])
+    assert driver.session.live.detector.still
+    assert driver.feed(rest[:1], 'another') == 0
+    assert not driver.session.live.detector.still
+    assert "frame_id 'another', those before it 'imu_link'" in driver.said()
+    assert driver.feed(rest[100:]) == len(rest) - 100
+    assert driver.session.statistics.foreign == 1
+    assert '1 messages were of another sensor' in driver.finding('values').words
+
+
+def test_silent_sensor_may_be_replaced_by_another_with_its_own_files(
+        home: Path, readings: Readings) -> None:
+    driver = Driver()
+    turned = readings(spread_directions(12))
+    driver.feed(turned)
+    assert driver.done(driver.session.fit())
+    driver.now += 3.0
+    assert driver.feed(turned[:50], 'another') == 50
+    assert driver.session.sensor == 'another'
+    assert driver.session.active.calibration is None
+    assert len(driver.session.live.book.poses()) < 2
+    assert "now have frame_id 'another'" in driver.said('warning')
+    driver.now += 3.0
+    driver.feed(turned[:50])
+    assert driver.session.active.calibration is not None
+    assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
+
+
+def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, readings: Readings
+                                                            ) -> None:
+    driver = Driver(calibration_file=str(stored()))
+    rest = readings([[0, 0, 1]], dwell=6.0)
+    for name in ('capture_pose', 'set_level'):
+        with pytest.raises(AccelCalibError, match='no Imu message has come'):
+            getattr(driver.session, name)()
+    driver.feed(rest[:150])
+    driver.now += 6.0
+    for name in ('capture_pose', 'set_level'):
+        with pytest.raises(AccelCalibError, match=r'came 6\.0 s ago, expected one in the last'):
+            getattr(driver.session, name)()
+    driver.feed(rest[150:160])
+    assert driver.done(driver.session.capture_pose()).startswith('1 pose:')
+    assert 'flat now' in driver.done(driver.session.set_level())
+
+
+def test_the_heading_is_found_with_the_nose_down_and_kept(
+        stored: Stored, readings: Readings) -> None:
+    path = stored()
+    found = read_calibration(path)
+    write_calibration(path, replace(found, model=Model(found.model.values)))
+    driver = Driver(calibration_file=str(path))
+    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 60.0)))
+    flat, nose_down = mounting @ [0.0, 0.0, 1.0], mounting @ [-0.6, 0.0, 0.8]
+    driver.feed(readings([nose_down], dwell=6.0)[:200])
+    with pytest.raises(InputError, match=r'not levelled; .*~/set_level first'):
+        driver.session.set_heading()
+
+    def yaw() -> float:
+        x = driver.session.active.calibration.rotation[:, 0]  # type: ignore[union-attr]
+        return float(np.degrees(np.arccos(x @ mounting[:, 0])))
+
+    driver.feed(readings([flat], dwell=6.0)[:200])
+    driver.done(driver.session.set_level())
+    assert yaw() > 50.0
+    with pytest.raises(InputError, match=r'within 10° of the flat one'):
+        driver.session.set_heading()
+    driver.feed(readings([nose_down], dwell=6.0)[:200])
+    assert 'the nose is down' in driver.done(driver.session.set_heading())
+    assert yaw() < 1.0
+    driver.feed(readings([flat], dwell=6.0)[:200])
+    driver.done(driver.session.set_level())
+    assert yaw() < 1.0
+
+
+def test_effects_are_held_at_the_edge_of_what_was_seen_and_warned_of(
+        stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    found = read_calibration(path)
+    values = {**found.model.values, 'offset_temperature': np.array([1e-3, 0.0, 0.0])}
+    poses = found.poses.with_columns(temperature=np.linspace(20.0, 30.0, len(found.poses)))
+    size = len(found.covariance)
+    covariance = np.zeros((size + 3, size + 3))
+    covariance[:size, :size] = found.covariance
+    covariance[size:, size:] = 1e-12 * np.eye(3)
+    write_calibration(path, replace(found, model=Model(values), poses=poses,
+                                    covariance=covariance))
+    driver = Driver(calibration_file=str(path))
+    for temperature, level in ((25.0, Level.OK), (40.0, Level.WARN)):
+        driver.session.set_temperature(temperature)
+        driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
+        assert driver.finding('calibration').level == level
+    assert 'temperature is 40, the calibration has seen 20 to 30' in driver.finding(
+        'calibration').words
+    calibration = read_calibration(path)
+    at = [calibration.apply([0.0, 0.0, GRAVITY], temperature=each) for each in (30.0, 40.0, 25.0)]
+    np.testing.assert_array_equal(at[0], at[1])
+    assert abs(at[0][0] - at[2][0]) == pytest.approx(5e-3 * GRAVITY, rel=0.05)
+
+
+def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
+        home: Path, readings: Readings) -> None:
+    rng = np.random.default_rng(2)
+    cone = np.array([0.0, 0.0, 1.0]) + 0.35 * rng.normal(size=(14, 3))
+    cone /= np.linalg.norm(cone, axis=1, keepdims=True)
+    driver = Driver(repeated='keep')
+    driver.feed(readings(cone))
+    with pytest.raises(AccelCalibError) as refusal:
+        driver.done(driver.session.refine())
+    assert '\n' not in str(refusal.value)
+    assert driver.session.active.calibration is None
+    assert not list(home.glob('*.yaml'))
