@@ -58,6 +58,8 @@ class Candidate:
         What it adds to the equations outside the model, orthonormal.
     size : float
         Largest of its values if it is added, over the typical size.
+    visible : float
+        Change of the residuals at most that it makes in its typical size, over their noise.
     searched : int
         Values of its shape that were found from the same data.
     tried : float
@@ -69,6 +71,7 @@ class Candidate:
     shape: Floats
     columns: Floats
     size: float
+    visible: float
     searched: int = 0
     tried: float = 1.0
 
@@ -131,7 +134,8 @@ def _best_shape(name: str, equations: Equations, fitted: Projected, context: Con
     left = seen - fitted.onto @ (fitted.onto.T @ seen)
     values = np.linalg.lstsq(left, fitted.residual, rcond=1e-7)[0]
     size = float(np.max(np.abs(values))) / effect.typical
-    return Candidate(name, shape, columns, size, int(len(shapes) > 1),
+    visible = float(np.linalg.norm(left, 2)) * effect.typical
+    return Candidate(name, shape, columns, size, visible, int(len(shapes) > 1),
                      1.0 if len(shapes) == 1 else len(shapes) / 3.0)
 
 

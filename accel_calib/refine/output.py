@@ -46,6 +46,9 @@ _LEAST_KEPT = 6
 _CLEARLY = 10.0
 """Decrease of the criterion for poses at the limit to be left out."""
 
+_LEAST_OF_GRID = 0.25
+"""Least variance of the residuals of readings on a grid, over that of the grid."""
+
 _COARSE = 1.0
 """Least q/√12 over the noise of a pose mean for a grid to matter."""
 
@@ -156,4 +159,12 @@ def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
     step = grid_step(poses_g)
     if step is None or beginning(poses_g, base).is_down_to_noise:
         return poses_g, None
-    return with_grid(poses_g, step), step
+    on_grid = with_grid(poses_g, step)
+    if poses_g.noise is None and not _all_of_it(beginning(on_grid, base)):
+        return poses_g, None  # the digits of the file, perhaps: the noise is another one
+    return on_grid, step
+
+
+def _all_of_it(state: State) -> bool:
+    """Return whether the noise of the grid is what the residuals show, no less and no more."""
+    return state.is_noise and state.fitted.rss > _LEAST_OF_GRID * state.dof

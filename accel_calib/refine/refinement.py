@@ -144,7 +144,7 @@ def _told(calibration: Calibration, found: Found, given: _Given, sensor: str, da
         verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
         tuple(each.row for each in rejected), untestable,
         advice_for(verdict, found, steps, untestable, len(rejected)), refined, refusal,
-        found.final.poses_g, found.final.fit.equations.force, _stages(states, found))
+        found.final.poses_g, found.final.fit.equations.force, _stages(states, steps))
 
 
 def _as_stored(calibration: Calibration, found: Found) -> State:
@@ -270,10 +270,12 @@ def _untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], .
     return tuple(not_testable(final.poses_g, testable, (*final.model.effects, *rivals)))
 
 
-def _stages(states: Sequence[State], found: Found) -> tuple[Stage, ...]:
-    names = ('base', *(name.removesuffix('_change') for name in found.added))
+def _stages(states: Sequence[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
+    """Return the residuals of the base and after each step; limit and grid leave those kept."""
+    of_output = len(steps) + 1 - len(states)
     stages = []
-    for name, state in zip(names, states, strict=False):
+    for name, state in zip(('base', *(step.effect for step in steps)),
+                           (*states[:1] * of_output, *states), strict=True):
         residual = state.fit.residual
         if name == WANDER and state.wander is not None:
             residual = state.wander.residual

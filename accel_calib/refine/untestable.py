@@ -13,6 +13,10 @@ from ..estimate.equations import kinds
 from ..table import COLUMNS, Poses
 
 
+_LEAST_VISIBLE = 0.1
+"""Change of the residuals by an effect of typical size, over their noise, that poses can show."""
+
+
 def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tuple[str, ...]
                  ) -> list[tuple[str, str]]:
     """
@@ -23,7 +27,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
     poses_g : Poses
         In g.
     testable : mapping of str to Candidate
-        Effects that they can show.
+        Effects that they distinguish from the model.
     present : tuple of str
         Effects of the model, and their rivals.
 
@@ -31,7 +35,9 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
     missing = []
     known = kinds(poses_g)[0]
     for name, effect in {**EFFECTS, **PROCESSES}.items():
-        if name in testable or name in present or effect.output is not None:
+        if name in present or effect.output is not None:
+            continue
+        if name in testable and (effect.needs or testable[name].visible > _LEAST_VISIBLE):
             continue
         if name in ('gain', 'axis_gain') and {'gain', 'axis_gain'} & set(present):
             continue

@@ -1,0 +1,218 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A refinement is stored only if the poses determine it, and a stored base is used as stored."""
+
+import json
+
+from accel_calib.calibrate import fit_poses, verify
+from accel_calib.cli.main import main
+from accel_calib.model import Model
+from accel_calib.refine import refine
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+G = units_of('g')
+TCO = {'offset_temperature': np.array([6e-4, -4e-4, 5e-4])}
+
+
+def with_effects(rng, **effects):
+    return model_with({**sensor(rng).values, **effects})
+
+
+def poses_of(model, rng, directions, **context):
+    return simulate_poses(model, directions, rng, context=context)
+
+
+def error_mg(calibration, model, rng, context):
+    """Return the RMS error of |a| on fresh directions."""
+    poses = poses_of(model, rng, random_directions(200, rng), **context)
+    return verify(calibration, poses).rms_after_mg
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed):
+    rng = np.random.default_rng(seed)
+    time = np.arange(30) * 7.0
+    warm = 30.0 + 12.0 * np.sin(time / 60.0)
+    model = with_effects(rng, **TCO)
+    poses = poses_of(model, rng, random_directions(30, rng), temperature=warm, time=time)
+    poses = Poses({key: part for key, part in poses.columns.items() if key != 'temperature'},
+                  poses.row)
+    found = refine(poses, G)
+    if not found.refusal:
+        at_the_middle = model.linear_part[1] + 5.0 * TCO['offset_temperature']
+        np.testing.assert_allclose(found.calibration.offset, at_the_middle, atol=0.02)
+        assert found.remaining_gap_mg > 0.01
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_an_effect_that_the_catalogue_lacks_leaves_a_sound_calibration(seed):
+    rng = np.random.default_rng(seed)
+    warm = rng.uniform(0.0, 50.0, 200)
+    model = with_effects(rng)
+    poses = poses_of(model, rng, random_directions(200, rng), temperature=warm,
+                     time=np.arange(200) * 20.0)
+    curve = ((warm - 25.0) / 25.0)[:, np.newaxis] ** 2 * rng.normal(size=3) * 0.006
+    found = refine(poses.with_columns(reading=poses.reading + curve), G)
+    assert not found.refusal
+    np.testing.assert_allclose(found.calibration.offset, model.linear_part[1], atol=0.02)
+
+
+def test_a_refinement_warns_of_what_a_fit_warns_of(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    near = random_directions(400, rng)
+    near = near[near[:, 2] > np.cos(np.radians(62.0))][:30]
+    poses = poses_of(with_effects(rng, **TCO), rng, near, temperature=rng.uniform(15, 35, 30))
+    expected = [words for words in fit_poses(poses, G).warnings if 'do not determine' in words]
+    found = refine(poses, G)
+    assert expected
+    assert set(expected) <= set(found.calibration.warnings)
+
+
+def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsys):
+    recording, stored = tmp_path / 'recording.csv', tmp_path / 'calibration.yaml'
+    assert main(['simulate', '-o', str(recording), '--recording', '--poses', '1', '--dwell',
+                 '600', '--temperature', '20', '40', '--rate', '50', '--effect', 'offset=0.02',
+                 '--effect', 'offset_temperature=6e-4,-4e-4,5e-4']) == 0
+    capsys.readouterr()
+    assert main(['refine', str(recording), '--max-dwell', '20', '-o', str(stored),
+                 '--json', '-']) == 2
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert {'offset_temperature', 'offset_drift'} & {
+        name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
+    assert 'do not determine' in result['refusal']
+    assert 'is not written' in printed.err.splitlines()[-1]
+    assert not stored.exists()
+
+
+@pytest.mark.parametrize('arguments', [[], ['--base', 'ideal'], ['--base', '4']])
+def test_six_faces_say_what_they_cannot_show(arguments, tmp_path, capsys):
+    table, page = tmp_path / 'faces.csv', tmp_path / 'page.html'
+    faces = np.vstack([np.eye(3), -np.eye(3)]) * 9.81 + [0.1, 0.2, -0.1]
+    faces += np.random.default_rng(3).normal(size=(6, 3)) * 0.003
+    table.write_text('ax,ay,az\n' + '\n'.join(','.join(f'{part:.3f}' for part in row)
+                                              for row in faces))
+    assert main(['refine', str(table), '--json', '-', '--report', str(page), *arguments]) == 0
+    result = json.loads(capsys.readouterr().out)
+    named = {name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
+    assert named <= {'offset', 'gain', 'axis_gain'}
+    assert 'cross_axis' in [entry['effect'] for entry in result['not_testable']]
+    assert any('6 poses leave' in line for line in result['advice'])
+    assert result['remaining_gap_mg'] < 2.0
+    assert page.exists()
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_effects_that_look_alike_end_in_a_result(seed):
+    rng = np.random.default_rng(seed)
+    time = np.arange(60) * 60.0
+    warm = 20.0 + 15.0 * (1.0 - np.exp(-time / 1500.0))
+    model = with_effects(rng, offset_drift=np.r_[rng.normal(size=3) * 0.01, 0.0],
+                         offset_temperature=rng.normal(size=3) * 8e-4,
+                         warm_up=np.r_[rng.normal(size=3) * 0.013, 0.0, 900.0])
+    found = refine(poses_of(model, rng, random_directions(60, rng), temperature=warm, time=time),
+                   G)
+    assert found.steps
+    assert found.remaining_gap_mg < 0.2 * found.gap_mg
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_dead_zone_ends_in_a_result(seed):
+    rng = np.random.default_rng(seed)
+    force, model = random_directions(60, rng), with_effects(rng)
+    felt = np.sign(force) * np.maximum(np.abs(force) - 0.05, 0.0)
+    poses = poses_of(model, rng, force)
+    found = refine(poses.with_columns(
+        reading=poses.reading + (felt - force) @ model.linear_part[0].T), G)
+    assert found.verdict == 'unexplained'
+    np.testing.assert_allclose(found.calibration.offset, model.linear_part[1], atol=0.02)
+
+
+@pytest.mark.parametrize(('poses', 'repeats'), [(24, 5), (12, 5)])
+def test_rows_of_one_orientation_in_a_row_show_no_hysteresis(poses, repeats):
+    for seed in range(8):
+        rng = np.random.default_rng((seed, poses))
+        directions = np.repeat(random_directions(poses, rng), repeats, axis=0)
+        found = refine(poses_of(with_effects(rng), rng, directions,
+                                time=np.arange(len(directions)) * 10.0), G)
+        assert found.verdict == 'no_gap'
+
+
+def test_of_rivals_a_plausible_one_is_named():
+    rng = np.random.default_rng(4)
+    time = np.arange(24) * 4.0
+    model = with_effects(rng, **TCO)
+    found = refine(poses_of(model, rng, random_directions(24, rng), time=time,
+                            temperature=25.0 + 3.0 * time / time[-1]), G)
+    assert 'offset_drift' not in [step.effect for step in found.steps]
+
+
+@pytest.fixture(scope='module')
+def stored():
+    """Return a sensor and its calibration from 14 poses at about 20 °C."""
+    rng = np.random.default_rng(21)
+    model = with_effects(rng)
+    poses = poses_of(model, rng, random_directions(14, rng), temperature=rng.uniform(18, 22, 14))
+    return model, fit_poses(poses, G, date='2026-11-02T00:00:00')
+
+
+def test_the_gap_of_a_stored_calibration_is_that_of_the_file(stored):
+    model, base = stored
+    rng = np.random.default_rng(22)
+    for truth in (model, with_effects(rng)):
+        new = poses_of(truth, rng, random_directions(16, rng), temperature=np.full(16, 20.0))
+        found = refine(new, G, base=base)
+        assert found.gap_mg == pytest.approx(verify(base, new).rms_after_mg)
+        assert (found.verdict == 'no_gap') is (truth is model)
+
+
+def test_a_changed_offset_is_named_with_its_size_and_date(stored):
+    model, base = stored
+    rng = np.random.default_rng(23)
+    moved = np.array([0.0121, -0.0030, 0.0004])
+    truth = Model({**model.values, 'offset': model.values['offset'] + moved})
+    found = refine(poses_of(truth, rng, random_directions(16, rng),
+                            temperature=np.full(16, 20.0)), G, base=base)
+    assert [step.effect for step in found.steps] == ['offset']
+    assert 'has changed by (+1' in found.steps[0].where
+    assert 'mg since 2026-11-02' in found.steps[0].where
+    np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in 'xyz'], moved,
+                               atol=1e-3)
+    np.testing.assert_allclose(found.calibration.offset, truth.linear_part[1], atol=1e-3)
+
+
+def test_hot_poses_beside_a_cold_calibration_name_the_temperature(stored):
+    model, base = stored
+    rng = np.random.default_rng(24)
+    truth = Model({**model.values, 'offset': model.values['offset'] - 20.0
+                   * TCO['offset_temperature'], **TCO})
+    hot = rng.uniform(48.0, 52.0, 16)
+    truth = model_with({**truth.values})
+    reading = poses_of(truth, rng, random_directions(16, rng), temperature=hot)
+    shift = predicted_at_20(truth) - model.linear_part[1]
+    found = refine(reading.with_columns(reading=reading.reading - shift), G, base=base)
+    assert [step.effect for step in found.steps] == ['offset_temperature']
+    np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in 'xyz'],
+                               TCO['offset_temperature'], atol=5e-5)
+    assert found.gap_mg > 5.0
+
+
+def predicted_at_20(model):
+    """Return the offset of a sensor at 20 °C."""
+    return model.at({'temperature': np.array([20.0])}).reading(np.zeros((1, 3)))[0]
+
+
+def test_another_sensor_is_named_as_such(stored):
+    _, base = stored
+    rng = np.random.default_rng(25)
+    other = with_effects(rng, offset=np.array([0.08, -0.06, 0.05]))
+    found = refine(poses_of(other, rng, random_directions(20, rng),
+                            temperature=np.full(20, 20.0)), G, base=base)
+    assert found.advice[0].startswith('this is probably another sensor')
