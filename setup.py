@@ -39,7 +39,7 @@ setup(
         ],
         # Figures: accel-calib report, and refine --report.
         'report': ['matplotlib>=3.6'],
-        'test': ['matplotlib>=3.6', 'pytest', 'setuptools'],
+        'test': ['matplotlib>=3.6', 'pandas', 'pytest', 'setuptools'],
         'dev': [
             'flake8',
             'flake8-builtins',

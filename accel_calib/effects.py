@@ -2,18 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The catalogue of effects: what each adds to the reading, and all else that is known of it.
+The catalogue of effects: what each effect adds to the reading, and its properties.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
-all read it there, so an effect that is added here works in each of them. Its reading is a sum of
-terms
+read it from there, so an effect that is added here works in all of them. Its contribution to the
+reading is a sum of terms
 
     added to axis i = Σ k_p · factor(context) · weight · monomial(u)
 
-over the parameters k_p, with u the specific force in the sensor axes. The factor depends on the
-context alone and the monomial on the force alone: with the context fixed, a term of monomial 1
-belongs to the offset V, one of u_j to the gain W, and only the others bend with the force.
-Constants in which an effect is not linear, such as a time constant, are its shape.
+over the parameters k_p, with u the specific force in the sensor axes. The factor depends only on
+the context, and the monomial only on the force. With the context fixed, a term with monomial 1
+belongs to the offset V and a term with monomial u_j to the gain W. The other terms are nonlinear
+in the force; they are called bending terms. The constants in which an effect is not linear, such
+as a time constant, are its shape.
 
 Force, readings and standard deviations are in g, temperatures in °C, times in s. Names and terms
 are those of IEEE 1293 (model equation of a linear accelerometer) and of data sheets.
@@ -22,6 +23,7 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,29 +36,29 @@ from .table import Floats
 from .units import STANDARD_GRAVITY
 
 Context = Mapping[str, NDArray[Any]]
-"""What is known beside a reading: arrays of n rows, or one row without the first axis."""
+"""Context of readings by column: arrays with n rows, or one row without the first axis."""
 
 REFERENCE_TEMPERATURE = 25.0
-"""Temperature at which temperature effects are zero [°C], as in data sheets."""
+"""Temperature at which the temperature effects are zero [°C], as in data sheets."""
 
 NOMINAL_SUPPLY = 3.3
-"""Supply at which `supply_ratio` is zero [V]."""
+"""Supply voltage at which `supply_ratio` is zero [V]."""
 
 HOUR = 3600.0
 
 AXES = ('x', 'y', 'z')
 
 Family = Literal['', 'force', 'time']
-"""Effects of one family can look alike: nonlinearities on the 1 g sphere, trends in time."""
+"""Effects of one family can be confused: nonlinearities on the 1 g sphere, trends in time."""
 
 TO_SEPARATE: dict[Family, str] = {
-    'force': 'on the 1 g sphere they overlap by up to 98 %; more poses between the faces would '
-             'separate them, or forces other than 1 g (a centrifuge)',
-    'time': 'let the temperature fall as well as rise, and visit the same orientations again at '
-            'other times',
-    '': 'vary the one while the other stays the same',
+    'force': 'on the 1 g sphere they overlap by up to 98 %; to separate them, take more poses '
+             'between the faces, or apply forces other than 1 g (a centrifuge)',
+    'time': 'let the temperature both rise and fall, and repeat the same orientations at other '
+            'times',
+    '': 'vary one while the other stays the same',
 }
-"""How to separate effects of one family, or of different ones."""
+"""Advice on how to separate effects of one family, or of different families."""
 
 
 class Monomial(NamedTuple):
@@ -77,7 +79,7 @@ class Monomial(NamedTuple):
 
 
 def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
-    """Return the monomial that applies a function of one variable to one component."""
+    """Return the monomial that is a function of one component of the force."""
     def gradient(*u: Any) -> tuple[Any, Any, Any]:
         found = [0.0, 0.0, 0.0]
         found[axis] = slope(u[axis])
@@ -104,7 +106,7 @@ MONOMIALS: tuple[Monomial, ...] = (
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z. The first four are affine."""
 
 ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT = 0, 1, 4, 7, 10, 13, 16
-"""First index of each kind in `MONOMIALS`; the kinds by axis have three."""
+"""First index of each kind in `MONOMIALS`; a kind by axis has three entries."""
 
 AFFINE = 4
 """Monomials below this index are 1, u_x, u_y, u_z."""
@@ -119,9 +121,9 @@ class Term(NamedTuple):
     Parameters
     ----------
     parameter : int
-        Index of the parameter that it is proportional to.
+        Index of the parameter that the term is proportional to.
     axis : int
-        Axis of the reading that it is added to.
+        Axis of the reading that the term is added to.
     monomial : int
         Index in `MONOMIALS`.
     weight : float
@@ -136,10 +138,15 @@ class Term(NamedTuple):
 
 
 Factor = Callable[[Mapping[str, Any], Floats], Any]
-"""Context, shape -> (n,) or (t, n) array, the factor of all terms or of each; no n for one row."""
+"""
+Context, shape -> factor of all terms, (n,), or of each term, (t, n).
+
+For one row of context the axis n is missing.
+
+"""
 
 Shapes = Callable[[Context], Iterator[Floats]]
-"""Context of the poses -> the shapes that a search tries."""
+"""Context of the poses -> shapes to try."""
 
 
 @dataclass(frozen=True)
@@ -150,34 +157,35 @@ class Effect:
     Parameters
     ----------
     words : str
-        Description for a person.
+        Short description.
     term : str
         Name in IEEE 1293 or in data sheets.
     parameters : tuple of str
-        Names of its p parameters.
+        Names of the p parameters.
     unit : str
         Unit of each parameter.
     typical : float
-        Size in common parts, in `unit`.
+        Typical size in common parts, in `unit`.
     plausible_g : float
         Largest contribution to the reading of a working accelerometer [g]; infinite: no limit.
     terms : tuple of Term
-        What it adds.
+        What the effect adds to the reading.
     factor : callable or None
         Factor of the terms; None: 1.
     needs : tuple of str
         Keys of the context that the factor uses.
     shape : tuple of str
-        Names of the s constants in which it is not linear.
+        Names of the s constants in which the effect is not linear.
     shapes : callable or None
-        Shapes that a search tries; None for an effect without shape.
+        Shapes that the search tries; None for an effect without shape.
     family : {'', 'force', 'time'}
-        Effects that it can be mistaken for.
+        Group of effects that can be confused with this one.
     repeatable_g : float
-        Largest change between calibrations of one sensor [g]; beyond it, it is probably another.
+        Largest change between calibrations of one sensor [g]. A larger change indicates another
+        sensor.
     output : callable or None
-        (n, 3) readings, (p,) values -> (n, 3) readings, for effects on the whole reading, which
-        cannot be undone.
+        (n, 3) readings, (p,) values -> (n, 3) readings, for an effect on the whole reading. Such
+        an effect cannot be corrected.
 
     """
 
@@ -198,17 +206,17 @@ class Effect:
 
     @property
     def values(self) -> tuple[str, ...]:
-        """Names of all its values: parameters, then shape."""
+        """Names of all values: parameters, then shape."""
         return self.parameters + self.shape
 
     @property
     def linear(self) -> bool:
-        """Whether it belongs to V and W whatever the context."""
+        """Whether the effect is part of V and W in every context."""
         return self.factor is None and self.output is None and not self.bends
 
     @property
     def bends(self) -> bool:
-        """Whether it is not affine in the force."""
+        """Whether the effect is not affine in the force."""
         return any(term.monomial >= AFFINE for term in self.terms)
 
     def split(self, values: Floats) -> tuple[Floats, Floats]:
@@ -217,13 +225,13 @@ class Effect:
 
 
 def _by_axis(first: int) -> tuple[Term, ...]:
-    """Return the terms of a parameter for each axis, with a monomial for each axis."""
+    """Return terms with one parameter and one monomial per axis."""
     step = 0 if first == ONE else 1
     return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
 
 
 def _matrix(*entries: tuple[int, int, int, float]) -> tuple[Term, ...]:
-    """Return the terms of a matrix times force, from (parameter, row, column, weight)."""
+    """Return the terms of a matrix times the force, from (parameter, row, column, weight)."""
     return tuple(Term(parameter, row, FORCE + column, weight)
                  for parameter, row, column, weight in entries)
 
@@ -238,14 +246,14 @@ _SUPPLY = (*_ALL, *(Term(1 + axis, axis, ONE) for axis in range(3)))
 _LEVER = tuple(Term(parameter, axis, ONE) for axis in range(3) for parameter in range(3))
 
 _TAUS = 40
-"""Time constants that a search tries; a coarser grid makes up second effects."""
+"""Number of time constants to try; a coarser grid leads to spurious second effects."""
 
 _LEAST_SIDE = 5
-"""Poses on each side of a step; with three it could absorb any single outlier."""
+"""Smallest number of poses on each side of a step; with 3, a step absorbs any single outlier."""
 
 
 def _times(context: Context) -> Floats:
-    """Return the times of the poses, sorted; without those that are not known (NaN)."""
+    """Return the known times of the poses, sorted; unknown times are NaN."""
     time: Floats = np.sort(context['time'])
     return time[np.isfinite(time)]
 
@@ -258,7 +266,7 @@ def _from_start(context: Context) -> Iterator[Floats]:
 
 
 def _taus(context: Context) -> Iterator[Floats]:
-    """Yield start and time constant, from a sixtieth of the time span to one and a half."""
+    """Yield start and time constant; the constants are 1/60 to 3/2 of the time span."""
     time = _times(context)
     span = time[-1] - time[0] if len(time) else 0.0
     if span > 0.0:
@@ -267,7 +275,7 @@ def _taus(context: Context) -> Iterator[Floats]:
 
 
 def _instants(context: Context) -> Iterator[Floats]:
-    """Yield the instants between successive poses that leave enough poses on each side."""
+    """Yield the instants between successive poses, with enough poses on each side."""
     time = _times(context)
     middles = (time[1:] + time[:-1]) / 2.0
     for instant in np.unique(middles[_LEAST_SIDE - 1:len(middles) - _LEAST_SIDE + 1]):
@@ -297,7 +305,7 @@ def _after(context: Mapping[str, Any], shape: Floats) -> Any:
 
 
 def _columns_of(key: str, power: int = 1) -> Factor:
-    """Return the factor that is a vector of the context, by axis."""
+    """Return the factor for a vector of the context, one component per axis."""
     return lambda context, shape: np.asarray(context[key], float).T ** power
 
 
@@ -336,9 +344,9 @@ EFFECTS: dict[str, Effect] = {
                           0.001, terms=_by_axis(SQUARE)),
     'cubic': _bending('cube of the force', 'third-order coefficient K3', AXES, 'g/g³', 0.001,
                       terms=_by_axis(CUBE)),
-    'odd_quadratic': _bending('force times its size', 'odd quadratic coefficient Koq', AXES,
+    'odd_quadratic': _bending('force times its magnitude', 'odd quadratic coefficient Koq', AXES,
                               'g/g²', 0.001, terms=_by_axis(ODD_SQUARE)),
-    'gain_asymmetry': _bending('gain that differs by direction', 'scale-factor asymmetry', AXES,
+    'gain_asymmetry': _bending('gain that differs between + and -', 'scale-factor asymmetry', AXES,
                                'g/g', 0.002, terms=_by_axis(SIZE)),
     'cross_coupling': _bending(
         'product of two axes', 'cross-coupling coefficients Kip, Kio',
@@ -358,11 +366,11 @@ EFFECTS: dict[str, Effect] = {
         'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=_by_axis(ONE),
         factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
     'warm_up': _in_time(
-        'offset that settles after switching on', 'turn-on transient', AXES, 'g', 0.005,
+        'offset that settles after power-on', 'turn-on transient', AXES, 'g', 0.005,
         terms=_by_axis(ONE), factor=_settling, needs=('time',), shape=('start', 'tau'),
         shapes=_taus),
     'offset_step': _in_time(
-        'offset that jumped at an instant', 'bias shift after shock', AXES, 'g', 0.005,
+        'offset that jumps at an instant', 'bias shift after shock', AXES, 'g', 0.005,
         terms=_by_axis(ONE), factor=_after, needs=('time',), shape=('instant',),
         shapes=_instants),
     'vibration_rectification': Effect(
@@ -370,35 +378,33 @@ EFFECTS: dict[str, Effect] = {
         'g/g²', 0.002, 0.5, _by_axis(ONE), _columns_of('std', 2), ('std',)),
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
                          0.001, 0.5, _by_axis(ONE), _columns_of('previous'), ('previous',)),
-    'lever_arm': Effect('centripetal force away from the axis of turning', 'size effect', AXES,
+    'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
                         'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
-    'saturation': Effect('readings that end at a limit', 'full-scale range', ('limit',), 'g', 2.0,
+    'saturation': Effect('readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0,
                          np.inf, (), output=_clipped),
     'quantisation': Effect('readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
                            output=_on_grid),
 }
-"""All effects that are functions of force and context."""
+"""All effects that are functions of the force and the context."""
 
 WANDER = 'offset_wander'
 PROCESSES: dict[str, Effect] = {
-    WANDER: _in_time('offset that wanders in no known form', 'bias random walk', (), 'g', 0.001,
+    WANDER: _in_time('offset that changes slowly without a known form', 'bias random walk', (), 'g', 0.001,
                      terms=(), needs=('time',))}
-"""Random processes, which `accel_calib.refine` names and no model holds."""
+"""Random processes. `accel_calib.refine` names them; a model cannot contain them."""
 
 CHANGES: dict[str, Effect] = {
     f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
                               factor=lambda context, shape: context['new'], needs=('new',))
     for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
-"""How a sensor differs from its stored calibration; see `accel_calib.refine`. ``new`` is 1 for
-poses taken since then and 0 for those of the calibration."""
-
-_ALL_EFFECTS = {**EFFECTS, **PROCESSES, **CHANGES}
+"""Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new`` is
+1 for poses taken since then and 0 for the poses of the calibration."""
 
 
 def effect_named(name: str) -> Effect:
-    """Return the effect of this name: of `EFFECTS`, `PROCESSES` or `CHANGES`; raises KeyError."""
-    return _ALL_EFFECTS[name]
+    """Return the effect with this name in `EFFECTS`, `PROCESSES` or `CHANGES`, or raise KeyError."""
+    return ChainMap(EFFECTS, PROCESSES, CHANGES)[name]
 
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
-"""The effects of V and W, which every sensor has."""
+"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""

@@ -140,8 +140,8 @@ class Calibration:
                     AXES, np.column_stack([self.offset, self.gain]),
                     np.column_stack([self.offset_sd, self.gain_sd]))]
         head = ['axis', f'offset V [{self.units.name}]', *(f'gain W, {axis}' for axis in AXES)]
-        lines = ''.join(f'<li>{escape(line)}</li>' for line in self.warnings)
-        return f'<p>{escape(repr(self))}</p>{table(head, rows)}<ul>{lines}</ul>'
+        lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.warnings))
+        return table(head, rows) + lines
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -87,7 +87,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     if noise_of(poses_g) is not None:
         known = poses_g if vectors else _without_orientation(poses_g)
         scale = judge(Model(model.values), known).equations.scale
-        floor = _rms_mg(scale) * np.sqrt(3.0 if vectors else 1.0)
+        floor = _rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
     return Verification(_rms_mg(before), _rms_mg(after), _largest_percent(before),
                         _largest_percent(after), floor)
 

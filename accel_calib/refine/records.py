@@ -128,5 +128,5 @@ class Refinement:
                  f'{step.held_out_before_mg:.3g} → {step.held_out_after_mg:.3g}',
                  f'{step.p_value:.1g}', ', '.join(step.rivals), step.where] for step in self.steps]
         head = ['effect', 'residual [mg]', 'held out [mg]', 'p', 'rivals', 'where']
-        lines = ''.join(f'<li>{escape(line)}</li>' for line in self.advice)
-        return f'<p>{escape(repr(self))}</p>{table(head, rows)}<ul>{lines}</ul>'
+        lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.advice))
+        return (table(head, rows) if rows else '') + lines

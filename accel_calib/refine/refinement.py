@@ -289,7 +289,8 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
     final = found.final
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
-    if given.joint and (final.model.effects == model.effects and 'time' not in model.needs):
+    unchanged = final.model.effects == model.effects
+    if given.joint and unchanged and all(key in base.poses for key in model.needs):
         poses = with_stored(given.poses, base)
     elif given.joint:
         kept = kept.take(kept['new'] > 0.0)

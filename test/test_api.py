@@ -1,0 +1,164 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The public face: what users have in hand is accepted, and results are as the docs state."""
+
+import importlib
+import pickle
+import subprocess
+import sys
+
+import accel_calib as ac
+from accel_calib.errors import AccelCalibError, InputError, RefusedFitError
+from accel_calib.files import write_table
+import numpy as np
+import pytest
+
+SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
+          'cross_axis': [0.004, 0.002, -0.003]}
+MATRIX = np.linalg.inv(np.eye(3) + np.diag(SENSOR['axis_gain']) + np.array(
+    [[0.0, 0.004, 0.002], [0.004, 0.0, -0.003], [0.002, -0.003, 0.0]]))
+
+
+@pytest.fixture(scope='module')
+def poses():
+    return ac.simulate(SENSOR, seed=1)
+
+
+@pytest.fixture(scope='module')
+def calibration(poses):
+    return ac.fit(poses, flat=1, sensor='imu_link')
+
+
+def frame_of(poses):
+    pandas = pytest.importorskip('pandas')
+    reading, std = poses.reading, poses['std']
+    return pandas.DataFrame({
+        'label': ['pose'] * len(poses), 'ay': reading[:, 1], 'ax': reading[:, 0],
+        'az': reading[:, 2], 'count': poses['count'], 'std_x': std[:, 0], 'std_y': std[:, 1],
+        'std_z': std[:, 2]})
+
+
+def test_names_of_the_package_are_its_public_face():
+    assert set(ac.__all__) <= set(dir(ac))
+    for name in ac.__all__:
+        assert getattr(ac, name).__doc__
+    with pytest.raises(AttributeError, match='no attribute'):
+        ac.fits
+
+
+def test_functions_stay_when_a_folder_of_their_name_is_imported():
+    for name in ('capture', 'compare', 'refine', 'simulate'):
+        importlib.import_module(f'accel_calib.{name}')
+        assert callable(getattr(ac, name))
+
+
+def test_import_of_the_package_imports_no_numpy():
+    code = 'import accel_calib, sys; print("numpy" in sys.modules)'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=True, timeout=60)
+    assert done.stdout.strip() == 'False'
+
+
+def test_offset_and_matrix_are_in_the_unit_of_the_readings(calibration):
+    np.testing.assert_allclose(calibration.offset, np.array(SENSOR['offset']) * 9.80665,
+                               atol=0.01)
+    np.testing.assert_allclose(calibration.matrix, MATRIX, atol=2e-3)
+    np.testing.assert_allclose(calibration.matrix @ calibration.gain, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize('units', ['m/s2', 'g'])
+def test_corrected_readings_are_1_g_long(units, poses):
+    table = ac.simulate(SENSOR, units=units, seed=1)
+    forces = ac.fit(table).apply(table.reading)
+    np.testing.assert_allclose(np.linalg.norm(forces, axis=1), {'m/s2': 9.80665, 'g': 1.0}[units],
+                               rtol=2e-3)
+
+
+def test_poses_are_a_path_a_table_a_data_frame_or_an_array(poses, tmp_path):
+    path = tmp_path / 'poses.csv'
+    write_table(path, poses)
+    expected = ac.fit(poses).offset
+    for given in (path, str(path), ac.read_poses(str(path)), frame_of(poses)):
+        np.testing.assert_allclose(ac.fit(given).offset, expected, atol=1e-6)
+    for given in (poses.reading, poses.reading.tolist()):
+        np.testing.assert_allclose(ac.fit(given).offset, expected, atol=0.01)
+
+
+def test_a_calibration_is_stored_read_and_used_again(calibration, poses, tmp_path):
+    path = str(tmp_path / 'calibration.yaml')
+    calibration.save(path)
+    read = ac.load(path)
+    assert isinstance(read, ac.Calibration)
+    np.testing.assert_allclose(read.apply(poses.reading), calibration.apply(poses.reading),
+                               atol=1e-9)
+    np.testing.assert_allclose(read.apply(poses.reading[0])[:2], 0.0, atol=1e-6)
+    found = ac.verify(poses, path)
+    assert found.rms_after_mg < 1.0 < found.rms_before_mg
+    assert isinstance(found.noise_floor_mg, float)
+    assert type(found.noise_floor_mg) is float
+    assert ac.compare([path, calibration]).agree
+
+
+def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
+    pytest.importorskip('pandas')
+    recording = ac.simulate(SENSOR, recording=True, poses=6, seed=3)
+    path = tmp_path / 'recording.csv'
+    write_table(path, recording)
+    expected = ac.capture(recording)
+    assert len(expected) == 6
+    for given in (str(path), ac.read_recording(path)):
+        np.testing.assert_allclose(ac.capture(given).reading, expected.reading, atol=1e-6)
+    assert len(ac.capture(recording, min_dwell=2.0)) == 6
+    with pytest.raises(InputError, match='there is no still stretch'):
+        ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
+
+
+def test_refine_starts_from_a_stored_calibration_and_reports(calibration, tmp_path):
+    pytest.importorskip('matplotlib')
+    rng = np.random.default_rng(4)
+    temperature = rng.uniform(15.0, 45.0, 40)
+    poses = ac.simulate({**SENSOR, 'offset_temperature': [6e-4, -4e-4, 5e-4]}, poses=40, seed=5,
+                        temperature=temperature)
+    found = ac.refine(poses, base=calibration)
+    assert isinstance(found, ac.Refinement)
+    assert 'offset_temperature' in [step.effect for step in found.steps]
+    assert isinstance(found.calibration, ac.Calibration)
+    found.calibration.report(tmp_path / 'page.html')
+    assert '<svg' in (tmp_path / 'page.html').read_text(encoding='utf-8')
+
+
+def test_records_are_shown_in_a_line_and_as_html(calibration, poses):
+    for record in (calibration, poses, ac.refine(poses, base=calibration)):
+        assert len(repr(record)) < 120
+        assert '\n' not in repr(record)
+        assert record._repr_html_().startswith(('<table>', '<p>'))
+
+
+def test_records_pass_through_other_processes(calibration, poses):
+    for record in (calibration, poses):
+        assert repr(pickle.loads(pickle.dumps(record))) == repr(record)
+
+
+@pytest.mark.parametrize(('call', 'says'), [
+    (lambda poses: ac.fit(poses.reading[:3]), '3 poses'),
+    (lambda poses: ac.fit(np.ones((5, 2))), r'shape \(5, 2\), expected \(n, 3\)'),
+    (lambda poses: ac.fit(poses, units='g'), "is in m/s2, expected g; set units='m/s2'"),
+    (lambda poses: ac.fit(poses, flat=40), 'row 40 is not in the table, which has 24 rows'),
+    (lambda poses: ac.fit(poses, nose_down=2), 'without the flat one'),
+    (lambda poses: ac.fit(poses, flat=1, nose_down=1), 'within 10° of the flat one'),
+    (lambda poses: ac.simulate({'offest': 1.0}), "'offest' is not in the catalogue"),
+    (lambda poses: ac.compare([ac.fit(poses)]), 'nothing to compare'),
+    (lambda poses: ac.capture(ac.simulate({}, recording=True, poses=2), min_dwel=3), 'min_dwel'),
+])
+def test_bad_input_is_refused_in_one_line(call, says, poses):
+    with pytest.raises(AccelCalibError, match=says) as refusal:
+        call(poses)
+    assert '\n' not in str(refusal.value)
+
+
+def test_poses_on_a_line_are_refused():
+    directions = np.column_stack([np.sin(np.linspace(0, 0.2, 20)), np.zeros(20),
+                                  np.cos(np.linspace(0, 0.2, 20))])
+    with pytest.raises(RefusedFitError):
+        ac.fit(ac.simulate(SENSOR, directions=directions), model='10')

@@ -1,0 +1,65 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One entry in the catalogue is all that a new effect takes."""
+
+import accel_calib as ac
+from accel_calib.effects import _by_axis, AXES, Effect, EFFECTS, ONE
+from accel_calib.messages.layout import layout_of
+from accel_calib.messages.rewriter import Rewriter
+from accel_calib.report import page
+from accel_calib.sphere import random_directions
+import numpy as np
+import pytest
+from rosbags.typesys import get_typestore, Stores
+
+NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
+             0.005, 0.5, _by_axis(ONE),
+             lambda context, shape: ((context['temperature'] - 25.0) / 20.0) ** 3,
+             ('temperature',))
+SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
+          'cross_axis': [0.004, 0.002, -0.003]}
+VALUES = [0.02, -0.015, 0.01]
+
+
+@pytest.fixture
+def poses(monkeypatch):
+    monkeypatch.setitem(EFFECTS, 'offset_cubic_temperature', NEW)
+    rng = np.random.default_rng(1)
+    return ac.simulate({**SENSOR, 'offset_cubic_temperature': VALUES}, units='m/s2', seed=2,
+                       directions=random_directions(60, rng),
+                       temperature=rng.uniform(5.0, 45.0, 60), time=np.arange(60) * 20.0)
+
+
+def message(reading):
+    """Return a serialized Imu."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kinds = store.types
+    vector, header = kinds['geometry_msgs/msg/Vector3'], kinds['std_msgs/msg/Header']
+    stamp, unknown = kinds['builtin_interfaces/msg/Time'](1, 2), np.zeros(9)
+    imu = kinds['sensor_msgs/msg/Imu'](
+        header(stamp, 'imu_link'), kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+        unknown, vector(0.0, 0.0, 0.0), unknown, vector(*reading), unknown)
+    return bytes(store.serialize_cdr(imu, imu.__msgtype__))
+
+
+def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tmp_path):
+    found = ac.refine(poses, base='10')
+    assert [step.effect for step in found.steps] == ['offset_cubic_temperature']
+    np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in AXES], VALUES,
+                               atol=1e-3)
+    assert NEW.words.capitalize() in page(found, 'poses')
+
+    found.calibration.save(tmp_path / 'calibration.yaml')
+    calibration = ac.load(tmp_path / 'calibration.yaml')
+    np.testing.assert_allclose(calibration.model.values['offset_cubic_temperature'], VALUES,
+                               atol=1e-3)
+    forces = calibration.apply(poses.reading, temperature=poses['temperature'])
+    np.testing.assert_allclose(np.linalg.norm(forces, axis=1), 9.80665, atol=0.02)
+
+    data = message(poses.reading[7])
+    rewrite = Rewriter(layout_of(data), calibration, 1.0, 9.80665, '')
+    corrected = rewrite(data, float(poses['temperature'][7]))
+    store = get_typestore(Stores.ROS2_JAZZY)
+    force = store.deserialize_cdr(corrected, 'sensor_msgs/msg/Imu').linear_acceleration
+    np.testing.assert_allclose([force.x, force.y, force.z], forces[7], atol=1e-9)
