@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Poses and a list of effects to values: the one estimator, used by `calibrate` and `refine`.
+The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
 
-`equations` sets up what poses say of a model, `solve` minimises, `fit` puts both together with the
-covariance, where `noise` says how far the measured noise is believed. `outliers` finds disturbed
-poses, `robust` begins where they would spoil the fit, `closed_form` and `quadric` give starts.
-`geometry` and `identifiability` say what poses determine before any fit.
+`equations` sets up the equations of the poses, and `solve` minimises their residuals. `fit`
+combines both and computes the covariance; `noise` defines the weight of the measured noise.
+`outliers` finds outliers, and `robust` starts the fit if outliers would distort it. `closed_form`
+and `quadric` compute start values. `geometry` and `identifiability` compute what poses determine
+before any fit.
 
 """

@@ -4,11 +4,12 @@
 """
 Closed forms: the cost functions of AN5286 and the ESGI'95 report, without weights.
 
-Poses of unknown orientation lie on a quadric (see `accel_calib.estimate.quadric`). The
-4-parameter model is its sphere, by linear least squares; for 7 its axes are those of the sensor,
-and for 10 they may lie anywhere.
+Poses of unknown orientation lie on a quadric (see `accel_calib.estimate.quadric`). For model 4 the
+quadric is a sphere, fitted by linear least squares. For model 7 its axes are parallel to those of
+the sensor, and for model 10 they have any direction.
 
-Poses of known orientation obey reading = X force + y, linear in X and y (ESGI'95 report, 3).
+Poses of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report,
+section 3).
 
 """
 
@@ -33,14 +34,14 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
     Parameters
     ----------
     name : {'4', '7', '9', '10'}
-        The model; 9 is 10 in other axes.
+        The model; model 9 is model 10 in other axes.
     reading : (..., n, 3) array
-        Readings in any unit, at least as many as free parameters; leading axes are separate sets.
+        Readings in any unit, at least as many as free parameters. Leading axes are separate sets.
 
     Returns
     -------
     (..., 3, 3) array, (..., 3) array
-        W, in the unit of the readings per g, and V; NaN for a set that lies on no ellipsoid.
+        W, in the unit of the readings per g, and V; NaN for a set that is not on an ellipsoid.
 
     """
     if name == '4':
@@ -50,12 +51,12 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
 
 def fit_4(reading: Floats) -> tuple[Floats, Floats]:
     """
-    Fit offset and one gain (AN5286 eq. 10-14).
+    Fit an offset and one gain for all axes (AN5286 eq. 10-14).
 
     Parameters
     ----------
     reading : (..., n, 3) array
-        Readings in any unit, n >= 4; leading axes are separate sets.
+        Readings in any unit, n >= 4. Leading axes are separate sets.
 
     Returns
     -------
@@ -94,15 +95,15 @@ def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
     design = np.column_stack([reference, np.ones(len(reference))])
     solution, _, rank, _ = np.linalg.lstsq(design, reading, rcond=1e-6)
     if rank < 4:
-        raise RefusedFitError(f'the {len(reading)} known orientations lie in a plane',
-                              'take poses with each side of the sensor up and down, and some '
-                              'edges')
+        raise RefusedFitError(f'the known forces of the {len(reading)} poses lie in a plane, '
+                              'expected three dimensions', 'take poses with each side of the '
+                              'sensor up and down, and some edges')
     return solution[:3].T, solution[3]
 
 
 def faces(reading: Floats) -> Floats | None:
     """
-    Return which face is up in each pose, if the poses are the six faces and nothing else.
+    Return the direction of up in each pose, if the poses are exactly the six faces.
 
     Parameters
     ----------

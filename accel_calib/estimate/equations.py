@@ -2,31 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Poses as equations: what they say of the values of a model, whatever is known of their orientation.
+The equations that poses of known, shared or unknown orientation impose on the values of a model.
 
-Each pose has a surface of readings that the model allows: a point where the orientation is known,
-and the ellipsoid-like image of the unit sphere where only |force| = 1 g is known. The residual of
-a pose is the distance of its reading to that surface, in units of the noise:
+A model allows each pose a set of readings. For a known orientation this set is a point. If only
+|force| = 1 g is known, it is the image of the unit sphere, nearly an ellipsoid. The residual of a
+pose is the distance of its reading from this set, in units of the noise:
 
 - known orientation: (reading - predict(reference)) / s, three equations;
-- |force| = 1 g alone: (|u| - 1) / σ, with u the force found from the reading, A the slope of the
-  reading, a = A⁻ᵀû and σ² = Σ_j a_j² s_j². To first order this is the distance to the surface
-  along its normal. Without the division by σ the sum of squares would vanish for W → ∞, where
-  every reading becomes one unit vector;
-- poses that share an unknown orientation: (reading - predict(d)) / s for their common direction d,
-  less the part that a turn of d accounts for.
+- only |force| = 1 g known: (|u| - 1) / σ, with u the force computed from the reading, A the slope
+  of the reading, a = A⁻ᵀû and σ² = Σ_j a_j² s_j². To first order this is the distance from the
+  surface along its normal. Without the division by σ, the sum of squares would be zero for W → ∞;
+- shared unknown orientation: (reading - predict(d)) / s for the common direction d, minus the part
+  that a rotation of d explains.
 
 The equations are linear in small changes k of the values,
 
     residual = columns · k + noise of variance 1
 
-with the exact derivative: a value that adds B(u) to the reading changes (|u| - 1) / σ by
+with the exact derivative. A value that adds B(u) to the reading changes (|u| - 1) / σ by
 
     -[ (a - e h)·B(u) - e a·B'(u)g ] / σ,
     e = |u| - 1,  g = A⁻¹ N a / σ²,  h = A⁻ᵀ(I - ûûᵀ)g / |u|
 
-where N is the covariance of the reading and B'(u)g the derivative of B along g. (The change of A
-with u, by effects that bend, is neglected: it is of the order of e times their size.)
+where N is the covariance of the reading, and B'(u)g is the derivative of B along g. (The change of
+A with u, by bending terms, is neglected: it is of the order of e times these terms.)
 
 """
 
@@ -41,11 +40,16 @@ from numpy.typing import NDArray
 
 from .noise import believable, USUAL_NOISE_G
 from ..effects import Context
-from ..model import Model, times
+from ..model import AtContext, Model, times
 from ..sphere import unit
 from ..table import Floats, Poses
 
 Indices = NDArray[np.intp]
+
+
+_TURNS = 5
+_STRAIGHT = 1e-9
+"""Most turns of a common direction, and the turn at which it is found [rad]."""
 
 
 class _Part(Protocol):
@@ -55,7 +59,7 @@ class _Part(Protocol):
     pose: Indices
 
     def columns(self, model: Model) -> Floats:
-        """Return the (m, p) derivative of the prediction by the values of any model."""
+        """Return the (m, p) derivative of the prediction by the values of a model."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,11 @@ class Equations:
     force : (n, 3) array
         u of each pose; a unit vector where the orientation is not known [g].
     scale : (n,) array
-        Noise of each pose in these equations [g].
+        Noise of each pose in its equations [g].
     count : int
         Number of independent equations.
     noise_known : bool
-        Whether the noise was measured; if not, all poses have `USUAL_NOISE_G`.
+        Whether the noise was measured; otherwise the noise of all poses is `USUAL_NOISE_G`.
 
     """
 
@@ -86,7 +90,7 @@ class Equations:
 
     @property
     def residual(self) -> Floats:
-        """(m,) array, what the model leaves, in units of the noise."""
+        """(m,) array, the residuals in units of the noise."""
         return _joined([part.residual for part in self.parts])
 
     @property
@@ -95,11 +99,11 @@ class Equations:
         return _joined([part.pose for part in self.parts])
 
     def columns(self, model: Model) -> Floats:
-        """Return the (m, p) derivative of the prediction by the values of any model, per noise."""
+        """Return the (m, p) derivative of the prediction by the values of a model, per noise."""
         return _joined([part.columns(model) for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:
-        """Return the residual of each pose, (n,) [g]: signed if it has one equation, else RMS."""
+        """Return the (n,) residuals of the poses [g]: signed for one equation per pose, else RMS."""
         sizes = residual * self.scale[self.pose]
         if len(sizes) == len(self.scale):
             signed = np.zeros(len(self.scale))
@@ -113,19 +117,19 @@ def _joined(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 def noise_of(poses_g: Poses) -> Floats | None:
-    """Return the (n, 3) noise of the pose means as far as it is believed [g]; None: unknown."""
+    """Return the believable (n, 3) noise of the pose means [g]; None if it is not known."""
     return believable(poses_g.noise)
 
 
 def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
     """
-    Split poses by what is known of their orientation.
+    Return the indices of poses of known, shared and unknown orientation.
 
     Returns
     -------
     (a,) array, list of arrays, (c,) array
-        Poses of known orientation, groups that share one, and poses of which only |force| = 1 g
-        is known.
+        Poses of known orientation, groups of poses with the same orientation, and poses of which
+        only |force| = 1 g is known.
 
     """
     everyone = np.arange(len(poses))
@@ -147,16 +151,16 @@ def equations(model: Model, poses_g: Poses, noise: Floats | None) -> Equations:
     Parameters
     ----------
     model : Model
-        With ΔR = I.
+        The model, with ΔR = I.
     poses_g : Poses
         Poses in g.
     noise : (n, 3) array or None
-        Noise of their means as far as it is believed [g].
+        Noise of the pose means, as `noise_of` returns it [g].
 
     Returns
     -------
     Equations
-        With NaN residuals where the reading belongs to no one force.
+        The equations; a residual is NaN where the force of the reading is not unique.
 
     """
     known, shared, alone = kinds(poses_g)
@@ -182,7 +186,7 @@ def equations(model: Model, poses_g: Poses, noise: Floats | None) -> Equations:
 
 
 class _Alone:
-    """Equations of poses of which only |force| = 1 g is known; see the module for the symbols."""
+    """Equations of poses of which only |force| = 1 g is known; symbols as in the module."""
 
     def __init__(self, model: Model, poses_g: Poses, s: Floats, pose: Indices) -> None:
         self.pose = pose
@@ -230,10 +234,11 @@ class _Known:
 
 class _Shared:
     """
-    Equations of poses in groups that share an unknown orientation.
+    Equations of poses in groups with a common unknown orientation.
 
-    A turn of the common direction moves the readings of a group by T = A [t1 t2] per noise, with
-    two tangents t. The part of the residuals in the span of T is projected out.
+    A rotation of the common direction changes the readings of a group by T = A [t1 t2] per noise,
+    with two tangents t. The direction is rotated until the residuals have no part in the span of
+    T, so that the derivative is exact; the part of the derivative in this span is projected out.
 
     """
 
@@ -245,16 +250,25 @@ class _Shared:
         mean = np.array([np.bincount(group, column) for column in
                          here.force(poses_g.reading).T]).T
         self.force = unit(mean)[group]
-        first = np.cross(self.force, np.eye(3)[np.argmin(np.abs(self.force), axis=1)])
-        first = unit(first)
+        for _ in range(_TURNS):
+            off, tangents = self._around(here, poses_g.reading)
+            turn = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ off)
+            if np.max(np.abs(turn)) < _STRAIGHT:
+                break
+            self.force = unit(self.force + (tangents @ turn[group])[:, :, 0])
+        off, _ = self._around(here, poses_g.reading)
+        self.residual = self._projected(off).ravel()
+
+    def _around(self, here: AtContext, reading: Floats) -> tuple[Floats, Floats]:
+        """Set up the turns about the common directions; return residuals and tangents."""
+        first = unit(np.cross(self.force, np.eye(3)[np.argmin(np.abs(self.force), axis=1)]))
         tangents = np.stack([first, np.cross(self.force, first)], axis=2)
-        self._turn = here.slope(self.force) @ tangents / s[:, :, np.newaxis]
+        self._turn = here.slope(self.force) @ tangents / self._sigma[:, :, np.newaxis]
         self._normal = np.linalg.inv(self._summed(np.swapaxes(self._turn, 1, 2) @ self._turn))
-        off = (poses_g.reading - here.reading(self.force)) / s
-        self.residual = self._projected(off[:, :, np.newaxis]).ravel()
+        return ((reading - here.reading(self.force)) / self._sigma)[:, :, np.newaxis], tangents
 
     def _summed(self, parts: Floats) -> Floats:
-        """Sum (n, …) parts by group."""
+        """Return the sums of (n, …) parts by group."""
         size, groups = math.prod(parts.shape[1:]), int(self._group[-1]) + 1
         summed = np.zeros((groups, size))
         for k, column in enumerate(parts.reshape(len(parts), size).T):
@@ -262,7 +276,7 @@ class _Shared:
         return summed.reshape(groups, *parts.shape[1:])
 
     def _projected(self, rows: Floats) -> Floats:
-        """Return (n, 3, p) rows less what a turn of the common direction accounts for."""
+        """Return (n, 3, p) rows minus the part that a rotation of the common direction explains."""
         onto = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ rows)
         return rows - self._turn @ onto[self._group]
 

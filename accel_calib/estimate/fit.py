@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The fit of any list of effects to poses of any kind: maximum likelihood by least squares.
+The maximum likelihood fit of any list of effects to poses of any kind, by least squares.
 
-The poses give equations (`.equations`), `.solve` minimises the sum of their squares, and the
-covariance is (JᵀJ)⁻¹ times what `.noise` makes of the residuals: poses often repeat worse than
-their samples say.
+`.equations` sets up the equations of the poses, and `.solve` minimises the sum of their squared
+residuals. The covariance is (JᵀJ)⁻¹ times the variance factor of `.noise`, because poses often
+repeat worse than the noise of their samples predicts.
 
-Each parameter is bounded so that it contributes no more to a reading than `Effect.plausible_g`,
-and a fitted shape constant stays near those that a search tries. The effects of V and W are not
-bounded here: native readings may have any offset, and known orientations any rotation.
+The bounds of each parameter limit its contribution to a reading to `Effect.plausible_g`. A fitted
+shape constant stays near the values that the search tries. The effects of V and W have no bounds
+here: native readings can have any offset, and known orientations any rotation.
 
 """
 
@@ -30,20 +30,22 @@ from ..sphere import unit
 from ..table import Floats, Poses
 
 _SINGULAR = 1e-3
+"""Relative singular value below which a combination of values is not determined."""
+
 _OPEN = 1e-3
-"""Relative singular value below which a combination is not determined; part of a value in it."""
+"""Part of a value in such combinations above which the value is not determined."""
 
 _SMALLEST = 1e-12
-"""A parameter that contributes less than this is not bounded [1/g]."""
+"""A parameter with a smaller contribution has no bound [1/g]."""
 
 _SHAPE_ROOM = 5.0
-"""Factor by which a fitted shape constant may leave the range of those that a search tries."""
+"""Factor by which a fitted shape constant may exceed the range that the search tries."""
 
 
 @dataclass(frozen=True)
 class Fit:
     """
-    A model at the poses, and what these say of it.
+    A model at poses, with residuals, derivatives and covariance.
 
     Parameters
     ----------
@@ -52,13 +54,13 @@ class Fit:
     poses_g : Poses
         The poses, in g.
     equations : Equations
-        Their equations near the model.
+        The equations of the poses near the model.
     columns : (m, q) array
-        Derivative of the prediction by the free values, per noise.
+        Derivative of the prediction by the free values, in units of the noise.
     ties : (p, q) array
-        From the free values to ``model.vector``.
+        Maps the free values to ``model.vector``.
     at_bound : bool
-        Whether a value is at the bound of what is plausible.
+        Whether a value is at a bound.
 
     """
 
@@ -81,17 +83,17 @@ class Fit:
 
     @property
     def dof(self) -> int:
-        """Independent equations less free values."""
+        """Number of independent equations minus number of free values."""
         return self.equations.count - self.columns.shape[1]
 
     @cached_property
     def chi2(self) -> float:
-        """Sum of the squared residuals over their noise."""
+        """Sum of the squared residuals in units of the noise."""
         return float(self.residual @ self.residual)
 
     @property
     def variance(self) -> float:
-        """Variance of a residual in units of the noise: 1 as far as the noise is believed."""
+        """Variance of a residual in units of the noise, moderated towards 1."""
         return (belief_in(self.noise_known) + self.chi2) / self.variance_dof
 
     @property
@@ -100,21 +102,12 @@ class Fit:
         return belief_in(self.noise_known) + self.dof
 
     @cached_property
-    def orthonormal(self) -> Floats:
-        """(m, q) array, columns that span the derivative."""
-        return np.linalg.qr(self.columns)[0]
-
-    @cached_property
-    def leverage(self) -> Floats:
-        """(m,) array, the share of each equation in its own prediction."""
-        return np.minimum(np.sum(self.orthonormal ** 2, axis=1), 1.0)
-
-    @cached_property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the values that the poses do not determine."""
         size = np.linalg.norm(self.columns, axis=0)
         size[size == 0.0] = 1.0
-        _, scales, axes = np.linalg.svd(self.columns / size, full_matrices=True)
+        few = len(self.columns) < len(size)  # only then are there axes beyond the singular values
+        _, scales, axes = np.linalg.svd(self.columns / size, full_matrices=few)
         open_ = axes[np.sum(scales > _SINGULAR * scales[0]):] if len(scales) else axes
         part = np.linalg.norm(self.ties @ (open_ / size).T, axis=1)
         names = parameter_names(self.model.effects)
@@ -139,9 +132,9 @@ def free_of(effects: tuple[str, ...]) -> Floats:
 
 def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     """
-    Return a model at poses, without a fit; arguments as of `Fit`.
+    Return a model at poses without fitting it; parameters as in `Fit`.
 
-    By default each fitted value of the effects is free.
+    By default, all fitted values of the effects are free.
 
     """
     ties = free_of(model.effects) if ties is None else ties
@@ -156,14 +149,14 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
     Parameters
     ----------
     start : Model
-        Effects with the values to begin with, ΔR = I.
+        Effects with their start values, ΔR = I.
     poses_g : Poses
-        In g, of known, shared or unknown orientation, with the context that the effects need.
+        Poses in g, of known, shared or unknown orientation, with the context of the effects.
 
     Returns
     -------
     Fit
-        At the solution.
+        The model at the solution.
 
     Raises
     ------
@@ -197,7 +190,7 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
-    """Return the lower and the upper bounds of all values, (p,) each; the start is within."""
+    """Return (p,) lower and (p,) upper bounds of all values; they include the start values."""
     lower, upper = [], []
     for name, values in start.values.items():
         effect = effect_named(name)
@@ -217,7 +210,7 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
 
 
 def _largest_contribution(model: Model, poses_g: Poses) -> Floats:
-    """Return the largest reading that a value of 1 of each parameter adds at the poses, (p,)."""
+    """Return the (p,) largest reading at the poses for a value of 1 of each parameter."""
     basis = model.basis(unit(poses_g.reading), poses_g.columns).full
     parameters = len(model.terms.effects[0].parameters)
     return np.max(np.linalg.norm(basis[:, :, :parameters], axis=1), axis=0)

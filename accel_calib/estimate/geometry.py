@@ -2,22 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the directions of the poses determine: how well, and what they leave open.
+How well the directions of poses determine a model, before any fit.
 
-A pose with force u sees the values of a model through the rows Φ(u): of unknown orientation the
-one row û · basis(u) (see `accel_calib.estimate.equations`, with A near I), of known orientation
-the three rows basis(u). With s_i the noise of a pose over that of the median pose, the poses have
-the information
+A pose with force u depends on the values of a model through the rows Φ(u). For a pose of unknown
+orientation this is the one row û · basis(u) (see `accel_calib.estimate.equations`, with A near I).
+For a pose of known orientation these are the three rows basis(u). With s_i the noise of a pose
+relative to that of the median pose, the information of the poses is
 
     M = Σ Φ_iᵀ Φ_i / s_i²
 
-and the corrected |force| (of known orientation: the force) in a direction d is uncertain by
+The standard deviation of the corrected |force| (known orientation: of the force) in a direction d,
+relative to the noise of a pose, is
 
     √(Φ(d) M⁻¹ Φ(d)ᵀ)
 
-times the noise of a pose. The largest such root over the sphere is the dilution: how much worse
-than a pose the fit is somewhere. It is about 1 for 12 poses spread evenly. What the poses leave
-open is in `accel_calib.estimate.identifiability`.
+The largest value over the sphere is the dilution. It is about 1 for 12 poses that are spread
+evenly. `accel_calib.estimate.identifiability` describes what the poses do not determine.
 
 """
 
@@ -33,16 +33,22 @@ from ..sphere import spread_directions
 from ..table import Floats
 
 LARGEST_DILUTION = 25.0
-"""Beyond this a fit is refused. 12 poses in a 45° cone have 400, in five directions and 2° about
-them 100, the worst 1 % of 12 poses in random directions 25. At 0.3 mg per pose it is an error of
-8 mg somewhere; fits that are wrong by 10 mg all over the sphere lie beyond it, with a limit of 40
-some of them do not (`benchmarks/geometry.py`)."""
+"""
+Above this dilution a fit is refused.
+
+The dilution is 400 for 12 poses in a 45° cone, 100 for poses in five directions with a spread of
+2°, and 25 for the worst 1 % of 12 poses in random directions. With a noise of 0.3 mg per pose, 25
+corresponds to an error of 8 mg in some direction. All fits that are wrong by 10 mg over the whole
+sphere have a larger dilution; with a limit of 40, some of them would pass
+(`benchmarks/geometry.py`).
+
+"""
 
 WEAK_DILUTION = 10.0
-"""Beyond this a fit warns: somewhere the error of |force| is ten times that of a pose."""
+"""Above this dilution a fit warns: the error of |force| is up to ten times that of a pose."""
 
 NORM_MODELS = ('4', '7', '10')
-"""Models for poses of unknown orientation, the smallest first."""
+"""Models for poses of unknown orientation; the smallest model is first."""
 
 _NEAR = np.cos(np.radians(45.0))
 _SAME = np.cos(np.radians(5.0))
@@ -50,7 +56,7 @@ _SINGULAR, _NOTHING = 1e-6, 1e-14
 
 
 def effects_of(name: str) -> tuple[str, ...]:
-    """Return the effects of a model; 9 is 10 in other axes."""
+    """Return the effects of a model; model 9 is model 10 in other axes."""
     return MODELS['10' if name == '9' else name]
 
 
@@ -60,13 +66,13 @@ def parameters_of(name: str) -> tuple[str, ...]:
 
 
 def rows_of(name: str, directions: Floats) -> Floats:
-    """Return Φ for each of these (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
+    """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
     basis = with_vector(effects_of(name), np.zeros(free_parameters(name))).basis(directions, {})
     return basis.full if name == '12' else basis.along(directions)[:, np.newaxis]
 
 
 def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
-    """Return the (n,) noise of |reading| from that of (n, 3) pose means; None if it is unknown."""
+    """Return the (n,) noise of |reading| from the (n, 3) noise of means; None if unknown."""
     believed = believable(noise) if len(directions) else None
     if believed is None:
         return None
@@ -76,7 +82,7 @@ def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
 
 
 def relative_weights(noise: Floats | None, count: int) -> Floats:
-    """Return 1 / s², (count,), from the noise of each pose in any unit; ones if it is unknown."""
+    """Return (count,) weights 1 / s² from the noise of each pose in any unit; ones if unknown."""
     if noise is None or count == 0:
         return np.ones(count)
     weights: Floats = (np.median(noise) / noise) ** 2
@@ -85,12 +91,12 @@ def relative_weights(noise: Floats | None, count: int) -> Floats:
 
 @lru_cache(maxsize=8)
 def over_the_sphere(name: str) -> Floats:
-    """Return Φ of directions spread evenly over the sphere, (m, 1 or 3, p)."""
+    """Return the (m, 1 or 3, p) rows Φ at directions spread evenly over the sphere."""
     return rows_of(name, spread_directions(300))
 
 
 def information_of(name: str, directions: Floats, weights: Floats) -> Floats:
-    """Return M, (p, p)."""
+    """Return the (p, p) information M."""
     rows = rows_of(name, directions)
     information: Floats = np.einsum('n,nip,niq->pq', weights, rows, rows)
     return information
@@ -102,12 +108,12 @@ def free_parameters(name: str) -> int:
 
 
 def poses_needed(name: str) -> int:
-    """Return the fewest poses that can determine a model."""
+    """Return the smallest number of poses that can determine a model."""
     return 4 if name == '12' else free_parameters(name)
 
 
 def _weighted_rows(name: str, directions: Floats, noise: Floats | None) -> Floats:
-    """Return Φ / s of all poses, (m, p)."""
+    """Return the (m, p) rows Φ / s of all poses."""
     root = np.sqrt(relative_weights(noise, len(directions)))
     rows = rows_of(name, directions) * root[:, np.newaxis, np.newaxis]
     return rows.reshape(-1, rows.shape[2])
@@ -116,54 +122,54 @@ def _weighted_rows(name: str, directions: Floats, noise: Floats | None) -> Float
 def spectrum(name: str, directions: Floats, noise: Floats | None = None
              ) -> tuple[Floats, Floats, Floats]:
     """
-    Split a model into combinations of parameters, in the order in which poses determine them.
+    Return the combinations of parameters of a model, ordered by how well poses determine them.
 
     Parameters
     ----------
     name : {'4', '7', '9', '10', '12'}
         The model.
     directions : (n, 3) array
-        Unit vectors of force in the sensor axes; n may be 0.
+        Unit vectors of force in the sensor axes; n can be 0.
     noise : (n,) array, optional
-        Noise of each pose, in any unit; equal if it is not given.
+        Noise of each pose, in any unit; by default equal for all poses.
 
     Returns
     -------
     (p,) array
-        Standard deviation of each combination over the noise of a pose, the smallest first;
-        infinite if nothing determines it.
+        Standard deviation of each combination, relative to the noise of a pose, in increasing
+        order; infinite if the poses do not determine the combination.
     (p, p) array
-        The combinations, rows of length 1.
+        The combinations as rows of length 1.
     (p, m) array
-        Error of |force| in m directions over that of a pose, squared, from the combinations up
-        to this one.
+        Squared error of |force| in m directions, relative to that of a pose, from all
+        combinations up to this one.
 
     """
     triangle = np.linalg.qr(_weighted_rows(name, directions, noise), mode='r')
     square = np.zeros((free_parameters(name),) * 2)
     square[:len(triangle)] = triangle
     _, scales, axes = np.linalg.svd(square)
-    told = scales > _SINGULAR * max(scales[0], 1.0)
-    deviations = np.where(told, 1.0 / np.where(told, scales, 1.0), np.inf)
+    determined = scales > _SINGULAR * max(scales[0], 1.0)
+    deviations = np.where(determined, 1.0 / np.where(determined, scales, 1.0), np.inf)
     seen = np.sum((over_the_sphere(name) @ axes.T) ** 2, axis=1)
     return deviations, axes, np.cumsum(times(seen, deviations ** 2), axis=1).T
 
 
 def times(share: Floats, deviations: Floats) -> Floats:
-    """Return the product, 0 where the share is 0 of an infinite deviation."""
+    """Return the product; 0 times an infinite deviation is 0."""
     none = np.abs(share) < _NOTHING
     return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
 
 
 def dilution(name: str, directions: Floats, noise: Floats | None = None) -> float:
     """
-    Return the dilution of poses under a model; arguments as `spectrum`.
+    Return the dilution of poses for a model; parameters as in `spectrum`.
 
     Returns
     -------
     float
-        Largest error of |force| over the sphere, over that of a pose; infinite if the poses leave
-        a parameter open.
+        Largest error of |force| over the sphere, relative to that of a pose; infinite if the poses
+        do not determine a parameter.
 
     """
     rows = _weighted_rows(name, directions, noise)
@@ -177,20 +183,20 @@ def dilution(name: str, directions: Floats, noise: Floats | None = None) -> floa
 
 @lru_cache(maxsize=8)
 def _pairs_over_the_sphere(name: str) -> Floats:
-    """Return the products of the entries of Φ in each direction, (p², m)."""
+    """Return the (p², m) products of the entries of Φ in each direction."""
     around = over_the_sphere(name)
     pairs = np.einsum('mkp,mkq->mpq', around, around)
     return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
 
 
 def coverage(directions: Floats) -> float:
-    """Return the share of the sphere that lies within 45° of a pose; (n, 3) unit vectors."""
+    """Return the share of the sphere within 45° of a pose, for (n, 3) unit vectors."""
     near = np.max(spread_directions(500) @ directions.T, axis=1)
     return float(np.mean(near >= _NEAR))
 
 
 def distinct(directions: Floats) -> int:
-    """Return the number of directions that are more than 5° apart; (n, 3) unit vectors."""
+    """Return the number of directions at least 5° apart, for (n, 3) unit vectors."""
     kept: list[Floats] = []
     for direction in directions:
         if all(direction @ other < _SAME for other in kept):

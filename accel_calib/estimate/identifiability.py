@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which parameters poses determine, how well, and which combinations they leave open.
+Which parameters poses determine, how well, and which combinations they do not determine.
 
-The singular vectors of the rows of `accel_calib.estimate.geometry` are the combinations of
-parameters in the order in which the poses determine them. Those that would raise the dilution
-beyond the limit for a fit are left open; they are described by as few parameters as possible.
+The singular vectors of the rows of `accel_calib.estimate.geometry` are combinations of parameters,
+ordered by how well the poses determine them. The combinations that raise the dilution above the
+limit for a fit are not determined. They are described by as few parameters as possible.
 
 """
 
@@ -31,26 +31,26 @@ from ..effects import EFFECTS
 from ..table import Floats
 
 _OPEN_PART = 0.1
-"""Part of a parameter in the open combinations from which it is not determined."""
+"""Part of a parameter in the open combinations above which it is not determined."""
 
-_SAID_PART = 0.3
-"""Part of the largest weight in a combination that is put into words."""
+_MAIN_PART = 0.3
+"""Weights above this part of the largest weight are included in the words."""
 
 _SMALL = 1e-3
-"""Weights in a combination that are left out."""
+"""Weights below this are omitted from a combination."""
 
 
 @dataclass(frozen=True)
 class Combination:
     """
-    A combination of parameters that poses leave open.
+    A combination of parameters that the poses do not determine.
 
     Parameters
     ----------
     weights : mapping of str to float
-        By name of the parameter, the largest first; their squares add up to 1.
+        Weight of each parameter, the largest first; the sum of the squares is 1.
     deviation : float
-        Its standard deviation over the noise of a pose; infinite if nothing determines it.
+        Standard deviation relative to the noise of a pose; infinite if not determined at all.
 
     """
 
@@ -60,12 +60,12 @@ class Combination:
     @property
     def words(self) -> str:
         """Return the combination in words, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
-        least = _SAID_PART * max(map(abs, self.weights.values()))
-        said = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
-        if len(said) == 1:
-            return said[0][0]
+        least = _MAIN_PART * max(map(abs, self.weights.values()))
+        main = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
+        if len(main) == 1:
+            return main[0][0]
         first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
-                          for name, weight in said)
+                          for name, weight in main)
         return ' '.join([first.removeprefix('+ '), *others])
 
 
@@ -79,12 +79,12 @@ class Identifiability:
     model : str
         The model.
     deviations : mapping of str to float
-        Of each parameter, standard deviation over the noise of a pose; infinite if nothing
-        determines it.
+        Standard deviation of each parameter, relative to the noise of a pose; infinite if not
+        determined at all.
     undetermined : tuple of Combination
-        What the poses leave open, so that without it they would carry the model.
+        Combinations that the poses do not determine. They determine the rest of the model.
     dilution, mean_dilution : float
-        Error of |force| over that of a pose: the largest and the RMS over the sphere.
+        Error of |force| relative to that of a pose: largest and RMS over the sphere.
 
     """
 
@@ -105,12 +105,12 @@ class Identifiability:
 def identifiability(name: str, directions: Floats, noise: Floats | None = None
                     ) -> Identifiability:
     """
-    Compute what poses determine; arguments as `accel_calib.estimate.geometry.spectrum`.
+    Compute what poses determine; parameters as in `accel_calib.estimate.geometry.spectrum`.
 
     Returns
     -------
     Identifiability
-        From the directions alone, before any fit.
+        The result, which depends only on directions and noise.
 
     """
     deviations, axes, errors = spectrum(name, directions, noise)
@@ -124,13 +124,13 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None
 
 def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
                   ) -> tuple[Combination, ...]:
-    """Return combinations of few parameters each that span these (k, p) combinations."""
+    """Return sparse combinations that span these (k, p) combinations."""
     from scipy.linalg import qr
 
     if not len(axes):
         return ()
     pivots = qr(axes, mode='r', pivoting=True)[1][:len(axes)]
-    mixed = np.linalg.inv(axes[:, pivots])  # each combination has one pivot of its own
+    mixed = np.linalg.inv(axes[:, pivots])  # each combination has its own pivot
     mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
     uncertain = np.sqrt(np.sum(times(mixed ** 2, deviations ** 2), axis=1))
     found = []
@@ -145,10 +145,10 @@ def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
 def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats | None = None
                   ) -> float:
     """
-    Return how wrong |force| commonly is when a model leaves out effects of a larger one.
+    Return the typical error of |force| if a model omits effects of a larger model.
 
-    What is left out, of the size that is common (`accel_calib.effects`), goes into the parameters
-    that are fitted as these poses let it, and from there to the whole sphere.
+    The omitted effects have their typical size (`accel_calib.effects`). The fit to these poses
+    partly absorbs them in its parameters, which changes the correction over the whole sphere.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats |
     directions : (n, 3) array
         Unit vectors of force in the sensor axes.
     noise : (n,) array, optional
-        Noise of each pose, in any unit; equal if it is not given.
+        Noise of each pose, in any unit; by default equal for all poses.
 
     Returns
     -------
@@ -177,5 +177,5 @@ def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats |
 
 
 def left_out(smaller: str, larger: str) -> list[str]:
-    """Return the effects that a smaller model leaves out."""
+    """Return the effects that a smaller model omits."""
     return [effect for effect in effects_of(larger) if effect not in effects_of(smaller)]

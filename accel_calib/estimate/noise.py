@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How far the measured noise of the poses is believed.
+Weight of the measured noise of poses against the residuals of a fit.
 
-The variance of a residual is λ times what the noise of its pose says. Either the noise is right,
-λ = 1, or poses repeat worse or better than their samples say, by an unknown factor: log λ is
-uniform from log 0.01 to log 10⁴. The residuals weigh one against the other (Bayes' rule with the
-likelihood λ^(-dof/2) exp(-chi²/2λ)). A parameter is then distributed as a mixture of normal
-distributions, and its stated variance is chosen so that ±1.96 standard deviations hold 95 % of it.
-Where the noise was not measured, λ comes from the residuals alone and the mixture is Student's t;
-where there are no residuals to spare either, a common sensor's noise is assumed.
+The variance of a residual is λ times the variance predicted by the noise of its pose. Either the
+noise is correct and λ = 1, or poses repeat worse or better than their samples predict. Then log λ
+is uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both (Bayes' rule
+with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then a mixture of
+normal distributions. Its stated variance is chosen so that ±1.96 standard deviations contain 95 %
+of the mixture. If the noise was not measured, λ is estimated from the residuals alone, and the
+mixture is Student's t. If there are no degrees of freedom either, the noise of a common sensor is
+assumed.
 
 In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
 2004).
@@ -26,20 +27,20 @@ import numpy as np
 from ..table import Floats
 
 USUAL_NOISE_G = 5e-4
-"""Noise of a pose mean of a common MEMS sensor, assumed where it was not measured [g]."""
+"""Noise of a pose mean of a common MEMS sensor, assumed if it was not measured [g]."""
 
 _NO_NOISE_G = 1e-9
-"""Samples that scatter less do not scatter at all [g]."""
+"""Noise below this counts as no noise [g]."""
 
 LEAST_NOISE = 0.1
-"""A pose whose noise is below this part of the median is not believed."""
+"""Smallest noise of a pose, relative to the median over the poses."""
 
 _BELIEF = 8.0
 _BELIEF_IN_USUAL = 3.0
-"""Degrees of freedom that measured noise, and the noise of a common sensor, count as in a test."""
+"""Degrees of freedom in a test that measured noise, and assumed noise, count as."""
 
 _RIGHT = 0.7
-"""Probability that the measured noise is right, before the residuals are seen."""
+"""Prior probability that the measured noise is correct."""
 
 _INTERVAL = 0.95
 _NORMAL = 1.959964
@@ -53,7 +54,7 @@ _BEYOND = 1e3
 
 def believable(noise: Floats | None) -> Floats | None:
     """
-    Raise noise that is far below that of the other poses.
+    Return the noise of poses, raised where it is far below that of the other poses.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def believable(noise: Floats | None) -> Floats | None:
     Returns
     -------
     (n, 3) array or None
-        None where it is not known, or where most poses claim to have none.
+        None if the noise is not known, or is zero for most poses.
 
     """
     if noise is None or not len(noise):
@@ -79,7 +80,7 @@ def belief_in(noise_known: bool) -> float:
 
 @cache
 def _grid() -> tuple[Floats, Floats]:
-    """Return half widths (k,), and the part of N(0, λ) that each of them holds, (m, k)."""
+    """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
     from scipy.special import ndtr
 
     width = np.geomspace(0.15, 250.0, 141)
@@ -88,16 +89,16 @@ def _grid() -> tuple[Floats, Floats]:
 
 def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     """
-    Return the factor from the variance that the noise leaves to the one that is stated.
+    Return the ratio of the stated variance to the variance predicted by the noise.
 
     Parameters
     ----------
     chi2 : float
-        Sum of the squared residuals over their noise.
+        Sum of the squared residuals in units of the noise.
     dof : int
-        Equations less free values.
+        Number of equations minus number of free values.
     noise_known : bool
-        Whether the noise was measured; if not, `chi2` is in units of `USUAL_NOISE_G`.
+        Whether the noise was measured; otherwise the unit of `chi2` is `USUAL_NOISE_G`.
 
     """
     if dof <= 0:
@@ -108,14 +109,14 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
 
 
 def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and the normal law."""
+    """Return the squared ratio of the 95 % intervals of Student's t and the normal distribution."""
     from scipy.special import stdtrit
 
     return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
 
 
 def _of_mixture(chi2: float, dof: int) -> float:
-    """Return the factor where the noise is measured, and may be right."""
+    """Return the factor for measured noise, which may be correct."""
     width, held = _grid()
     likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
     largest = np.max(likelihood)

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Outliers: poses that were knocked or not still. A fault of the data, found and left out.
+Outliers: poses that were knocked or not still.
 
-The pose whose residual is largest against what the other poses say (externally studentised, with
-the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. As
-many are then outliers as the generalised extreme studentised deviate test (Rosner 1983) finds at
-`LEVEL`; that test is not masked when several poses are disturbed. Between the removals the fit is
-followed to first order. Above `_MANY` poses outliers no longer mask each other, and all that are
-extreme against the median are removed at once.
+The pose with the largest residual against a fit of the other poses (externally studentised, with
+the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. The
+generalised extreme studentised deviate test (Rosner 1983) at `LEVEL` then decides how many of them
+are outliers. In this test several outliers do not mask each other. Between the removals the fit is
+updated to first order. Above `_MANY` poses, outliers no longer mask each other, and all poses that
+are extreme relative to the median are removed at once.
 
-A gross outlier can spoil the fit that this begins with. `.robust` begins with poses that agree.
+A gross outlier can distort the first fit. `.robust` starts from poses that agree.
 
 """
 
@@ -27,23 +27,24 @@ from .noise import belief_in
 from ..table import Floats
 
 LEVEL = 0.007
-"""Probability that a clean set loses a pose."""
+"""Probability that a pose of a set without outliers is removed."""
 
 LARGEST_SHARE = 0.25
-"""Part of the poses that may be left out."""
+"""Largest share of the poses that can be excluded."""
 
 _LEAST_OWN = 1e-6
-"""1 - leverage below this: this pose alone fixes a parameter, and nothing can contradict it."""
+"""1 - leverage below this: this pose alone determines a parameter, and cannot be tested."""
 
 _MANY = 200
 
 _MEDIAN_OF_CHI2 = {1: 0.454936, 3: 2.365974}
-"""Median of chi² with so many degrees of freedom."""
+"""Median of chi² by degrees of freedom."""
+
+_DOUBT_BELOW = 0.01
+"""Probability of the chi² of the poses left below which they contradict the measured noise."""
 
 _DOUBTED = 1.0
-_DOUBT_BELOW = 0.01
-"""Degrees of freedom that measured noise counts as when the poses left contradict it, and the
-probability of their chi² below which they do."""
+"""Degrees of freedom that contradicted noise counts as."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,11 @@ class ByPose:
     Parameters
     ----------
     residual : (n, k) array
-        Residuals per noise, padded with 0.
+        Residuals in units of the noise, padded with 0.
     columns : (n, k, q) array
         Derivative of the prediction, padded with 0.
     rows : (n,) array of int
-        Equations of each pose.
+        Number of equations of each pose.
 
     """
 
@@ -74,11 +75,11 @@ class ByPose:
 
     @property
     def flat(self) -> Floats:
-        """(n k, q) array, the derivative without the axis of poses."""
+        """(n k, q) array, the derivative with one row per equation."""
         return self.columns.reshape(self.residual.size, self.columns.shape[2])
 
     def own(self, spread: Floats) -> Floats:
-        """Return I less the leverage of each pose, (n, k, k)."""
+        """Return the (n, k, k) matrices I - leverage of each pose."""
         return (np.eye(self.columns.shape[1])
                 - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
 
@@ -101,7 +102,7 @@ def by_pose(fit: Fit) -> ByPose:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Poses to leave out, (d,) indices among those of a fit, and the chi² of the others."""
+    """Poses to exclude, as (d,) indices among the poses of a fit, and the chi² of the others."""
 
     poses: NDArray[np.intp]
     chi2: float
@@ -109,20 +110,20 @@ class Outliers:
 
 def outliers(fit: Fit, total: int) -> Outliers:
     """
-    Find the poses to leave out.
+    Find the outliers among the poses of a fit.
 
     Parameters
     ----------
     fit : Fit
-        To the poses that are kept so far.
+        Fit to the poses that are kept so far.
     total : int
-        Poses before any was left out.
+        Number of poses before any was excluded.
 
     Returns
     -------
     Outliers
-        In all no more than a quarter of the poses, and no more than leave enough equations to
-        find which they are.
+        At most `LARGEST_SHARE` of all poses, and at most so many that the other equations identify
+        them.
 
     """
     data = by_pose(fit)
@@ -140,7 +141,7 @@ def outliers(fit: Fit, total: int) -> Outliers:
 
 
 def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as, given the chi² of what is kept."""
+    """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
     from scipy.special import chdtrc
 
     if noise_known and chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
@@ -149,7 +150,7 @@ def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
 
 
 def most_outliers(fit: Fit, total: int, rows: int = 1) -> int:
-    """Return how many of all poses may be left out, each with so many equations."""
+    """Return the largest number of poses to exclude, each with `rows` equations."""
     spare = fit.dof + rows * (total - len(fit.poses_g))
     return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
 
@@ -162,13 +163,13 @@ class _Removed:
     Parameters
     ----------
     pose, rows : (k,) array of int
-        The most extreme of those left, and its equations.
+        Index of the removed pose, and its number of equations.
     size : (k,) array
-        Its squared residual against the others, in units of its variance.
+        Squared residual of this pose against the others, in units of its variance.
     rss : (k + 1,) array
         Sum of squared residuals before each removal, and at the end.
     dof, count : int
-        Degrees of freedom and poses at the beginning.
+        Degrees of freedom and number of poses at the start.
 
     """
 
@@ -180,7 +181,7 @@ class _Removed:
     count: int
 
     def extreme(self, belief: float) -> int:
-        """Return how many of them are outliers."""
+        """Return how many of the removed poses are outliers."""
         removed = np.concatenate([[0], np.cumsum(self.rows)])
         dof = np.maximum(belief + self.dof - removed[1:], 1e-9)
         others = np.maximum(belief + self.rss[:-1] - self.size, 1e-300) / dof
@@ -190,7 +191,7 @@ class _Removed:
 
 
 def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Floats:
-    """Return the probability that a ratio of variances is as large by chance (F distribution)."""
+    """Return the probability of a larger ratio of variances by chance (F distribution)."""
     from scipy.special import fdtrc
 
     chance: Floats = fdtrc(rows, np.maximum(dof, 1.0), ratio)
@@ -198,7 +199,7 @@ def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Float
 
 
 def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
-    """Remove the most extreme pose again and again, following the fit to first order."""
+    """Remove the most extreme pose repeatedly, and update the fit to first order."""
     spread = data.spread
     flat = data.flat
     residual = data.residual - (flat @ (spread @ (flat.T @ data.residual.ravel()))).reshape(
@@ -224,19 +225,20 @@ def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
 
 
 def _squared(own: Floats, residual: Floats) -> Floats:
-    """Return the squared residual of each pose against the others; 0 where nothing contradicts."""
+    """Return the squared residual of each pose against the others; 0 if it cannot be tested."""
     if residual.shape[1] == 1:
         alone = own[:, 0, 0]
         return np.where(alone > _LEAST_OWN,
                         residual[:, 0] ** 2 / np.maximum(alone, _LEAST_OWN), 0.0)
     size, axes = np.linalg.eigh(own)
     along = (np.swapaxes(axes, 1, 2) @ residual[:, :, np.newaxis])[:, :, 0]
-    told = size > _LEAST_OWN
-    return np.sum(np.where(told, along ** 2 / np.where(told, size, 1.0), 0.0), axis=1)
+    testable = size > _LEAST_OWN
+    squares = np.where(testable, along ** 2 / np.where(testable, size, 1.0), 0.0)
+    return np.sum(squares, axis=1)
 
 
 def _far_out(data: ByPose, fit: Fit, limit: int) -> Outliers:
-    """Find outliers among many poses: all at once, against the median."""
+    """Find outliers among many poses, all at once, relative to the median."""
     alone = _squared(data.own(data.spread), data.residual)
     size = alone / data.rows
     usual = np.array([_MEDIAN_OF_CHI2[int(rows)] / rows for rows in data.rows])

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The quadric that readings of a still sensor lie on, from their moments.
+The quadric through the readings of a still sensor, from the moments of the readings.
 
-Poses of unknown orientation obey |W⁻¹ (reading - V)| = 1 (NXP AN5286):
+Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
 
     readingᵀ A reading - 2 readingᵀ A V + VᵀA V - B² = 0,   W⁻¹ = (A / B²)^(1/2)
 
 The coefficients are the eigenvector of XᵀX with the smallest eigenvalue, where a row of X holds
-the monomials of a reading. That cost depends on origin and scale, so the readings are first
-shifted and scaled by the sphere that fits them: then counts and volts give what m/s² give,
-without a loss of digits. Leading axes are sensors throughout.
+the monomials of a reading. This cost depends on origin and scale. The readings are therefore first
+shifted and scaled by the sphere that fits them. Counts and volts then lead to the same result as
+m/s², without a loss of digits. Leading axes of all arrays are sensors.
 
 """
 
@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from ..table import Floats
 
 _RIDGE = 1e-12
-"""Keeps the solution finite for poses in a plane; it puts the centre into the plane."""
+"""Keeps the solution finite for poses in a plane; the centre is then in the plane."""
 
 _BLOCK = 8192
-"""Poses at a time: their monomials stay in the cache."""
+"""Number of poses per block; their monomials fit in the cache."""
 
 _IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
 
@@ -42,7 +42,7 @@ class Form:
     Parameters
     ----------
     first, second : (k,) array of int
-        i and j; those with i = j first.
+        i and j; pairs with i = j are first.
 
     """
 
@@ -51,17 +51,17 @@ class Form:
 
     @cached_property
     def pairs(self) -> NDArray[np.intp]:
-        """(2 k,) array, all i and then all j."""
+        """(2 k,) array, all i, then all j."""
         return np.concatenate([self.first, self.second])
 
     @cached_property
     def twice(self) -> Floats:
-        """(k,) array, how often each stands in rᵀ A r."""
+        """(k,) array, how often each monomial occurs in rᵀ A r."""
         return np.where(self.first == self.second, 1.0, 2.0)
 
     @cached_property
     def linear(self) -> Floats:
-        """(3, 3 k) array, what moving the origin by c takes from each in proportion to r."""
+        """(3, 3 k) array, the part linear in r when the origin moves by c."""
         taken = np.zeros((3, 3, len(self.twice)))
         for k, (i, j) in enumerate(zip(self.first, self.second)):
             taken[i, j, k] += self.twice[k]
@@ -70,7 +70,7 @@ class Form:
 
     @cached_property
     def scatter(self) -> Floats:
-        """(k, 9) array, from the coefficients to the entries of A."""
+        """(k, 9) array, maps the coefficients to the entries of A."""
         entries = np.zeros((len(self.twice), 3, 3))
         each = np.arange(len(self.twice))
         entries[each, self.first, self.second] = entries[each, self.second, self.first] = 1.0
@@ -82,7 +82,7 @@ SYMMETRIC = Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
 
 
 def centred(reading: Floats) -> tuple[Floats, Floats]:
-    """Give the mean (..., 3), and the readings from there on, (..., 3, n)."""
+    """Return the (..., 3) mean, and the (..., 3, n) readings minus the mean."""
     transposed = reading.swapaxes(-1, -2)
     mean = transposed.sum(axis=-1) / reading.shape[-2]
     return mean, transposed - mean[..., np.newaxis]
@@ -90,9 +90,10 @@ def centred(reading: Floats) -> tuple[Floats, Floats]:
 
 def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
     """
-    Give the sphere from moments about the mean.
+    Return the sphere from moments about the mean.
 
-    |r|² = 2 V·r + (W² - |V|²), summed over the poses times r, and alone; their r sum up to zero.
+    It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses. The
+    sum of all r is zero.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
     third : (..., 3) array
         Sum of |r|² r.
     count : int
-        Poses.
+        Number of poses.
 
     Returns
     -------
@@ -110,20 +111,20 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
 
     """
     trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
-    kept_apart = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
-    centre = np.linalg.solve(second + kept_apart, third[..., np.newaxis])[..., 0] / 2.0
+    ridge = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
+    centre = np.linalg.solve(second + ridge, third[..., np.newaxis])[..., 0] / 2.0
     squared = trace / count + (centre * centre) @ _ONES
     return centre, np.sqrt(squared + (squared == 0.0))
 
 
 def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
     """
-    Fit the quadric whose matrix A has the entries of this form; others are zero.
+    Fit the quadric whose matrix A has the entries of this form; other entries are zero.
 
     Parameters
     ----------
     reading : (..., n, 3) array
-        In any unit.
+        Readings in any unit.
     form : Form
         `DIAGONAL` or `SYMMETRIC`.
 
@@ -148,7 +149,7 @@ def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
 
 
 def _moments(form: Form, r: Floats) -> Floats:
-    """Sum up the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
+    """Sum the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
     size = len(form.twice)
     monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
     monomials[..., size:-1, :] = r
@@ -158,7 +159,7 @@ def _moments(form: Form, r: Floats) -> Floats:
 
 
 def _to_sphere(form: Form, centre: Floats, radius: Floats) -> Floats:
-    """Give the matrix from monomials of r to those of (r - centre) / radius, each `twice`."""
+    """Return the matrix from monomials of r to those of (r - centre) / radius, times `twice`."""
     size, lead = len(form.twice), centre.shape[:-1]
     change = np.zeros((*lead, size + 4, size + 4))
     diagonal = change.reshape(*lead, -1)[..., ::size + 5]
@@ -174,7 +175,7 @@ def _to_sphere(form: Form, centre: Floats, radius: Floats) -> Floats:
 
 
 def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
-    """Give W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
+    """Return W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
     size = len(form.twice)
     mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
     values, vectors = np.linalg.eigh(mat_a)

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Fits that gross outliers cannot spoil.
+Fits that are robust against gross outliers.
 
-One row that has nothing to do with the others, such as zeros or a reading in another unit, can
-bend the closed form and the fit of all poses so far that the residuals no longer show which row it
-is. So where the fit of all poses is suspicious, subsets are fitted in closed form; the one whose
-nearest poses agree best (least trimmed squares, Rousseeuw 1984) begins a fit that then takes in
-every pose that agrees with it.
+A single wrong row, such as zeros or a reading in another unit, can distort the closed form and the
+fit of all poses so far that the residuals do not show which row is wrong. If the fit of all poses
+is suspicious, subsets are therefore fitted in closed form. The subset with the smallest trimmed
+squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
+agrees with it.
 
 """
 
@@ -29,44 +29,46 @@ from ..model import Model, MODELS, parameter_names, with_linear_part
 from ..table import Floats, Poses
 
 _ROUNDS = 6
-"""Most fits after which poses are left out or taken in."""
+"""Largest number of fits after which poses are excluded or included."""
 
 _SUSPICIOUS = 4.0
-"""chi² per degree of freedom from which the fit of all poses is doubted."""
+"""chi² per degree of freedom above which the fit of all poses is suspicious."""
 
 _CLEARLY = 10.0
-"""Ratio of the variances above which a pose that a fit of those that agree leaves out must go. The
-choice among subsets makes small differences look significant, so a smaller ratio counts for
-nothing, and the other poses are judged by `.outliers`."""
+"""Ratio of the variances above which a pose that the robust fit excludes is an outlier. The choice
+among subsets makes small differences look significant, so a smaller ratio is ignored; `.outliers`
+decides about the other poses."""
 
 _MOST_SUBSETS = 400
+"""Largest number of subsets that are fitted."""
+
 _SPARE = 3
-"""Subsets that are fitted; poses of a random one beyond the free parameters."""
+"""Number of poses in a random subset beyond the free parameters."""
 
 _CONCENTRATIONS = 3
-"""Closed forms after which the poses nearest to each are chosen anew."""
+"""Number of closed forms after each of which the nearest poses are selected again."""
 
 
 def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
     """
-    Fit a model to poses of which only |force| = 1 g is known, without the outliers.
+    Fit a model to poses of unknown orientation, without the outliers.
 
     Parameters
     ----------
     name : {'4', '7', '10'}
         The model.
     poses_g : Poses
-        In g, as many as the model has free parameters, or more.
+        Poses in g, at least as many as free parameters.
 
     Returns
     -------
     Fit, (k,) array of int
-        The fit, and the indices of the poses that it keeps.
+        The fit, and the indices of the poses used.
 
     Raises
     ------
     NotConvergedError
-        If the poses lie on no ellipsoid.
+        If the poses are not on an ellipsoid.
 
     """
     everyone = np.arange(len(poses_g))
@@ -87,7 +89,7 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
 
 
 def start_of(name: str, reading: Floats) -> Model:
-    """Return the closed form of a model as a start; its sphere where there is no ellipsoid."""
+    """Return start values by the closed form; a sphere if the poses are not on an ellipsoid."""
     mat_w, vec_v = closed_form(name, reading)
     if not np.all(np.isfinite(mat_w)):
         mat_w, vec_v = closed_form('4', reading)
@@ -98,7 +100,7 @@ def start_of(name: str, reading: Floats) -> Model:
 
 
 def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.intp]:
-    """Return the poses that a fit leaves out, those that are furthest away first."""
+    """Return the poses that a fit excludes, in decreasing order of the residual."""
     out = np.setdiff1d(np.arange(len(poses_g)), kept)
     away = np.abs(judge(fit.model, poses_g).residual[out])
     return out[np.argsort(-away, kind='stable')]
@@ -106,7 +108,7 @@ def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray
 
 def _without_outliers(name: str, poses_g: Poses, kept: NDArray[np.intp]
                       ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Fit poses and leave outliers out, until there are none; None: no convergence."""
+    """Fit poses and exclude outliers until there are none; None if a fit does not converge."""
     fit = _fit(name, poses_g, kept)
     for _ in range(_ROUNDS):
         out = () if fit is None else outliers(fit, len(poses_g)).poses
@@ -122,7 +124,7 @@ def _without_outliers(name: str, poses_g: Poses, kept: NDArray[np.intp]
 
 
 def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Fit the poses that agree best, and take in those that agree with them."""
+    """Fit the poses that agree best, and include those that agree with them."""
     most = _most(name, len(poses_g))
     if most < 1:
         return None
@@ -131,14 +133,14 @@ def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.i
 
 def _with_those_that_agree(name: str, poses_g: Poses, kept: NDArray[np.intp]
                            ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Take in poses that agree with a fit, leave out those that don't; None: too few do."""
-    been: set[bytes] = set()
+    """Include the poses that agree with a fit, exclude the others; None if too few agree."""
+    tried: set[bytes] = set()
     while (fit := _fit(name, poses_g, kept)) is not None:
-        been.add(kept.tobytes())
+        tried.add(kept.tobytes())
         agreeing = np.flatnonzero(_agrees(fit, kept, poses_g))
         if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
             return None
-        if agreeing.tobytes() in been or len(been) == _ROUNDS:
+        if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
             return fit, kept
         kept = agreeing
     return None
@@ -153,7 +155,7 @@ def _fit(name: str, poses_g: Poses, kept: NDArray[np.intp]) -> Fit | None:
 
 
 def _most(name: str, count: int) -> int:
-    """Return how many of so many poses may be left out."""
+    """Return the largest number of poses that can be excluded."""
     return min(int(LARGEST_SHARE * count), (count - _free(name)) // 2)
 
 
@@ -162,7 +164,7 @@ def _free(name: str) -> int:
 
 
 def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool_]:
-    """Return which poses agree with a fit to those that are kept."""
+    """Return which poses agree with a fit to the poses kept."""
     data = by_pose(judge(fit.model, poses_g))
     flat = fit.columns
     spread = np.linalg.pinv(flat.T @ flat, hermitian=True)
@@ -176,7 +178,7 @@ def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool
 
 
 def _agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
-    """Return all poses but `most` of them, so that those left agree best."""
+    """Return the indices of all poses but `most`, selected so that they agree best."""
     count = len(poses_g)
     reading = poses_g.reading
     noise = noise_of(poses_g)
@@ -191,7 +193,7 @@ def _agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
 
 
 def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
-    """Return subsets of the poses: all of count - most, or as many random ones as are fitted."""
+    """Return all subsets of count - most poses, or `_MOST_SUBSETS` random subsets."""
     if comb(count, most) <= _MOST_SUBSETS:
         out = np.array(list(combinations(range(count), most)))
         inside = np.ones((len(out), count), bool)
@@ -204,8 +206,8 @@ def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
 
 def _squared_distances(name: str, reading: Floats, subsets: NDArray[np.intp], noise: Floats
                        ) -> Floats:
-    """Return the (s, n) squared distances of all poses to the closed form of each subset."""
-    with np.errstate(all='ignore'):  # a subset may lie on no ellipsoid, or in a plane
+    """Return the (s, n) squared distances of all poses from the closed form of each subset."""
+    with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane
         mat_w, vec_v = closed_form(name, reading[subsets])
         sound = np.isfinite(mat_w).all(axis=(1, 2)) & (np.abs(np.linalg.det(mat_w)) > 0.0)
         inverse = np.linalg.inv(np.where(sound[:, np.newaxis, np.newaxis], mat_w, np.eye(3)))

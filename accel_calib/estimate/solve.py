@@ -4,8 +4,8 @@
 """
 Damped least squares (Levenberg 1944, Marquardt 1963) within bounds.
 
-`scipy.optimize.least_squares` solves the same problem; for a dozen poses it takes several times as
-long, most of it overhead (`benchmarks/fits.py`).
+`scipy.optimize.least_squares` solves the same problem. For a dozen poses it takes several times as
+long, mostly because of overhead (`benchmarks/fits.py`).
 
 """
 
@@ -25,13 +25,13 @@ _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e9
 
 _NEAR = 1e-12
-"""The solution is reached when a full step would lower the cost by less than this part of it."""
+"""The fit has converged when a full step lowers the cost by less than this part."""
 
 _NEAR_ENOUGH = 1e-5
-"""Where rounding keeps it from that, this part of the cost per degree of freedom is accepted."""
+"""If rounding prevents this, the fit accepts this part of the cost per degree of freedom."""
 
 _ROUNDING = 1e-20
-"""Falls of the cost below this are rounding errors [noise²]."""
+"""Decreases of the cost below this are rounding errors [noise²]."""
 
 _SINGULAR = 1e-6
 """Relative square of a singular value below which the residuals do not determine a combination."""
@@ -41,19 +41,19 @@ class NotConvergedError(RefusedFitError):
     """The fit did not converge, so it has no result."""
 
     def __init__(self) -> None:
-        super().__init__('the fit did not converge',
-                         'check the poses for mistakes, or take more of them')
+        super().__init__('the fit did not converge, so it has no result',
+                         'check the poses for mistakes, or take more poses')
 
 
 class Point(NamedTuple):
-    """Values with (m,) residuals and the (m, q) derivative of the prediction there."""
+    """The (m,) residuals and the (m, q) derivative of the prediction at some values."""
 
     residual: Floats
     columns: Floats
 
     @property
     def cost(self) -> float:
-        """Sum of the squared residuals; infinite where they are not finite."""
+        """Sum of the squared residuals; infinite if a residual or derivative is not finite."""
         cost = float(self.residual @ self.residual)
         return cost if np.isfinite(cost) and np.all(np.isfinite(self.columns)) else np.inf
 
@@ -65,26 +65,26 @@ NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats
           ) -> tuple[Floats, Point]:
     """
-    Find the values that minimise the sum of squared residuals.
+    Compute the values that minimise the sum of squared residuals.
 
     Parameters
     ----------
     point_at : callable
-        (q,) values -> residuals and columns there; residual = columns · (change of the values).
+        (q,) values -> residuals and derivative. The step solves residual = columns · step.
     start : (q,) array
-        Where to begin.
+        Start values.
     lower, upper : (q,) array
         Bounds of the values.
 
     Returns
     -------
     (q,) array, Point
-        The solution.
+        The values at the minimum, with residuals and derivative.
 
     Raises
     ------
     NotConvergedError
-        If there is no solution near enough after `_MOST_STEPS` steps.
+        If the fit has not converged after `_MOST_STEPS` steps.
 
     """
     values = np.clip(start, lower, upper)
@@ -112,7 +112,7 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
 
 
 def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
-    """Return the values that are not at a bound beyond which the cost would fall."""
+    """Return which values are free: not at a bound beyond which the cost would decrease."""
     downhill = now.columns.T @ now.residual
     held = ((values <= lower) & (downhill < 0.0)) | ((values >= upper) & (downhill > 0.0))
     return ~held
@@ -120,9 +120,9 @@ def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[n
 
 def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """
-    Return the damped Gauss-Newton step, (q,), and by how much the cost would fall.
+    Return the (q,) damped Gauss-Newton step, and the predicted decrease of the cost.
 
-    Combinations of values that the residuals do not determine stay as they are.
+    Combinations of values that the residuals do not determine are not changed.
 
     """
     columns = now.columns * free
@@ -131,6 +131,6 @@ def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, 
     columns = columns / size
     scales, axes = np.linalg.eigh(columns.T @ columns)
     downhill = axes.T @ (columns.T @ now.residual)
-    told = scales > _SINGULAR * scales[-1]
-    along = np.where(told, downhill, 0.0) / (np.where(told, scales, 1.0) + damping)
+    determined = scales > _SINGULAR * scales[-1]
+    along = np.where(determined, downhill, 0.0) / (np.where(determined, scales, 1.0) + damping)
     return axes @ along / size, float(along @ downhill)

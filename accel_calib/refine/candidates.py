@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,9 @@ RIVAL = 9.0
 
 _AS_GOOD = 6.0
 """Within this of the best criterion the effect with the fewest parameters is taken."""
+
+_SHAPES_AT_ONCE = 250
+"""Of more shapes than these, evenly spread ones are tried first, then those near the best."""
 
 _USUAL = 1.6
 """Standard deviation of the logarithm of the size of an effect about its typical size."""
@@ -114,28 +118,43 @@ def candidates(equations: Equations, fitted: Projected, context: Context, names:
     return found
 
 
+class _Tried(NamedTuple):
+    """A shape: its place among all, what it explains, and its columns beside and with the model."""
+
+    place: int
+    gain: float
+    columns: Floats
+    seen: Floats
+
+
 def _best_shape(name: str, equations: Equations, fitted: Projected, context: Context,
                 whiten: Callable[[Floats], Floats] | None) -> Candidate | None:
     """Return the candidate in its best shape; None if the model spans it."""
     effect = effect_named(name)
     shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(context))
-    best, most = None, 0.0
-    for shape in shapes:
-        model = Model({name: np.concatenate([np.zeros(len(effect.parameters)), shape])})
+    if not shapes:
+        return None
+
+    def tried(place: int) -> _Tried:
+        model = Model({name: np.concatenate([np.zeros(len(effect.parameters)), shapes[place]])})
         seen = equations.columns(model)[:, :len(effect.parameters)]
         seen = seen if whiten is None else whiten(seen)
         columns = fitted.outside(seen)
         gain = float(np.sum((columns.T @ fitted.residual) ** 2))
-        if columns.shape[1] and (best is None or gain > most):
-            best, most = (shape, columns, seen), gain
-    if best is None:
+        return _Tried(place, gain if columns.shape[1] else -1.0, columns, seen)
+
+    step = -(-len(shapes) // _SHAPES_AT_ONCE)
+    best = max(map(tried, range(0, len(shapes), step)), key=lambda each: each.gain)
+    if step > 1:
+        near = range(max(best.place - step + 1, 0), min(best.place + step, len(shapes)))
+        best = max(map(tried, near), key=lambda each: each.gain)
+    if not best.columns.shape[1]:
         return None
-    shape, columns, seen = best
-    left = seen - fitted.onto @ (fitted.onto.T @ seen)
+    left = best.seen - fitted.onto @ (fitted.onto.T @ best.seen)
     values = np.linalg.lstsq(left, fitted.residual, rcond=1e-7)[0]
     size = float(np.max(np.abs(values))) / effect.typical
     visible = float(np.linalg.norm(left, 2)) * effect.typical
-    return Candidate(name, shape, columns, size, visible, int(len(shapes) > 1),
+    return Candidate(name, shapes[best.place], best.columns, size, visible, int(len(shapes) > 1),
                      1.0 if len(shapes) == 1 else len(shapes) / 3.0)
 
 

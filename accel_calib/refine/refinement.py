@@ -270,7 +270,7 @@ def _untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], .
     return tuple(not_testable(final.poses_g, testable, (*final.model.effects, *rivals)))
 
 
-def _stages(states: Sequence[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
+def _stages(states: list[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
     """Return the residuals of the base and after each step; limit and grid leave those kept."""
     of_output = len(steps) + 1 - len(states)
     stages = []

@@ -34,6 +34,9 @@ _LARGEST_RATIO = 1e3
 _LEAST_WHITE = 0.5
 """Part of the measured variance that is left to the poses themselves."""
 
+_NO_CHANGE = 1e-9
+"""Directions that are shrunk by less than this part are left out."""
+
 _OFFSET = Model({'offset': np.zeros(3)})
 
 
@@ -105,6 +108,8 @@ def wander(equations: Equations, fitted: Projected, time: Floats) -> Wander:
     diagonal = 1.0 - np.sum(fitted.onto ** 2, axis=1) - vectors ** 2 @ taken
     axes, size, _ = np.linalg.svd(modes, full_matrices=False)
     shrink = 1.0 / np.sqrt(1.0 + _RATIOS[best] * size ** 2 / largest)
+    shrunk = shrink < 1.0 - _NO_CHANGE
+    axes, shrink = axes[:, shrunk], shrink[shrunk]
     return Wander(ratio - np.log(max(dof, 2)), ratio, residual,
                   residual / np.maximum(diagonal, 0.02), axes, shrink)
 
