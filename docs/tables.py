@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Make the tables of the documentation from the code: ``python docs/tables.py``.
+Make the tables of the documentation and the API reference: ``python docs/tables.py``.
 
-Each stands between ``<!-- NAME -->`` and ``<!-- end -->`` in a page; a test compares them.
+A table stands between ``<!-- NAME -->`` and ``<!-- end -->`` in a page. The reference is the whole
+page ``api.md``. Tests compare both with the code. The package need not be installed.
 
 """
 
@@ -13,26 +14,29 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 import re
+import sys
 
-from accel_calib.effects import EFFECTS
-from accel_calib.table import COLUMNS
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
-HERE = Path(__file__).parent
+from accel_calib.effects import EFFECTS  # noqa: E402
+from accel_calib.table import COLUMNS  # noqa: E402
+import api_page  # noqa: E402
 
 
 def columns() -> Iterator[str]:
-    """Give the columns of pose tables and recordings."""
-    yield '| columns | unit | meaning |'
-    yield '|---|---|---|'
-    for column in COLUMNS.values():
+    """Yield the columns of pose tables and recordings."""
+    yield '| in Python | in a file | unit | meaning |'
+    yield '|---|---|---|---|'
+    for key, column in COLUMNS.items():
         if column.made:
             continue
         names = ', '.join(f'`{name}`' for name in column.names)
-        yield f'| {names} | {column.unit} | {column.meaning} |'
+        yield f'| `{key}` | {names} | {column.unit} | {column.meaning} |'
 
 
 def effects() -> Iterator[str]:
-    """Give the catalogue of effects."""
+    """Yield the catalogue of effects."""
     yield '| name | what | term | values | unit | common size | needs |'
     yield '|---|---|---|---|---|---|---|'
     for name, effect in EFFECTS.items():
@@ -43,10 +47,11 @@ def effects() -> Iterator[str]:
 
 
 TABLES = {'columns': columns, 'effects': effects}
+REFERENCE = 'api.md'
 
 
 def with_tables(text: str) -> str:
-    """Give the text of a page with its tables as they are now."""
+    """Return the text of a page with its tables made from the code."""
     for name, table in TABLES.items():
         rows = '\n'.join(table()).replace('\\', r'\\')
         text = re.sub(rf'(<!-- {name} -->\n).*?(<!-- end -->)', rf'\1\n{rows}\n\n\2', text,
@@ -55,9 +60,11 @@ def with_tables(text: str) -> str:
 
 
 def main() -> None:
-    """Write the tables into all pages."""
+    """Write the reference, and the tables into all other pages."""
+    (HERE / REFERENCE).write_text(api_page.page(), encoding='utf-8')
     for page in sorted(HERE.glob('*.md')):
-        page.write_text(with_tables(page.read_text(encoding='utf-8')), encoding='utf-8')
+        if page.name != REFERENCE:
+            page.write_text(with_tables(page.read_text(encoding='utf-8')), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -1,17 +1,53 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The examples run, and tell what they should."""
+"""The examples run without the repository as working folder, and print the expected result."""
 
+import os
 from pathlib import Path
-import runpy
+import re
+import subprocess
+import sys
 
-EXAMPLES = Path(__file__).parent.parent / 'examples'
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted(path.name for path in (ROOT / 'examples').glob('*.py'))
 
 
-def test_hidden_effect_is_found(capsys):
-    runpy.run_path(str(EXAMPLES / 'find_hidden_effect.py'), run_name='__main__')
-    said = capsys.readouterr().out
-    assert 'Missing: offset_temperature' in said
-    assert said.count('Missing') == 1
-    assert said.endswith('Verdict: explained.\n')
+def output_of(name, folder):
+    """Run an example in an empty folder, and return its output."""
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    done = subprocess.run([sys.executable, ROOT / 'examples' / name], cwd=folder, text=True,
+                          env=environment, capture_output=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not list(folder.iterdir())
+    return done.stdout
+
+
+def test_hidden_effect_is_found(tmp_path):
+    output = output_of('find_hidden_effect.py', tmp_path)
+    assert re.findall(r'Missing effect: (\w+)', output) == ['offset_temperature']
+    assert output.endswith('Verdict: explained.\n')
+
+
+def test_recording_is_calibrated_from_end_to_end(tmp_path):
+    output = output_of('calibrate_recording.py', tmp_path)
+    assert 'Calibration(model 10; 18 of 18 poses' in output
+    before, after = map(float, re.search(r'residual (\S+) -> (\S+) mg', output).groups())
+    assert before > 20.0
+    assert after < 0.5
+    assert output.endswith('Corrected force in the flat pose [g]: [0. 0. 1.]\n')
+
+
+@pytest.mark.parametrize('name', EXAMPLES)
+def test_examples_use_nothing_but_the_public_face(name):
+    text = (ROOT / 'examples' / name).read_text(encoding='utf-8')
+    imports = re.findall(r'^(?:from|import) .*', text, re.MULTILINE)
+    own = [line for line in imports if 'accel_calib' in line]
+    assert own == ['import accel_calib as ac']
+
+
+@pytest.mark.parametrize('name', EXAMPLES)
+def test_every_example_is_run(name):
+    assert f"output_of('{name}'" in Path(__file__).read_text(encoding='utf-8')
