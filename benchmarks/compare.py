@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How often repeat runs of one sensor are said to agree, and a change of it is found.
+Repeat runs of one sensor: how often they are reported to agree, and how often a change is found.
 
-Poses spread evenly in a random attitude, noise of a pose mean 0.3 mg by axis; a sensor is drawn
-for each set. The change is 1 mg of offset on one axis in one run::
+Each set draws a sensor. The poses are spread evenly in a random attitude, with 0.3 mg of noise per
+pose mean and axis. The change is 1 mg of offset on one axis in one run::
 
     python benchmarks/compare.py --sets 200 --markdown docs/figures/compare.md
 
@@ -24,7 +24,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import Calibration, compare, Comparison, fit_poses  # noqa: E402
+from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
+from accel_calib.compare import compare, Comparison  # noqa: E402
 from accel_calib.model import Model  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import rotation_from_rpy, spread_directions  # noqa: E402
@@ -34,15 +35,17 @@ from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from shared import sensor  # noqa: E402
 
-_SAID = """\
-Repeat runs of one simulated sensor, noise of a pose mean 0.3 mg by axis; then with 1 mg of offset
-added on one axis in one run. Two runs of 12 poses have six residuals to tell their noise by, and
-1 mg is there four to five standard deviations of an offset; measured noise is not fully believed.
+_ABOUT = """\
+Repeat runs of one simulated sensor, with 0.3 mg of noise per pose mean and axis, compared as they
+are and with 1 mg of offset added on one axis in one run. Two runs of 12 poses leave six residuals
+to estimate the noise from, and 1 mg is four to five standard deviations of an offset there.
+Measured noise is not fully believed.
 
-A cross-axis gain of 0.3 mg/g is as small as what 12 poses leave it known to: `auto` takes model 10
-where the noise makes it look larger, and model 7, which says zero, elsewhere. Over 20 runs that
-choice shows; with `--model 10` it does not. Where the noise is really twice that of the samples,
-some poses look disturbed and are left out, so that the residuals of the rest tell too little.
+12 poses determine a cross-axis gain to about 0.3 mg/g. Where a sensor has so little, `auto`
+chooses model 10 if the noise makes it look larger, and otherwise model 7, which sets it to zero.
+The comparison of 20 runs detects this difference; with `--model 10` there is none. Where the noise
+is really twice that of the samples, some poses look like outliers and are left out, and the
+residuals of the others understate the noise.
 """
 
 CHANGE_G = 1e-3
@@ -52,19 +55,19 @@ MOST_FALSE = 0.05
 @dataclass(frozen=True)
 class Case:
     """
-    What is repeated.
+    The runs of one set.
 
     Parameters
     ----------
     runs, poses : int
-        Number of runs, and of poses of each.
+        Number of runs, and of poses per run.
     model : str
-        What is fitted.
+        The model that is fitted.
     noise : {'known', 'unknown', 'twice'}
-        Whether the poses state it, or state half of it.
+        Whether the poses state their noise; it is really twice what they state for 'twice'.
     cross_axis : float
-        Cross-axis gain over that of a common sensor: where it is as small as the noise,
-        ``auto`` takes now model 7, now 10.
+        Factor on the cross-axis gain of a common sensor. Where the result is as small as the
+        noise, ``auto`` chooses sometimes model 7, sometimes 10.
 
     """
 
@@ -76,7 +79,7 @@ class Case:
 
     @property
     def words(self) -> str:
-        """Say so for the table."""
+        """Return the case in words, for the table."""
         noise = {'known': '', 'unknown': ', noise not given',
                  'twice': ', noise really twice that of the samples'}[self.noise]
         small = '' if self.cross_axis == 1.0 else f' (cross-axis {self.cross_axis * 10:.1f} mg/g)'
@@ -90,7 +93,7 @@ CASES = (*(Case(runs) for runs in (2, 5, 20)), Case(2, 24), Case(5, 24),
 
 
 def fitted(model: Model, case: Case, rng: np.random.Generator) -> Calibration:
-    """Take poses and fit them."""
+    """Simulate a run and fit it."""
     attitude = rotation_from_rpy(*rng.uniform(-np.pi, np.pi, 3))
     poses = simulate_poses(model, spread_directions(case.poses) @ attitude.T, rng)
     if case.noise == 'unknown':
@@ -102,7 +105,7 @@ def fitted(model: Model, case: Case, rng: np.random.Generator) -> Calibration:
 
 
 def measured(case: Case, sets: int, seed: int) -> list[tuple[Comparison, Comparison, int]]:
-    """Compare runs as they are, and with one of them changed; and give which."""
+    """Compare the runs unchanged and with one changed; return both, and which one changed."""
     found = []
     for number in range(sets):
         rng = np.random.default_rng([seed, CASES.index(case), number])
@@ -119,21 +122,21 @@ def measured(case: Case, sets: int, seed: int) -> list[tuple[Comparison, Compari
 
 
 def lines_of(case: Case, found: Sequence[tuple[Comparison, Comparison, int]]) -> list[Line]:
-    """Give the lines of a case."""
+    """Return the lines of a case."""
     count = len(found)
     false = sum(not same.agree for same, _, _ in found)
     seen = sum(not changed.agree for _, changed, _ in found)
     named = sum(changed.outlier == which for _, changed, which in found)
     ratio = np.median([one.ratio for same, _, _ in found for one in same.parameters if one.ratio])
     asked = case.noise != 'twice'
-    lines = [Line(f'{case.words}: said to differ and do not', _share(false, count),
+    lines = [Line(f'{case.words}: equal runs reported to differ', _share(false, count),
                   '≤ 5 %' if asked else '', count, false <= MOST_FALSE * count if asked else None),
-             Line(f'{case.words}: 1 mg in one run found', _share(seen, count), '', count, None)]
+             Line(f'{case.words}: 1 mg in one run detected', _share(seen, count), '', count, None)]
     if case.runs > 2:
-        lines.append(Line(f'{case.words}: and the run named', _share(named, count), '', count,
+        lines.append(Line(f'{case.words}: the changed run named', _share(named, count), '', count,
                           None))
     if case.runs > 5:
-        lines.append(Line(f'{case.words}: spread of a parameter over the stated deviation, median',
+        lines.append(Line(f'{case.words}: spread of a parameter over its stated deviation, median',
                           f'{ratio:.2f}', '', count, None))
     return lines
 
@@ -155,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines += lines_of(case, measured(case, sets, given.seed))
         print(case.words, file=sys.stderr, flush=True)
     command = f'python benchmarks/compare.py --sets {given.sets} --seed {given.seed}'
-    publish(f'# Figures of compare\n\nMade by `{command} --markdown FILE`.\n\n{_SAID}\n'
+    publish(f'# Figures of compare\n\nMade by `{command} --markdown FILE`.\n\n{_ABOUT}\n'
             f'{table(lines)}\n', given.markdown)
     return 0
 

@@ -1,18 +1,34 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables that the benchmarks print and write into the docs: asked beside measured."""
+"""The pages that the benchmarks write: tables of what is measured beside what is asked."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import os
 from pathlib import Path
+import platform
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table: what, measured, asked, over how many sets, and whether it is met."""
+    """
+    One line of a table.
+
+    Parameters
+    ----------
+    what : str
+        The quantity, with its unit.
+    measured, asked : str
+        Its value, and the limit; an empty limit if nothing is asked.
+    sets : int
+        Number of sets, repeats or poses behind the value.
+    met : bool or None
+        Whether the value is within the limit; None if nothing is asked.
+
+    """
 
     what: str
     measured: str
@@ -22,7 +38,7 @@ class Line:
 
 
 def table(lines: Sequence[Line]) -> str:
-    """Give the table as Markdown; `met` is empty where nothing was asked."""
+    """Return the lines as a Markdown table."""
     rows = ['| | measured | asked | sets | met |', '|---|---|---|---|---|']
     words = {True: 'yes', False: '**no**', None: ''}
     rows += [f'| {x.what} | {x.measured} | {x.asked} | {x.sets} | {words[x.met]} |' for x in lines]
@@ -30,7 +46,18 @@ def table(lines: Sequence[Line]) -> str:
 
 
 def publish(page: str, path: Path | None) -> None:
-    """Print a page, and write it where that is asked for."""
+    """Print a page, and write it to the path if there is one."""
     print(page)
     if path is not None:
         path.write_text(page, encoding='utf-8')
+
+
+def processor() -> str:
+    """Return the processor, its number of cores and the load of the machine now."""
+    try:
+        text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
+        name = next(line.split(':')[1].strip() for line in text.splitlines()
+                    if line.startswith('model name'))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}'

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How long fits take: one sensor, a fleet, and up to a million poses or sensors.
+Time of fits: one sensor, up to a million poses, and the refinement of 5,000 poses.
 
-Everything runs on one core, beside what people write when they need such a fit: the ellipsoid by
-numpy's least squares for the closed form, and scipy's `least_squares` with differences for the
-likelihood. Times are CPU time, the least of many runs, or of a few where one takes long::
+Everything runs on one core. The closed form is compared with the ellipsoid by numpy's least
+squares, the likelihood with scipy's `least_squares` and its numerical derivatives; both are what
+people commonly write by hand. Times of fits are CPU time, the least of several runs. A refinement
+runs in a fresh process, on poses of an independent generator (`test/generator.py`); its memory is
+that of the process::
 
     python benchmarks/fits.py --markdown docs/figures/fits.md
 
@@ -15,33 +17,47 @@ likelihood. Times are CPU time, the least of many runs, or of a few where one ta
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 import os
 from pathlib import Path
 import platform
 import sys
+from tempfile import TemporaryDirectory
 import time
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import closed_form, fit_many, fit_poses  # noqa: E402
+from accel_calib.calibrate import fit_poses  # noqa: E402
+from accel_calib.estimate.closed_form import closed_form  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
+from generator import Setup, simulate, write_csv  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import Case, draw, draw_sensor, NOISE, spread  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
+from trial import trial  # noqa: E402
 
 G = units_of('g')
 SEED = 2031
-FLEET = 100_000
 _LONG_ENOUGH, _TOO_LONG = 1.0, 5.0
+
+REFINED = 5_000
+"""Poses of a refinement."""
+
+HIDDEN: tuple[Mapping[str, float], ...] = (
+    {'offset_temperature': 3.0}, {'offset_temperature': 5.0, 'quadratic': 5.0},
+    {'offset_wander': 3.0}, {})
+"""Sizes of the effects that hide in the poses of a refinement, by name."""
+
+Curves = dict[str, tuple[list[int], list[float]]]
 
 
 def least_time(work: Callable[[], object]) -> float:
-    """Give the least CPU time of the work [s], over a second or three runs."""
+    """Return the least CPU time of the work [s]: of 1 s of runs, or of 3 runs within 5 s."""
     times: list[float] = []
     while sum(times) < _LONG_ENOUGH or (len(times) < 3 and sum(times) < _TOO_LONG):
         start = time.process_time()
@@ -62,7 +78,7 @@ def plain_ellipsoid(reading: Floats) -> Floats:
 
 
 def plain_likelihood(reading: Floats) -> Floats:
-    """Fit |M (reading - V)| = 1 as one does by hand: least squares with differences."""
+    """Fit |M (reading - V)| = 1 as one does by hand: least squares, numerical derivatives."""
     def residual(values: Floats) -> Floats:
         mat_m = values[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
         return np.linalg.norm((reading - values[6:]) @ mat_m, axis=1) - 1.0
@@ -73,16 +89,16 @@ def plain_likelihood(reading: Floats) -> Floats:
 
 def one_sensor() -> Iterator[Line]:
     """Measure fits of one sensor."""
-    for count, closed, likely in ((12, 60.0, 1.5), (36, 60.0, 2.0), (1000, 100.0, 10.0)):
+    for count, closed, likely in ((12, 60.0, 2.0), (36, 60.0, 2.5), (1000, 100.0, 10.0)):
         case = draw(np.random.default_rng([SEED, count]), count)
         reading = case.poses.reading
-        took = least_time(partial(closed_form.fit_10, reading)) * 1e6
+        took = least_time(partial(closed_form, '10', reading)) * 1e6
         beside = least_time(partial(plain_ellipsoid, reading)) * 1e6
         yield Line(f'closed form, {count} poses [µs] (by hand)', f'{took:.0f} ({beside:.0f})',
                    f'≤ {closed:g}', 1, took <= closed)
         took = least_time(partial(fit_poses, case.poses, G, model='10')) * 1e3
         beside = least_time(partial(plain_likelihood, reading)) * 1e3
-        yield Line(f'likelihood, geometry, disturbed poses, covariance, quality: {count} poses '
+        yield Line(f'likelihood with geometry, outliers, covariance and quality: {count} poses '
                    '[ms] (values alone, by hand)', f'{took:.2f} ({beside:.2f})', f'≤ {likely:g}',
                    1, took <= likely)
         took = least_time(partial(fit_poses, case.poses, G)) * 1e3
@@ -90,60 +106,62 @@ def one_sensor() -> Iterator[Line]:
                    f'{took:.2f}', '', 1, None)
 
 
-def fleet_of(sensors: int, poses: int = 12) -> tuple[Floats, Floats]:
-    """Draw readings of a fleet and their noise, (m, n, 3)."""
-    rng = np.random.default_rng([SEED, sensors])
-    force = np.stack([spread(poses, rng) for _ in range(min(sensors, 1000))])
+def readings_of(sensors: int, poses: int = 12) -> Floats:
+    """Draw readings of many sensors, (m, n, 3)."""
+    rng = np.random.default_rng([SEED, 100_000])
+    force = np.stack([spread(poses, rng) for _ in range(1000)])
     gain = np.stack([draw_sensor(rng, '10').gain for _ in range(len(force))])
     reading = np.resize(force @ gain, (sensors, poses, 3))
-    return reading + NOISE * rng.normal(size=reading.shape), np.full(reading.shape, NOISE)
+    return reading + NOISE * rng.normal(size=reading.shape)
 
 
-def fleets() -> Iterator[Line]:
-    """Measure fits of many sensors."""
-    reading, noise = fleet_of(FLEET)
-    each = []
-    for method, least in (('algebraic', 40_000), ('ml', 5_000)):
-        took = least_time(partial(fit_many, reading, G, method=method, noise=noise))
-        rate = len(reading) / took
-        each.append(rate)
-        what = 'closed form' if method == 'algebraic' else 'likelihood and disturbed poses'
-        yield Line(f'{FLEET:,} sensors of 12 poses, {what}, uncertainty: sensors/s',
-                   f'{rate:,.0f}', f'≥ {least:,}', FLEET, rate >= least)
-    took = least_time(partial(closed_form.fit_10, reading[:1000]))
-    yield Line('closed form alone, 1,000 sensors at a time: sensors/s', f'{1000 / took:,.0f}', '',
-               1000, None)
+def many_sensors() -> Line:
+    """Measure the closed form of many sensors in one call."""
+    took = least_time(partial(closed_form, '10', readings_of(1000)))
+    return Line('closed form alone, 1,000 sensors at a time: sensors/s', f'{1000 / took:,.0f}', '',
+                1000, None)
 
 
-def growth() -> tuple[dict[str, tuple[list[int], list[float]]], list[Line]]:
-    """Measure how the time grows with poses and with sensors, to a million of each."""
+def refinements(hidden: Sequence[Mapping[str, float]]) -> Iterator[Line]:
+    """Measure refinements of large tables."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / 'poses.csv'
+        for effects in hidden:
+            made = simulate(np.random.default_rng([SEED, REFINED]), effects, Setup(poses=REFINED))
+            write_csv(path, made.columns)
+            found = trial('refined', path)
+            what = (f'refine, {REFINED:,} poses with {" and ".join(effects) or "nothing"} hidden '
+                    f'({found["result"]})')
+            yield Line(f'{what}: time [s]', f'{found["seconds"]:.1f}', '≤ 10', 1,
+                       found['seconds'] <= 10.0)
+            yield Line(f'{what}: largest memory, with imports [MB]', f'{found["megabytes"]:.0f}',
+                       '≤ 300', 1, found['megabytes'] <= 300.0)
+
+
+def growth() -> tuple[Curves, list[Line]]:
+    """Measure how the time grows with the poses, up to a million."""
     sizes = [10 ** k for k in range(2, 7)]
-    curves: dict[str, tuple[list[int], list[float]]] = {}
     cases = {size: draw(np.random.default_rng([SEED, size]), size) for size in sizes}
-    reading, noise = fleet_of(sizes[-1])
 
     def closed(case: Case) -> object:
-        return closed_form.fit_10(case.poses.reading)
+        return closed_form('10', case.poses.reading)
 
     def likely(case: Case) -> object:
         return fit_poses(case.poses, G, model='10')
 
-    for name, work in (('poses of one sensor, closed form', closed),
-                       ('poses of one sensor, likelihood', likely)):
-        curves[name] = sizes, [least_time(partial(work, cases[size])) for size in sizes]
-    for method, name in (('algebraic', 'sensors of 12 poses, closed form'),
-                         ('ml', 'sensors of 12 poses, likelihood')):
-        curves[name] = sizes, [least_time(partial(
-            fit_many, reading[:size], G, method=method, noise=noise[:size])) for size in sizes]
+    curves: Curves = {}
     lines = []
-    for name, (at, took) in curves.items():
-        slope = float(np.polyfit(np.log(at[-3:]), np.log(took[-3:]), 1)[0])
-        lines.append(Line(f'{name}: time at {at[-1]:,} [s], and its exponent from {at[-3]:,}',
-                          f'{took[-1]:.3g}, {slope:.2f}', 'exponent ≤ 1.1', at[-1], slope <= 1.1))
+    for name, work in (('closed form', closed), ('likelihood', likely)):
+        took = [least_time(partial(work, cases[size])) for size in sizes]
+        curves[name] = sizes, took
+        slope = float(np.polyfit(np.log(sizes[-3:]), np.log(took[-3:]), 1)[0])
+        lines.append(Line(f'{name}: time of {sizes[-1]:,} poses [s], and its exponent from '
+                          f'{sizes[-3]:,}', f'{took[-1]:.3g}, {slope:.2f}', 'exponent ≤ 1.1',
+                          sizes[-1], slope <= 1.1))
     return curves, lines
 
 
-def draw_growth(curves: dict[str, tuple[list[int], list[float]]], path: Path) -> None:
+def draw_growth(curves: Curves, path: Path) -> None:
     """Draw the growth, log-log."""
     from matplotlib.figure import Figure
 
@@ -151,7 +169,7 @@ def draw_growth(curves: dict[str, tuple[list[int], list[float]]], path: Path) ->
     axes = figure.add_subplot()
     for name, (at, took) in curves.items():
         axes.loglog(at, took, marker='o', label=name)
-    axes.set_xlabel('poses, or sensors')
+    axes.set_xlabel('poses')
     axes.set_ylabel('CPU time [s]')
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
@@ -161,20 +179,21 @@ def draw_growth(curves: dict[str, tuple[list[int], list[float]]], path: Path) ->
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='leave the growth out')
+    parser.add_argument('--quick', action='store_true',
+                        help='without the growth, and with one refinement')
     parser.add_argument('--markdown', type=Path, help='write table and figure beside this file')
     given = parser.parse_args(arguments)
-    lines = [*one_sensor(), *fleets()]
+    before = processor()
+    lines = [*one_sensor(), many_sensors(), *refinements(HIDDEN[:1] if given.quick else HIDDEN)]
     drawn = ''
     if not given.quick:
         curves, grown = growth()
         lines += grown
         if given.markdown:
             draw_growth(curves, given.markdown.with_suffix('.svg'))
-            drawn = f'\n![time over poses and sensors]({given.markdown.stem}.svg)\n'
-    text = (f'# Figures of fits\n\n{__doc__.strip()}\n\n{platform.machine()}, {os.cpu_count()} '
-            f'cores, Python {platform.python_version()}, numpy {np.__version__}; load '
-            f'{os.getloadavg()[0]:.1f} at the end.\n\n{table(lines)}\n{drawn}')
+            drawn = f'\n![time over poses]({given.markdown.stem}.svg)\n'
+    text = (f'# Figures of fits\n\n{__doc__.strip()}\n\n{before} before; Python '
+            f'{platform.python_version()}, numpy {np.__version__}.\n\n{table(lines)}\n{drawn}')
     publish(text, given.markdown)
     return 0
 

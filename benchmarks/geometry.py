@@ -1,14 +1,15 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Poses that cannot carry model 10: are they refused, and does the way out lead out.
 
-12 poses of a sensor with offset, gains and cross-axis gains, noise of a pose mean 0.3 mg an axis,
-in directions that are poor in some way and by some degrees, and in good ones. For each set: is the
-fit refused; by how much is |a| wrong (RMS over fresh directions) where it is not; by how much had
-it been fitted all the same; which smaller model is offered; and how good is the fit once the poses
-that the refusal names have been added, each held 5° off. "5 directions, held 1° off" are poses 1°
-off in each of two axes. Of 12 random directions one set in a hundred leaves a gap of its own.
+"""
+Poses that do not determine model 10: whether they are refused, and whether the advice helps.
+
+12 poses of a sensor with offset, gains and cross-axis gains, 0.3 mg of noise per pose mean and
+axis, in good directions and in directions that are poor in some way. Each set is fitted. The
+tables have the share that is refused; the RMS error of |a| on fresh directions where it is fitted,
+and where it is fitted although it is refused; the smaller model that the refusal offers; and the
+error with the poses added that the refusal names, each held 5° off. "Held 1° off" means 1° in each
+of two axes. Some sets of 12 random directions leave a region of the sphere uncovered.
 
 """
 
@@ -23,9 +24,11 @@ import sys
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from accel_calib.calibrate import closed_form, fit_poses  # noqa: E402
-from accel_calib.calibrate.likelihood import fit_norm  # noqa: E402
+from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
+from accel_calib.estimate.closed_form import closed_form  # noqa: E402
+from accel_calib.estimate.fit import estimate  # noqa: E402
+from accel_calib.estimate.robust import start_of  # noqa: E402
 from accel_calib.model import predict, sensor_force  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
@@ -38,22 +41,42 @@ G = units_of('g')
 COUNT = 12
 MODELS = ('4', '7', '9', '10', '12')
 FAR = 10.0
-"""An error of |a| that no one would want: twice that of leaving the cross-axis gains out [mg]."""
+"""An error of |a| that nobody accepts: twice that of leaving out the cross-axis gains [mg]."""
 
 Draw = Callable[[np.random.Generator], Floats]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a set: errors in mg, NaN where there is none."""
+    """
+    The result of a set; errors are RMS errors of |a| [mg], NaN if there is no fit.
+
+    Parameters
+    ----------
+    refused : bool
+        Whether model 10 is refused.
+    determined : tuple of bool
+        Whether each model of `MODELS` is fitted.
+    error : float
+        Of model 10, or of the smaller model that the refusal offers.
+    forced : float
+        Of model 10, fitted even if it is refused; infinite if that fails.
+    offered : str
+        The smaller model that the refusal offers; empty if there is none.
+    added : int
+        Number of poses that the refusal names.
+    with_added : float
+        Of model 10 with these poses.
+
+    """
 
     refused: bool
-    carried: tuple[bool, ...]
+    determined: tuple[bool, ...]
     error: float
     forced: float
     offered: str
     added: int
-    mended: float
+    with_added: float
 
 
 def held(directions: Floats, degrees: float, rng: np.random.Generator) -> Floats:
@@ -109,26 +132,27 @@ CASES: dict[str, tuple[Draw, float | None]] = {
        for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
     'random directions': (lambda rng: random_directions(COUNT, rng), 0.0),
     'spread, held 10° off': (lambda rng: held(spread_directions(COUNT), 10.0, rng), 0.0)}
-"""How the directions are drawn, and the share of the sets that is to be refused, where known."""
+"""How the directions are drawn, and the share of sets to be refused; None: nothing is asked."""
 
 
 def rms(force: Floats) -> float:
-    """Give the RMS error of |force| [mg]."""
+    """Return the RMS error of |force| [mg]."""
     return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * MG)
 
 
 def forced(poses: Poses, reading: Floats) -> float:
-    """Give the error of a fit that is not refused, without asking whether it should be."""
+    """Return the error of a fit [mg], whatever the geometry; infinite if it fails."""
+    if not np.all(np.isfinite(closed_form('10', poses.reading)[0])):
+        return np.inf
     try:
-        start = closed_form.fit_10(poses.reading)
-        fit = fit_norm('10', *start, poses.reading, poses.noise)
-        return rms(sensor_force(fit.model, reading, {}))
+        model = estimate(start_of('10', poses.reading), poses).model
+        return rms(sensor_force(model, reading, {}))
     except (RefusedFitError, np.linalg.LinAlgError):
         return np.inf
 
 
 def fitted(poses: Poses, reading: Floats, model: str) -> float:
-    """Give the error of a fit; NaN where it is refused."""
+    """Return the error of a fit [mg]; NaN if it is refused."""
     try:
         return rms(fit_poses(poses, G, model=model).correct(reading))
     except RefusedFitError:
@@ -136,7 +160,7 @@ def fitted(poses: Poses, reading: Floats, model: str) -> float:
 
 
 def named(advice: str) -> Floats:
-    """Give the directions that words such as (+x -z) name, (n, 3)."""
+    """Return the directions that words such as (+x -z) name, (n, 3)."""
     found = []
     for part in re.findall(r'\([-+xyz ]+\)', advice):
         signs = {axis: float(f'{sign}1') for sign, axis in re.findall('([+-])([xyz])', part)}
@@ -155,29 +179,29 @@ def run(draw: Draw, seed: Sequence[int]) -> Outcome:
     poses = simulate_poses(model, directions, rng)
     error = forced(poses, reading)
     known = poses.with_columns(reference=directions)
-    carried = tuple(not np.isnan(fitted(known if name == '12' else poses, reading, name))
-                    for name in MODELS)
+    determined = tuple(not np.isnan(fitted(known if name == '12' else poses, reading, name))
+                       for name in MODELS)
     try:
         found = rms(fit_poses(poses, G, model='10').correct(reading))
-        return Outcome(False, carried, found, error, '', 0, np.nan)
+        return Outcome(False, determined, found, error, '', 0, np.nan)
     except RefusedFitError as refusal:
         more = named(refusal.advice)
         offer = re.search(r'or use model (\d+)', refusal.advice)
         offered = offer.group(1) if offer else ''
         again = joined(poses, simulate_poses(model, held(more, 5.0, rng), rng))
         smaller = fitted(poses, reading, offered) if offered else np.nan
-        return Outcome(True, carried, smaller, error, offered, len(more),
+        return Outcome(True, determined, smaller, error, offered, len(more),
                        fitted(again, reading, '10'))
 
 
 def joined(poses: Poses, more: Poses) -> Poses:
-    """Put poses behind others."""
+    """Return poses followed by others."""
     columns = {key: np.concatenate([poses[key], more[key]]) for key in poses.columns}
     return Poses(columns, numbered(columns))
 
 
 def median(values: Sequence[float]) -> str:
-    """Give the median and the worst as text; empty where there is none."""
+    """Return the median and the largest value as text; empty if there is none."""
     known = [value for value in values if not np.isnan(value)]
     if not known:
         return ''
@@ -185,7 +209,7 @@ def median(values: Sequence[float]) -> str:
 
 
 def row(name: str, outcomes: Sequence[Outcome]) -> str:
-    """Make a row of the table by case."""
+    """Return a row of the table by case."""
     out = [each for each in outcomes if each.refused]
     kept = [each for each in outcomes if not each.refused]
     offers = [f'{np.mean([each.offered == name for each in out]):.0%} {name}'
@@ -193,12 +217,12 @@ def row(name: str, outcomes: Sequence[Outcome]) -> str:
     cells = [name, f'{len(out) / len(outcomes):.1%}', median([each.forced for each in out]),
              median([each.error for each in kept]), ', '.join(offers),
              median([each.error for each in out]),
-             median([each.added for each in out]), median([each.mended for each in out])]
+             median([each.added for each in out]), median([each.with_added for each in out])]
     return f'| {" | ".join(cells)} |'
 
 
 def lines_of(name: str, outcomes: Sequence[Outcome], share: float | None) -> list[Line]:
-    """Make the lines of what was asked."""
+    """Return the lines of what is asked of a case."""
     if share is None:
         return []
     refused = float(np.mean([each.refused for each in outcomes]))
@@ -207,17 +231,17 @@ def lines_of(name: str, outcomes: Sequence[Outcome], share: float | None) -> lis
 
 
 def overall(outcomes: Sequence[Outcome]) -> list[Line]:
-    """Make the lines over all sets."""
+    """Return the lines over all sets."""
     far = [each for each in outcomes if each.forced > FAR]
     out = [each for each in outcomes if each.refused]
     kept = [each.error for each in outcomes if not each.refused]
-    mended = float(np.mean([each.mended <= 0.6 for each in out]))
+    helped = float(np.mean([each.with_added <= 0.6 for each in out]))
     caught = float(np.mean([each.refused for each in far]))
     return [Line(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
                  f'{caught:.2%}', '100 %', len(far), caught == 1.0),
             Line('all sets fitted: error of the norm, median (worst) [mg]', median(kept), '',
                  len(kept), None),
-            Line('all sets refused: within 0.6 mg once the poses named are added', f'{mended:.1%}',
+            Line('all sets refused: within 0.6 mg once the poses named are added', f'{helped:.1%}',
                  '', len(out), None)]
 
 
@@ -229,9 +253,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--markdown', type=Path, help='write the tables to this file')
     given = parser.parse_args(arguments)
     lines, everything = [], []
-    heads = ('12 poses', 'refused for 10', 'error had it been fitted, median (worst) [mg]',
-             'error where it was fitted [mg]', 'offered instead', 'error of that [mg]',
-             'poses to add', 'error with them [mg]')
+    heads = ('12 poses', 'model 10 refused', 'error of the refused fit, median (worst) [mg]',
+             'error if not refused [mg]', 'offered instead', 'its error [mg]', 'poses to add',
+             'error with them [mg]')
     rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
     models = [f'| refused for model | {" | ".join(MODELS)} |', '|---' * 6 + '|']
     for name, (draw, share) in CASES.items():
@@ -239,7 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         everything += outcomes
         lines += lines_of(name, outcomes, share)
         rows.append(row(name, outcomes))
-        shares = 1.0 - np.mean([each.carried for each in outcomes], axis=0)
+        shares = 1.0 - np.mean([each.determined for each in outcomes], axis=0)
         models.append(f'| {name} | {" | ".join(f"{each:.1%}" for each in shares)} |')
     text = (f'# Figures of poor geometry\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/geometry.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'

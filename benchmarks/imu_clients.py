@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The processes around the node: a driver, a user, and bare relays to compare with.
+The processes around the node: a driver, a user, and bare relays for comparison.
 
-A driver stamps each message with the monotonic clock and notes the stamps; a user notes stamp and
-arrival. Both write what they noted as arrays when they are told to end, by the end of standard
-input. All are as cheap as rclpy allows: serialized messages under EventsExecutor. Qualities of
-service are those of the node, so that nothing but the work differs.
+The driver stamps each message with the monotonic clock and records the stamps; the user records
+stamp and arrival. Both write their records as arrays at the end of standard input. All are as
+cheap as rclpy allows: serialized messages under EventsExecutor. They have the qualities of service
+of the node, so that only the work differs.
 
 """
 
@@ -43,7 +43,7 @@ NANO = 1_000_000_000
 
 
 def messages(turning: bool, rng: np.random.Generator) -> list[bytearray]:
-    """Make messages of a sensor at rest in some attitude, or on its way to another."""
+    """Return messages of a sensor at rest in a random attitude, or turning."""
     direction = rng.normal(size=3)
     direction *= GRAVITY / np.linalg.norm(direction)
     noise, gyro = (3.0, 1.0) if turning else (0.02, 0.002)
@@ -63,14 +63,14 @@ def messages(turning: bool, rng: np.random.Generator) -> list[bytearray]:
 
 
 def ended() -> Any:
-    """Give a function that tells whether standard input has come to its end."""
+    """Return a function that returns whether standard input has ended."""
     over = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
     return over.is_set
 
 
 def drive(rate: float, file: Path) -> None:
-    """Publish so many messages a second, or without a pause for 0."""
+    """Publish messages at a rate [1/s]; 0: without a pause."""
     node = Node('driver')
     imu = node.create_publisher(Imu, 'imu/data_raw', STREAM)
     temperature = node.create_publisher(Temperature, 'temperature', STREAM)
@@ -103,7 +103,7 @@ def drive(rate: float, file: Path) -> None:
 
 
 def listen(file: Path) -> None:
-    """Note stamp and arrival of what comes out."""
+    """Record stamp and arrival of the calibrated messages."""
     node = Node('user')
     heard: list[bytes] = []
     came = array('q')
@@ -113,13 +113,13 @@ def listen(file: Path) -> None:
         heard.append(data[4:12])
 
     node.create_subscription(Imu, 'imu/data_calibrated', on_imu, USER, raw=True)
-    executor, over, told = EventsExecutor(), ended(), False
+    executor, over, printed = EventsExecutor(), ended(), False
     executor.add_node(node)
     while not over():
         executor.spin_until_future_complete(Future(), timeout_sec=0.05)
-        if heard and not told:
+        if heard and not printed:
             print(came[0], flush=True)
-            told = True
+            printed = True
     stamps = np.frombuffer(b''.join(heard), '<i4,<u4')
     np.save(file, np.column_stack([stamps['f0'].astype(np.int64) * NANO + stamps['f1'],
                                    np.array(came[:len(heard)])]))
@@ -127,7 +127,7 @@ def listen(file: Path) -> None:
 
 
 def relay(kind: str) -> None:
-    """Publish what comes, changing nothing; or take it and do nothing."""
+    """Publish each message unchanged; a sink drops it."""
     node = Node('relay')
     out = node.create_publisher(Imu, 'imu/data_calibrated', STREAM)
     callback = out.publish if kind != 'sink' else lambda data: None
@@ -141,7 +141,7 @@ def relay(kind: str) -> None:
 
 
 def main() -> int:
-    """Be what the first argument says."""
+    """Run the process that the first argument names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('what', choices=['drive', 'listen', 'serialized', 'typed', 'sink'])
     parser.add_argument('--rate', type=float, default=1000.0)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The Imu path: what the node costs beside bare relays, in one run on one machine.
+The Imu path: the cost of the node beside bare relays, in one run on one machine.
 
-A driver, a relay or the node, and a user are processes of their own, side by side and again and
-again in turn; figures are medians over the turns, and ratios come first, for they travel best from
-machine to machine::
+A driver, a relay or the node, and a user are separate processes. The relays and the node take
+turns, and figures are medians over the turns. Ratios come first, because they depend least on the
+machine::
 
     python benchmarks/imu_path.py --markdown docs/figures/imu_path.md
 
@@ -35,7 +35,7 @@ from accel_calib.model import Model  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import spread_directions  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
 from imu_trial import node, relay, Trial, trial  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -51,13 +51,23 @@ PACES = {'five times a second': 0.2, 'back to back': 0.0}
 """Pauses between calls [s]."""
 
 OFTEN = ROOT / 'config' / 'fast_dds.xml'
-"""Has DDS announce a process more often than every 3 s."""
+"""Profile that makes DDS announce a process more often than every 3 s."""
+
+_ABOUT = """\
+Made by `python benchmarks/imu_path.py {command} --markdown FILE`. The node has a
+levelled 10-parameter calibration, and the messages have covariances, which makes the most work.
+Driver and user are rclpy processes too and share the cores with the node. A set is a turn of all
+trials. The CPU time of the node excludes its worker process, which fits and refines. A start waits
+until DDS finds the other processes, sometimes for an announcement that comes every 3 s. The caller
+of `~/fit` and `~/refine` is an rclpy process too, and calls that are back to back load it much.
+
+Machine: {machine}."""
 
 Trials = dict[str, list[Trial]]
 
 
 def calibration() -> Calibration:
-    """Make a levelled 10-parameter calibration; its poses have more in them than it knows of."""
+    """Return a levelled 10-parameter calibration; its poses have further effects."""
     rng = np.random.default_rng(SEED)
     directions = spread_directions(36)
     context = {'temperature': 25.0 + 10.0 * rng.uniform(-1.0, 1.0, len(directions))}
@@ -71,7 +81,7 @@ def calibration() -> Calibration:
 
 
 def refined(linear: Calibration) -> Calibration:
-    """Add effects of temperature and one that is not linear."""
+    """Return the calibration with effects of temperature and a non-linear one."""
     model = Model({**linear.model.values, **MORE}, linear.model.rotation)
     covariance = np.eye(len(model.vector)) * 1e-9
     size = len(linear.covariance)
@@ -81,7 +91,7 @@ def refined(linear: Calibration) -> Calibration:
 
 @contextmanager
 def stored() -> Iterator[tuple[Path, Path]]:
-    """Store both, with poses beside the linear one."""
+    """Store both calibrations, with poses beside the linear one."""
     with tempfile.TemporaryDirectory() as folder:
         linear, more = Path(folder) / 'linear.yaml', Path(folder) / 'refined.yaml'
         made = calibration()
@@ -93,7 +103,7 @@ def stored() -> Iterator[tuple[Path, Path]]:
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of a trial: from and to [ns], and how many calls were answered in it."""
+    """A part of a trial: begin and end [ns], and the number of calls answered in it."""
 
     began: int
     ended: int
@@ -101,14 +111,14 @@ class Phase:
 
 
 class Calls:
-    """Call services in one phase of a trial after the other."""
+    """Calls of services, in phases of a trial one after the other."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self.phases: dict[str, Phase] = {}
 
     def __call__(self) -> None:
-        """Let the stream be for a while, then call ``~/fit`` and ``~/refine``."""
+        """Wait for an idle phase, then call ``~/fit`` and ``~/refine``."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from std_srvs.srv import Trigger
@@ -140,27 +150,27 @@ class Calls:
 
 
 def median(trials: list[Trial], of: Callable[[Trial], float]) -> float:
-    """Give the median of a figure over trials."""
+    """Return the median of a figure over trials."""
     return float(np.median([of(each) for each in trials]))
 
 
 def ratio(trials: Trials, of: Callable[[Trial], float], one: str, other: str) -> float:
-    """Give the median of the ratio of two that ran in the same turn."""
+    """Return the median ratio of two programs that ran in the same turn."""
     return float(np.median([of(a) / of(b) for a, b in zip(trials[one], trials[other])]))
 
 
 def quantile(percent: float) -> Callable[[Trial], float]:
-    """Give the function that takes this percentile of the latency [µs]."""
+    """Return the function that returns this percentile of the latency [µs]."""
     return lambda each: float(np.percentile(each.latency_us, percent))
 
 
 def cpu(each: Trial) -> float:
-    """Give the CPU time a message [µs]."""
+    """Return the CPU time per message [µs]."""
     return each.cpu_us
 
 
 def at_1_khz(trials: Trials) -> list[Line]:
-    """Judge the trials at 1 kHz."""
+    """Return the lines of the trials at 1 kHz."""
     turns = len(trials['node'])
     over_raw = ratio(trials, cpu, 'node', 'serialized')
     over_typed = ratio(trials, cpu, 'node', 'typed')
@@ -171,23 +181,23 @@ def at_1_khz(trials: Trials) -> list[Line]:
     unheard = ratio(trials, cpu, 'unheard', 'sink')
     saved = median(trials['node'], cpu) - median(trials['unheard'], cpu)
     return [
-        Line('CPU a message at 1 kHz, over the bare serialized relay', f'{over_raw:.2f}', '≤ 1.5',
-             turns, over_raw <= 1.5),
-        Line('same, over the bare typed relay under the default executor', f'{over_typed:.2f}',
+        Line('CPU per message at 1 kHz, over the bare serialized relay', f'{over_raw:.2f}',
+             '≤ 1.5', turns, over_raw <= 1.5),
+        Line('the same, over the bare typed relay under the default executor', f'{over_typed:.2f}',
              '≤ 0.5', turns, over_typed <= 0.5),
         Line('latency p50, added to that of the serialized relay', f'{added:.0f} µs', '≤ 50 µs',
              turns, added <= 50.0),
         Line('latency p99, over that of the serialized relay', f'{p99:.2f}', '≤ 1.3', turns,
              p99 <= 1.3),
-        Line('CPU a message with temperature and non-linear effects, over the linear calibration',
-             f'{more:.2f}', '≤ 1.3', turns, more <= 1.3),
-        Line('CPU a message with nobody listening, over a bare subscriber that drops them',
+        Line('CPU per message with temperature and non-linear effects, over the linear '
+             'calibration', f'{more:.2f}', '≤ 1.3', turns, more <= 1.3),
+        Line('CPU per message without a listener, over a bare subscriber that drops them',
              f'{unheard:.2f} ({saved:.0f} µs less than with a listener)',
              'publishers cost nothing', turns, None)]
 
 
 def starts(relay_s: list[float], node_s: list[float], often_s: list[float]) -> list[Line]:
-    """Judge how long it took until the first message came out [s]."""
+    """Return the lines of the times to the first corrected message [s]."""
     def words(seconds: list[float]) -> str:
         return f'{np.median(seconds):.2f} s ({min(seconds):.2f} to {max(seconds):.2f})'
 
@@ -199,16 +209,16 @@ def starts(relay_s: list[float], node_s: list[float], often_s: list[float]) -> l
 
 
 def flooded(trials: Trials) -> Line:
-    """Judge the trials without a pause."""
+    """Return the line of the trials without a pause."""
     share = ratio(trials, lambda each: each.rate, 'node', 'serialized')
     rates = [median(trials[name], lambda each: each.rate) for name in ('node', 'serialized')]
-    return Line('flooded: messages/s that came through, over the bare serialized relay',
+    return Line('flooded: messages/s received, over the bare serialized relay',
                 f'{share:.2f} ({rates[0]:,.0f} of {rates[1]:,.0f})', '≥ 0.8',
                 len(trials['node']), share >= 0.8)
 
 
 def lossless(trials: Trials, seconds: float) -> Line:
-    """Judge the trial at 8 kHz."""
+    """Return the line of the trial at 8 kHz."""
     ours, bare = trials['node'][0], trials['serialized'][0]
     return Line(f'8 kHz for {seconds:.0f} s, depth 100: messages lost',
                 f'{ours.lost} of {len(ours.sent):,} (bare relay: {bare.lost})', '0', 1,
@@ -216,7 +226,7 @@ def lossless(trials: Trials, seconds: float) -> Line:
 
 
 def while_computing(runs: list[tuple[Trial, Calls]]) -> list[Line]:
-    """Judge the trials in which services compute."""
+    """Return the lines of the trials in which services compute."""
     lines = []
     for name in list(runs[0][1].phases)[1:]:
         ratios, lost, count = [], 0, 0
@@ -234,19 +244,9 @@ def while_computing(runs: list[tuple[Trial, Calls]]) -> list[Line]:
     return lines
 
 
-def machine() -> str:
-    """Describe the machine and what else it does."""
-    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
-    model = next((line.split(':')[1].strip() for line in lines if line.startswith('model name')),
-                 platform.machine())
-    return (f'{model}, {os.cpu_count()} cores that driver, node and user share; Linux '
-            f'{platform.release()}, Python {platform.python_version()}; load average before: '
-            f'{os.getloadavg()[0]:.1f}.')
-
-
 def figures_of(trials: Trials) -> str:
-    """Give the plain figures, for the noise of the machine to be seen."""
-    rows = ['| at 1 kHz | CPU a message, µs: median (least to most) | p50, µs | p99, µs |',
+    """Return the plain figures as Markdown; they show the noise of the machine."""
+    rows = ['| at 1 kHz | CPU per message, µs: median (least to most) | p50, µs | p99, µs |',
             '|---|---|---|---|']
     for name, each in trials.items():
         used = [one.cpu_us for one in each]
@@ -258,7 +258,7 @@ def figures_of(trials: Trials) -> str:
 
 
 def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
-    """Run all trials; give the lines of the table, then the plain figures."""
+    """Run all trials; yield the lines of the table, then the plain figures."""
     with stored() as (linear, more):
         commands = {'serialized': relay('serialized'), 'node': node(linear),
                     'refined': node(more), 'typed': relay('typed')}
@@ -288,7 +288,7 @@ def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
                 often_s.append(start(commands['node']))
                 del os.environ['FASTRTPS_DEFAULT_PROFILES_FILE']
             calls = Calls(seconds)
-            with stored() as (own, _):  # they store what they find
+            with stored() as (own, _):  # the services store their results
                 runs.append((trial(node(own, 'auto_capture:=false'), 1000.0, calls), calls))
             print(f'turn {turn + 1} of {turns}', file=sys.stderr, flush=True)
         many = {name: [trial(commands[name], 8000.0, lambda: time.sleep(long))]
@@ -299,22 +299,18 @@ def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
 
 
 def main() -> int:
-    """Print the table, and write it where that is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--turns', type=int, default=5)
     parser.add_argument('--quick', action='store_true', help='one short turn')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args()
-    words = machine()
+    before = (f'{processor()} before; Linux {platform.release()}, '
+              f'Python {platform.python_version()}')
     lines, plain = run(*((1, 2.0, 5.0) if given.quick else (given.turns, 6.0, 60.0)))
-    text = (f'# Figures of the Imu path\n\nMade by `python benchmarks/imu_path.py --turns '
-            f'{given.turns} --markdown FILE`. {words}\n'
-            'The node has a levelled 10-parameter calibration, and the messages have\n'
-            'covariances, which makes the most work. Driver and user are rclpy processes\n'
-            'too; a set is a turn of all trials. A start waits for DDS to find\n'
-            'the others, in some cases for an announcement that comes every 3 s.\n'
-            'The caller of `~/fit` and `~/refine` is an rclpy process too, and back to back it\n'
-            f'takes half a core.\n\n{table(lines)}\n\n{plain}\n')
+    command = '--quick' if given.quick else f'--turns {given.turns}'
+    text = (f'# Figures of the Imu path\n\n{_ABOUT.format(command=command, machine=before)}\n\n'
+            f'{table(lines)}\n\n{plain}\n')
     publish(text, given.markdown)
     return 0
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One trial of the Imu path: a driver, a relay or the node, and a user, each a process."""
+"""One trial of the Imu path: a driver, a relay or the node, and a user, one process each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLIENTS = ROOT / 'benchmarks' / 'imu_clients.py'
 Stamps = NDArray[np.int64]
 
 SETTLE = 2.0
-"""After the first message came through, before anything is measured [s]."""
+"""Time from the first message to the start of the measurement [s]."""
 
 _DOMAINS = itertools.islice(itertools.cycle(range(1, 102)), os.getpid() % 101, None)
 
@@ -33,20 +33,20 @@ _DOMAINS = itertools.islice(itertools.cycle(range(1, 102)), os.getpid() % 101, N
 @dataclass(frozen=True)
 class Trial:
     """
-    What was measured in a stretch of time.
+    The measurements of one interval.
 
     Parameters
     ----------
     cpu : float
-        CPU time of the process between driver and user [s].
+        CPU time of the process between driver and user, without the processes that it starts [s].
     start : float
-        From the start of that process to the first message that came through it [s].
+        Time from the start of that process to the first message that the user receives [s].
     first, last : int
-        Begin and end [ns].
+        Begin and end of the interval [ns].
     sent : (n,) array
-        Stamps of the messages of the driver [ns].
+        Stamps of the messages that the driver sent [ns].
     heard : (m, 2) array
-        Stamp and arrival of the messages that the user heard [ns].
+        Stamp and arrival of the messages that the user received [ns].
 
     """
 
@@ -58,40 +58,40 @@ class Trial:
     heard: Stamps
 
     def between(self, first: int, last: int) -> Trial:
-        """Give the messages of a shorter stretch."""
+        """Return the messages of a shorter interval."""
         sent, heard = self.sent, self.heard
         return replace(self, first=first, last=last, sent=sent[(sent >= first) & (sent < last)],
                        heard=heard[(heard[:, 0] >= first) & (heard[:, 0] < last)])
 
     @property
     def latency_us(self) -> NDArray[np.float64]:
-        """Give the time of each message from driver to user [µs]."""
+        """Return the time of each message from driver to user [µs]."""
         return (self.heard[:, 1] - self.heard[:, 0]) * 1e-3
 
     @property
     def lost(self) -> int:
-        """Give how many messages did not come through."""
+        """Return the number of messages that the user did not receive."""
         return len(self.sent) - len(np.unique(self.heard[:, 0]))
 
     @property
     def rate(self) -> float:
-        """Give how many messages came through in a second."""
+        """Return the messages per second that the user received."""
         return len(self.heard) / (self.last - self.first) * 1e9
 
     @property
     def cpu_us(self) -> float:
-        """Give the CPU time a message that came through, or was sent where nobody listened."""
+        """Return the CPU time per received message, or per sent one without a user [µs]."""
         return self.cpu * 1e6 / (len(self.heard) or len(self.sent))
 
 
 def cpu_seconds(pid: int) -> float:
-    """Give the CPU time of all threads of a process."""
+    """Return the CPU time of all threads of a process [s]."""
     tasks = Path(f'/proc/{pid}/task').glob('*/schedstat')
     return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
 
 
 def first_of(client: subprocess.Popen[str]) -> int:
-    """Wait for the first message of a client; give its time [ns]."""
+    """Wait for the first message of a client, and return its time [ns]."""
     assert client.stdout is not None
     return int(client.stdout.readline())
 
@@ -104,7 +104,7 @@ def end(running: subprocess.Popen[str]) -> None:
 
 @contextmanager
 def process(command: list[str], environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
-    """Run a Python program; end it by the end of its input, or by SIGTERM."""
+    """Run a Python program; end it by closing its standard input, or by SIGTERM."""
     running = subprocess.Popen([sys.executable, *command], env=environment, cwd=ROOT, text=True,
                                stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
@@ -123,15 +123,15 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
     Parameters
     ----------
     command : list of str
-        Of the program to be measured.
+        Command of the program to measure.
     rate : float
-        Messages a second; 0: without a pause.
+        Messages per second; 0: without a pause.
     during : callable
-        Takes as long as is to be measured.
+        Is called during the measurement, which ends when it returns.
     listened : bool
         Whether there is a user.
     lead : float
-        So long the driver has run before [s].
+        Time from the first message of the driver to the start of the program [s].
 
     """
     os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT))
@@ -153,19 +153,19 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
                 during()
                 cpu, last = cpu_seconds(measured.pid) - cpu, time.monotonic_ns()
                 time.sleep(0.3)
-                end(driver)  # first, for what is flooded may not see that it is to end
+                end(driver)  # first: a flooded process may not notice that it must end
         sent = np.load(sent_file)
         heard = np.load(heard_file) if listened else np.empty((0, 2), np.int64)
     return Trial(cpu, start, first, last, sent, heard).between(first, last)
 
 
 def relay(kind: str) -> list[str]:
-    """Give the command of a bare relay."""
+    """Return the command of a bare relay."""
     return [str(CLIENTS), kind]
 
 
 def node(calibration: Path, *parameters: str) -> list[str]:
-    """Give the command of the node with a stored calibration."""
+    """Return the command of the node with a stored calibration."""
     given = [part for parameter in parameters for part in ('-p', parameter)]
     return ['-m', 'accel_calib.ros.calibrator', '--ros-args', '--log-level', 'error', '-p',
             f'calibration_file:={calibration}', *given]

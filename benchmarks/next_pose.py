@@ -1,13 +1,14 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-How many poses it takes to know |a|, by the order in which they are taken.
 
-A sensor with offset, gains and cross-axis gains, noise of a pose mean 0.3 mg an axis, is turned
-pose by pose: as the node asks, in an order that comes to mind (faces, edges, corners), or at
-random. After each pose model 10 is fitted, and the RMS error of |a| measured on fresh directions.
-A person holds an attitude 10° off in each of two axes. The report is the number of poses from
-which on the median over the sets stays below 0.3 mg.
+"""
+Number of poses until |a| is known, by the order in which they are taken.
+
+A sensor with offset, gains and cross-axis gains, 0.3 mg of noise per pose mean and axis, is turned
+pose by pose: as the node asks, in the order faces, edges, corners, or at random. After each pose
+model 10 is fitted, and the RMS error of |a| is measured on fresh directions. A person holds an
+attitude 10° off in each of two axes. The result is the number of poses from which on the median
+over the sets stays below 0.3 mg.
 
 """
 
@@ -22,8 +23,8 @@ import sys
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E402
-from accel_calib.calibrate.geometry import pose_noise  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
+from accel_calib.estimate.geometry import pose_noise  # noqa: E402
 from accel_calib.model import Model, predict  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import random_directions  # noqa: E402
@@ -43,21 +44,21 @@ Order = Callable[[Poses | None, int, np.random.Generator], Floats]
 
 
 def attitudes() -> Floats:
-    """Give the 6 faces, 12 edges and 8 corners, (26, 3)."""
+    """Return the 6 faces, 12 edges and 8 corners, (26, 3)."""
     signs = [s for s in product((0, 1, -1), repeat=3) if any(s)]
     found = np.array(sorted(signs, key=lambda each: sum(map(abs, each))), float)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def held(direction: Floats, rng: np.random.Generator) -> Floats:
-    """Give a direction as a person holds it."""
+    """Return a direction as a person holds it."""
     off = rng.normal(size=3) * OFF
     turned = direction + off - direction * (off @ direction)
     return turned / np.linalg.norm(turned)
 
 
 def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
-    """Give the direction that the node asks for; any, when it says that more do not pay."""
+    """Return the direction that the node asks for; a random attitude once it asks for none."""
     if poses is None:
         found = next_pose(np.zeros((0, 3)))
     else:
@@ -67,17 +68,17 @@ def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
 
 
 def in_order(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
-    """Give the faces, then the edges, then the corners."""
+    """Return the faces, then the edges, then the corners."""
     return attitudes()[count % 26]
 
 
 def at_random(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
-    """Give a direction of the sphere."""
+    """Return a random direction."""
     return random_directions(1, rng)[0]
 
 
 def of_the_26(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
-    """Give one of the 26 attitudes."""
+    """Return one of the 26 attitudes."""
     return attitudes()[rng.integers(26)]
 
 
@@ -97,7 +98,7 @@ def sensor(rng: np.random.Generator) -> Model:
 
 
 def error(model: Model, poses: Poses, fresh: Floats) -> float:
-    """Give the RMS error of |a| on fresh directions [mg]; infinite where the fit is refused."""
+    """Return the RMS error of |a| on fresh directions [mg]; infinite if the fit is refused."""
     try:
         fitted = fit_poses(poses, G, model='10')
     except RefusedFitError:
@@ -107,7 +108,7 @@ def error(model: Model, poses: Poses, fresh: Floats) -> float:
 
 
 def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], float]:
-    """Turn a sensor; give the errors from `FEWEST` poses on, and when more no longer paid."""
+    """Return the errors from `FEWEST` poses on, and the number at which the node asks no more."""
     rng = np.random.default_rng(seed)
     model, fresh = sensor(rng), random_directions(500, rng)
     poses: Poses | None = None
@@ -126,16 +127,21 @@ def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], 
 
 
 def joined(poses: Poses, one: Poses) -> Poses:
-    """Put a pose behind the others."""
+    """Return poses followed by one more."""
     columns = {key: np.concatenate([poses[key], one[key]]) for key in poses.columns}
     return Poses(columns, np.arange(1, len(poses) + 2))
 
 
 def first_below(medians: Floats) -> int | None:
-    """Give the number of poses from which on the median stays below the aim."""
+    """Return the number of poses from which on the median stays below the aim; None: never."""
     above = np.flatnonzero(~(medians <= AIM))
     first = 0 if len(above) == 0 else int(above[-1]) + 1
     return FEWEST + first if first < len(medians) else None
+
+
+def words_of(count: int | None) -> str:
+    """Return a number of poses as text; None: more than were taken."""
+    return f'over {MOST}' if count is None else str(count)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -154,21 +160,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         needed[name] = first_below(medians)
         rows.append(f'| {name} | ' + ' | '.join(
             f'{medians[count - FEWEST]:.3f}' for count in SHOWN) + ' |')
-        lines.append(Line(f'poses to {AIM} mg, {name}', str(needed[name] or f'over {MOST}'), '',
-                          given.sets, None))
+        lines.append(Line(f'poses to {AIM} mg, {name}', words_of(needed[name]), '', given.sets,
+                          None))
         if order is asked:
             enough = np.array([count for _, count in found])
             there = [errors[int(min(count, MOST)) - FEWEST] for errors, count in found]
-            lines.append(Line(f'poses when more no longer help, {name}',
+            lines.append(Line(f'poses when the node asks for no more, {name}',
                               f'{np.median(enough):.0f} ({np.min(enough):.0f} to '
                               f'{np.max(enough):.0f}), {np.median(there):.3f} mg', '',
                               given.sets, None))
     ours = needed['as asked, held 10° off']
     for name in ('random directions', 'random among the 26, held 10° off',
                  'faces, edges, corners, held 10° off'):
-        if ours is not None and needed[name] is not None:
-            lines.append(Line(f'as asked against {name}', f'{needed[name] - ours} poses fewer',
-                              'fewer', given.sets, bool(needed[name] > ours)))
+        lines.append(Line(f'poses to {AIM} mg: as asked, held 10° off, instead of {name}',
+                          f'{words_of(ours)} instead of {words_of(needed[name])}', 'fewer',
+                          given.sets, ours is not None and ours < (needed[name] or np.inf)))
     text = (f'# Figures of the next pose\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/next_pose.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
             f'\n\n{table(lines)}\n\nMedian error of |a| [mg]:\n\n' + '\n'.join(rows) + '\n')

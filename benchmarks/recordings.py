@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How fast recordings are read, searched for poses and corrected, and how soon commands answer.
+Rates of reading recordings, of finding their poses and of correcting them; duration of commands.
 
-Every measurement is a process of its own, one at a time; those that are compared take turns::
+Each measurement is a fresh process, one at a time; those that are compared take turns::
 
     python benchmarks/recordings.py --markdown docs/figures/recordings.md
 
-The bags, of 1.3 GB each, are made in a temporary folder, where 4 GB must be free.
+The bags have an Imu at 1 kHz that is turned through 36 poses, and other topics. They take 1.3 GB
+each in a temporary folder, where 4 GB must be free.
 
 """
 
@@ -18,7 +19,6 @@ import argparse
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from importlib.metadata import version
-import json
 import os
 from pathlib import Path
 import platform
@@ -30,34 +30,98 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
+ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', PYTHONPATH=str(ROOT))
 
 from accel_calib.cli.main import main as accel_calib  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from accel_calib.simulate import model_with, simulate_recording  # noqa: E402
+from accel_calib.sphere import spread_directions  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
-from recordings_bags import serialized, write_bag  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.typesys import get_typestore, Stores  # noqa: E402
+from trial import trial  # noqa: E402
 
 FULL = 3_600_000
+"""Messages of a bag: an hour at 1 kHz."""
+
 MESSAGE_BYTES = 324
 XSENS = ROOT.parent / 'shared' / 'data' / 'xsens_mti_counts.csv'
 
+_PAGE = """\
+# Figures of recordings
 
-def trial(what: str, *arguments: object) -> dict[str, Any]:
-    """Run one measurement in a process of its own."""
-    done = subprocess.run([sys.executable, HERE / 'recordings_trial.py', what,
-                           *map(str, arguments)], capture_output=True, text=True, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
-    print(what, arguments[0], found if what != 'table' else '', file=sys.stderr, flush=True)
-    return found
+Made by `python benchmarks/recordings.py {command}`. Figures are medians over the repeats
+(sets); processes that are compared take turns. A rate is that of the whole work: opening the bag,
+reading it, and finding poses or writing the corrected copy. The rate of rosbags excludes the
+opening. Memory is bounded if ten times the messages take less than 3 % of their bytes more.
+
+Machine: {machine}.
+
+{lines}
+"""
+
+RATE_HZ = 1000
+_POSES = 36
+_RATE, _FORCE = slice(-192, -168), slice(-96, -72)  # bytes of a serialized Imu
+_EFFECTS = {'offset': np.array([0.02, -0.03, 0.01]), 'axis_gain': np.array([0.01, -0.02, 0.015]),
+            'cross_axis': np.array([0.004, -0.002, 0.003])}
+
+
+def serialized(count: int, seed: int) -> NDArray[np.uint8]:
+    """Return `count` serialized Imu messages, one row per message."""
+    turn = 2.0
+    recording = simulate_recording(
+        model_with(_EFFECTS), spread_directions(_POSES), np.random.default_rng(seed),
+        rate_hz=RATE_HZ, turn=turn, dwell=(count / RATE_HZ + turn) / _POSES - turn)
+    count = min(count, len(recording))
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    vector, zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0), np.zeros(9)
+    message = types['sensor_msgs/msg/Imu'](
+        types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), 'imu_link'),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), zero, vector, zero, vector,
+        zero)
+    one = np.frombuffer(store.serialize_cdr(message, 'sensor_msgs/msg/Imu'), np.uint8)
+    rows = np.tile(one, (count, 1))
+    number = np.arange(count)
+    stamps = np.column_stack([number // RATE_HZ, number % RATE_HZ * (10 ** 9 // RATE_HZ)])
+    rows[:, 4:12] = stamps.astype('<u4').view(np.uint8)
+    rows[:, _RATE] = np.ascontiguousarray(recording['rate'][:count]).view(np.uint8)
+    force = units_of('m/s2').from_g(recording.reading[:count])
+    rows[:, _FORCE] = np.ascontiguousarray(force).view(np.uint8)
+    return rows
+
+
+def write_bag(path: Path, storage: str, rows: NDArray[np.uint8]) -> Path:
+    """Write the messages, with a temperature and a string ten times a second."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    header = store.types['std_msgs/msg/Header']
+    stamp = store.types['builtin_interfaces/msg/Time']
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        imu, warm, words = (writer.add_connection(*each, typestore=store) for each in (
+            ('/imu', 'sensor_msgs/msg/Imu'), ('/temperature', 'sensor_msgs/msg/Temperature'),
+            ('/words', 'std_msgs/msg/String')))
+        for k, row in enumerate(rows):
+            time = k * (10 ** 9 // RATE_HZ)
+            writer.write(imu, time, row.tobytes())
+            if k % 100 == 0:
+                seconds = stamp(k // RATE_HZ, time % 10 ** 9)
+                writer.write(warm, time, store.serialize_cdr(store.types[
+                    'sensor_msgs/msg/Temperature'](header(seconds, 'imu_link'), 25.0, 0.0),
+                    'sensor_msgs/msg/Temperature'))
+                writer.write(words, time, store.serialize_cdr(
+                    store.types['std_msgs/msg/String'](f'word {k}'), 'std_msgs/msg/String'))
+    return path
 
 
 def table_lines() -> list[Line]:
-    """Time the Xsens recording: table in, poses and fit out."""
+    """Time the Xsens recording, from the file to poses and fit."""
     if not XSENS.exists():
-        return []
+        return [Line(f'Xsens: not measured, {XSENS} is missing', '', '', 0, None)]
     spent = trial('table', XSENS)['result']
     total = [sum(parts) for parts in zip(*spent.values(), strict=True)]
     warm = median(total[1:])
@@ -70,7 +134,7 @@ def table_lines() -> list[Line]:
 
 def bag_lines(folder: Path, storage: str, count: int, repeats: int, calibration: Path
               ) -> list[Line]:
-    """Time a bag, and look at the memory for it and for one of a tenth of its length."""
+    """Time a bag; measure the memory for it and for a bag of a tenth of its length."""
     rows = serialized(count, seed=2031)
     bag = write_bag(folder / storage, storage, rows)
     tenth = write_bag(folder / f'{storage}_tenth', storage, rows[:len(rows) // 10])
@@ -79,28 +143,31 @@ def bag_lines(folder: Path, storage: str, count: int, repeats: int, calibration:
     found: dict[str, list[dict[str, Any]]] = {}
     for _ in range(repeats):
         for what in ('deserialize', 'read', 'poses', 'apply'):
-            found.setdefault(what, []).append(trial(what, bag, out, calibration))
+            files = (bag, out, calibration) if what == 'apply' else (bag,)
+            found.setdefault(what, []).append(trial(what, *files))
             shutil.rmtree(out, ignore_errors=True)
-    small = {what: trial(what, tenth, out, calibration)['megabytes']
-             for what in ('poses', 'apply')}
+    small = {'poses': trial('poses', tenth)['megabytes'],
+             'apply': trial('apply', tenth, out, calibration)['megabytes']}
     for path in (bag, tenth, out):
         shutil.rmtree(path, ignore_errors=True)
     rate = {what: median(x['result'] / x['seconds'] for x in each)
             for what, each in found.items()}
     busy = {what: median(1e6 * x['cpu'] / x['result'] for x in each)
             for what, each in found.items()}
-    times = rate['poses'] / rate['deserialize']
+    times = {what: rate[what] / rate['deserialize'] for what in ('read', 'poses')}
     memory = {what: max(x['megabytes'] for x in found[what]) for what in small}
     allowed = 0.03 * 0.9e-6 * count * MESSAGE_BYTES
     name = f'{storage}, {count:,} messages'
     return [
-        Line(f'{name}: to poses, over rosbags deserializing each',
-             f'{times:.1f} × ({_thousands(rate["poses"])} over '
-             f'{_thousands(rate["deserialize"])} a second)', '≥ 5 ×', repeats, times >= 5.0),
-        Line(f'{name}: read alone', f'{_thousands(rate["read"])} a second', '', repeats, None),
-        Line(f'{name}: apply', f'{_thousands(rate["apply"])} a second', '≥ 300,000', repeats,
-             rate['apply'] >= 300_000),
-        Line(f'{name}: CPU a message, deserializing / poses / apply',
+        *(Line(f'{name}: rate of {words}, times that of rosbags deserializing each message',
+               f'{times[what]:.1f} × ({_thousands(rate[what])} and '
+               f'{_thousands(rate["deserialize"])} per second)', f'≥ {least:g} ×', repeats,
+               times[what] >= least)
+          for what, words, least in (('poses', 'reading and finding poses', 5.0),
+                                     ('read', 'reading', 4.0))),
+        Line(f'{name}: rate of apply', f'{_thousands(rate["apply"])} per second', '≥ 300,000',
+             repeats, rate['apply'] >= 300_000),
+        Line(f'{name}: CPU per message, deserializing / poses / apply',
              f'{busy["deserialize"]:.2f} / {busy["poses"]:.2f} / {busy["apply"]:.2f} µs', '',
              repeats, None),
         *(Line(f'{name}: largest memory of {what}, with imports',
@@ -130,29 +197,18 @@ def command_lines(folder: Path, poses: Path, repeats: int) -> list[Line]:
     return lines
 
 
-def machine() -> str:
-    """Say what this was measured on, and how busy it was."""
-    try:
-        text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
-        name = next(line.split(':')[1].strip() for line in text.splitlines()
-                    if line.startswith('model name'))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return (f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; Python '
-            f'{platform.python_version()}, numpy {np.__version__}, rosbags {version("rosbags")}')
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split('\n')[0])
     parser.add_argument('--messages', type=int, default=FULL)
     parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--quick', action='store_true', help='200,000 messages, once')
-    parser.add_argument('--temporary', type=Path, help='where to make the folder for the bags')
+    parser.add_argument('--temporary', type=Path, help='parent of the temporary folder')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args(arguments)
     count, repeats = (200_000, 1) if given.quick else (given.messages, given.repeats)
-    before = machine()
+    before = (f'{processor()} before; Python {platform.python_version()}, numpy {np.__version__}, '
+              f'rosbags {version("rosbags")}')
     with TemporaryDirectory(dir=given.temporary) as name:
         folder = Path(name)
         poses, calibration = folder / 'poses.csv', folder / 'calibration.yaml'
@@ -163,19 +219,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines += table_lines()
         for storage in ('mcap', 'sqlite3'):
             lines += bag_lines(folder, storage, count, repeats, calibration)
-    text = _page(table(lines), before, arguments)
-    publish(text, given.markdown)
+    command = ' '.join(sys.argv[1:] if arguments is None else arguments)
+    publish(_PAGE.format(command=command, machine=before, lines=table(lines)), given.markdown)
     return 0
-
-
-def _page(lines: str, before: str, arguments: Sequence[str] | None) -> str:
-    given = ' '.join(sys.argv[1:] if arguments is None else arguments)
-    return (f'# Figures of recordings\n\nMade by `python benchmarks/recordings.py {given}`. '
-            'Medians over the repeats\n(sets); processes that are compared take turns. A rate '
-            'is that of the whole work: opening the bag,\nreading, poses, or writing the '
-            'corrected copy; of rosbags it is that of the messages alone. Memory is\nbounded '
-            'where ten times the messages take less than 3 % of their bytes more.\n\n'
-            f'Machine: {before}.\n\n{lines}\n')
 
 
 if __name__ == '__main__':

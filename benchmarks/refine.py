@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How often the refinement names the hidden effect: the figures that were asked for, measured.
+Refinement: how often it names the hidden effect.
 
 The sets come from `test/generator.py`, which shares no code with the package::
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import multiprocessing
 import os
 from pathlib import Path
@@ -25,23 +25,85 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
 from figures import Line, publish, table  # noqa: E402
-from generator import OUTSIDE  # noqa: E402
+from generator import EFFECTS, ON_OUTPUT, OUTSIDE, Setup  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import Case, Outcome, run, SHOWS  # noqa: E402
-from refine_rows import (  # noqa: E402
-    ALONE,
-    cases_of,
-    IN_TIME,
-    LOOK_ALIKE,
-    LOST,
-    NOTHING,
-    ROWS,
-    SMALL,
-)
+
+CATALOGUE = tuple(name for name in EFFECTS if name not in OUTSIDE)
+LOOK_ALIKE = ({'quadratic', 'gain_asymmetry', 'cross_coupling'}, {'cubic', 'odd_quadratic'},
+              {'offset_drift', 'warm_up', 'offset_step'})
+PAIRED = tuple(name for name in CATALOGUE if name not in (*ON_OUTPUT, 'offset_wander'))
+IN_TIME = ('temperature_rate', 'periodic_offset')
+RISING = ('offset_temperature', 'offset_drift', 'warm_up')
+LOST = {'offset_temperature': ('temperature',), 'gain_temperature': ('temperature',),
+        'supply_ratio': ('supply_voltage',), 'offset_drift': ('time',), 'warm_up': ('time',),
+        'offset_step': ('time',), 'lever_arm': ('gx', 'gy', 'gz'),
+        'vibration_rectification': ('std_x', 'std_y', 'std_z', 'count')}
+ALONE = {'alone60': (60, 3.0), 'alone200': (200, 2.0), 'alone24': (24, 6.0)}
+SMALL = 0.3
+NOTHING = {'nothing24': 24, 'nothing60': 60, 'nothing200': 200}
+ROWS = (*ALONE, *NOTHING, 'two', 'outside', 'rising', 'missing', 'knocked', 'small')
+
+_ABOUT = """\
+Made by `{command} --markdown FILE`, on sets of an independent generator
+(`test/generator.py`). The size of an effect is the RMS of its part in |a| that the base cannot
+absorb, over the noise of a pose mean. Look-alikes are quadratic, gain_asymmetry and
+cross_coupling; also cubic and odd_quadratic."""
+
+Kind = tuple[dict[str, float], Setup]
+
+
+def cases_of(row: str, sets: int, seed: int) -> Iterator[Case]:
+    """
+    Yield the cases of a row.
+
+    Parameters
+    ----------
+    row : str
+        Of `ROWS`.
+    sets : int
+        Number of sets per effect; five times as many if no effect or two are hidden.
+    seed : int
+        Seed of the random numbers.
+
+    """
+    place = (seed, ROWS.index(row))
+    for number in range(sets):
+        kinds = _kinds(row, np.random.default_rng((*place, number)))
+        for kind, (hidden, setup) in enumerate(kinds):
+            yield Case(row, hidden, setup, (*place, kind, number), row in ALONE)
+
+
+def _kinds(row: str, rng: np.random.Generator) -> list[Kind]:
+    """Return what is hidden in the sets of a row."""
+    if row in ALONE:
+        poses, size = ALONE[row]
+        return [({name: size}, Setup(poses=poses)) for name in CATALOGUE]
+    if row in NOTHING:
+        return [({}, Setup(poses=NOTHING[row]))] * 5
+    if row == 'two':
+        return [({one: 5.0, two: 5.0}, Setup()) for one, two in _pairs(rng, 5)]
+    one_by_one: dict[str, list[Kind]] = {
+        'outside': [({name: 3.0}, Setup()) for name in OUTSIDE],
+        'rising': [({name: 3.0}, Setup(temperature='rising')) for name in RISING],
+        'missing': [({name: 3.0}, Setup(dropped=lost)) for name, lost in LOST.items()],
+        'knocked': [({}, Setup(knocked=3))] * 3,
+        'small': [({name: SMALL}, Setup()) for name in CATALOGUE if name not in ON_OUTPUT]}
+    return one_by_one[row]
+
+
+def _pairs(rng: np.random.Generator, count: int) -> list[tuple[str, str]]:
+    """Draw pairs of effects that do not look alike."""
+    pairs: list[tuple[str, str]] = []
+    while len(pairs) < count:
+        one, two = rng.choice(PAIRED, 2, replace=False).tolist()
+        if not any({one, two} <= family for family in LOOK_ALIKE):
+            pairs.append((one, two))
+    return pairs
 
 
 def share(outcomes: Sequence[Outcome], good: Callable[[Outcome], bool]) -> tuple[float, str]:
-    """Give the share of the outcomes that are good, and as text with the count."""
+    """Return the share of good outcomes, and the share as text with the count."""
     count = sum(map(good, outcomes))
     part = count / len(outcomes) if outcomes else float('nan')
     return part, f'{100.0 * part:.1f} % ({count}/{len(outcomes)})'
@@ -49,7 +111,7 @@ def share(outcomes: Sequence[Outcome], good: Callable[[Outcome], bool]) -> tuple
 
 def line(what: str, outcomes: Sequence[Outcome], good: Callable[[Outcome], bool],
          least: float | None = None, most: float | None = None) -> Line:
-    """Make a line of how many outcomes are good."""
+    """Return a line with the share of good outcomes."""
     part, text = share(outcomes, good)
     if least is not None:
         return Line(what, text, f'≥ {100.0 * least:g} %', len(outcomes), part >= least)
@@ -59,7 +121,7 @@ def line(what: str, outcomes: Sequence[Outcome], good: Callable[[Outcome], bool]
 
 
 def lines_of(row: str, outcomes: Sequence[Outcome]) -> list[Line]:
-    """Make the lines of a row."""
+    """Return the lines of a row."""
     if row in ALONE:
         poses, size = ALONE[row]
         return _lines_alone(f'one effect, {poses} poses, size {size:g}', outcomes)
@@ -84,13 +146,13 @@ def _right(outcome: Outcome) -> bool:
 
 
 def _lines_alone(what: str, outcomes: Sequence[Outcome]) -> list[Line]:
-    """Make the lines of one hidden effect."""
+    """Return the lines of one hidden effect."""
     families = set().union(*LOOK_ALIKE[:2])
     alike = [o for o in outcomes if families & set(o.case.hidden)]
     clear = [o for o in outcomes if not families & set(o.case.hidden)]
     lines = [
         line(f'{what}: exact', outcomes, lambda o: o.judgement == 'exact'),
-        line(f'{what}: exact, look-alikes apart', clear, lambda o: o.judgement == 'exact',
+        line(f'{what}: exact, without look-alikes', clear, lambda o: o.judgement == 'exact',
              least=0.97),
         line(f'{what}: look-alikes right or rival', alike, _right, least=0.98),
         line(f'{what}: look-alikes exact', alike, lambda o: o.judgement == 'exact'),
@@ -103,17 +165,17 @@ def _lines_alone(what: str, outcomes: Sequence[Outcome]) -> list[Line]:
 
 
 def _numbers(what: str, outcomes: Sequence[Outcome]) -> list[Line]:
-    """Make the lines of held-out gaps, parameters and time."""
-    gaps = np.array([o.held_out for o in outcomes if o.held_out]).reshape(-1, 2)
+    """Return the lines of held-out residuals, parameters and time."""
+    every = np.array([o.held_out for o in outcomes if o.held_out]).reshape(-1, 2)
     right = np.array([o.held_out for o in outcomes if o.held_out and _right(o)]).reshape(-1, 2)
     off = np.abs([value for o in outcomes for value in o.deviations])
     seconds = np.array([o.seconds for o in outcomes])
     lines = []
-    for group, pairs in (('all', gaps), ('where the name is right', right)):
+    for group, pairs in (('all', every), ('where the name is right', right)):
         if len(pairs):
             pooled = float(np.sqrt(np.mean(pairs[:, 0] ** 2) / np.mean(pairs[:, 1] ** 2)))
             worst = float(np.percentile(pairs[:, 0] / pairs[:, 1], 95.0))
-            lines.append(Line(f'{what}: held-out gap over that of the true form, {group}',
+            lines.append(Line(f'{what}: held-out residual over that of the true form, {group}',
                               f'{pooled:.3f} (95 % of sets below {worst:.3f})', '≤ 1.05',
                               len(pairs), pooled <= 1.05))
     if len(off):
@@ -121,13 +183,13 @@ def _numbers(what: str, outcomes: Sequence[Outcome]) -> list[Line]:
         lines.append(Line(f'{what}: parameters inside 3 standard deviations',
                           f'{100.0 * inside:.1f} % of {len(off)}', '≥ 99 %', len(outcomes),
                           inside >= 0.99))
-    return [*lines, Line(f'{what}: seconds a set',
+    return [*lines, Line(f'{what}: seconds per set',
                          f'{np.median(seconds):.2f}, longest {np.max(seconds):.2f}', '< 1',
                          len(outcomes), bool(np.median(seconds) < 1.0))]
 
 
 def _lines_without_name(row: str, outcomes: Sequence[Outcome]) -> list[Line]:
-    """Make the lines of rows in which nothing is to be named."""
+    """Return the lines of rows in which no effect of the catalogue is to be named."""
     if row == 'outside':
         groups = {name: [o for o in outcomes if name in o.case.hidden] for name in OUTSIDE}
         return [line('outside the catalogue: unexplained, or offset_wander in time', outcomes,
@@ -152,9 +214,9 @@ def _lines_without_name(row: str, outcomes: Sequence[Outcome]) -> list[Line]:
 
 def _honest(outcome: Outcome) -> bool:
     """
-    Tell whether what cannot be named was not named, and not passed over.
+    Return whether an effect that cannot be named is reported without a name.
 
-    Where std and count are missing the noise is not known, and nothing can be called a gap.
+    If std and count are missing, the noise is unknown, and any verdict without a name is right.
 
     """
     if 'count' in outcome.case.setup.dropped and not outcome.named:
@@ -174,9 +236,9 @@ def _clean(outcome: Outcome) -> bool:
 
 
 def by_effect(outcomes: Sequence[Outcome]) -> str:
-    """Write what became of each hidden effect, and what was named instead, as Markdown."""
+    """Return a Markdown table of the outcomes by hidden effect, with what is named instead."""
     heads = ('row', 'hidden', 'sets', 'exact', 'rival', 'wrong', 'missed', 'error',
-             'clean poses left out', 'parameters inside 3 sd', 'held-out gap over true form',
+             'clean poses left out', 'parameters inside 3 sd', 'held-out residual over true form',
              'instead')
     rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
     kinds = sorted({(o.case.row, _hidden(o)) for o in outcomes},
@@ -200,8 +262,8 @@ def _inside(outcomes: Sequence[Outcome]) -> str:
 
 
 def _over_true_form(outcomes: Sequence[Outcome]) -> str:
-    gaps = np.array([o.held_out for o in outcomes if o.held_out])
-    return f'{np.sqrt(np.divide(*np.mean(gaps ** 2, axis=0))):.2f}' if len(gaps) else ''
+    each = np.array([o.held_out for o in outcomes if o.held_out])
+    return f'{np.sqrt(np.divide(*np.mean(each ** 2, axis=0))):.2f}' if len(each) else ''
 
 
 def _hidden(outcome: Outcome) -> str:
@@ -209,7 +271,7 @@ def _hidden(outcome: Outcome) -> str:
 
 
 def measured(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    """Run the cases in so many processes."""
+    """Run the cases in `jobs` processes."""
     if jobs == 1:
         return [run(case) for case in cases]
     with multiprocessing.get_context('spawn').Pool(jobs) as pool:
@@ -235,7 +297,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if outcomes:
             lines += lines_of(row, outcomes)
             print(f'{row}: {len(outcomes)} sets', file=sys.stderr, flush=True)
-    text = f'{table([x for x in lines if x.sets])}\n\n{by_effect(everything)}\n'
+    command = (f'python benchmarks/refine.py --sets {given.sets} --jobs {given.jobs} --seed '
+               f'{given.seed}' + ''.join(f' --only {row}' for row in given.only or ())
+               + (f' --hidden {given.hidden}' if given.hidden else ''))
+    text = (f'# Figures of refine\n\n{_ABOUT.format(command=command)}\n\n'
+            f'{table([x for x in lines if x.sets])}\n\n{by_effect(everything)}\n')
     for error, count in Counter(o.error for o in everything if o.error).most_common(5):
         print(f'{count} times:\n{error}', file=sys.stderr)
     publish(text, given.markdown)

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Sets of poses for the benchmark of trust: sensors, directions, noise, knocks, placement.
+Sets of poses for `robustness` and `fits`: sensors, directions, noise, knocks, placement.
 
-The sensors are drawn and read here, with arithmetic of its own, not by the package's simulation.
+The arithmetic of sensors, readings and derivatives is written out here; it shares no code with the
+models and the simulation of the package.
 
 """
 
@@ -35,17 +36,59 @@ class Sensor:
     offset: Floats
 
     def reading(self, force: Floats) -> Floats:
-        """Give what it reads under these (n, 3) forces."""
+        """Return the readings of (n, 3) forces."""
         return force @ self.gain.T + self.offset
 
     def lengths(self, reading: Floats) -> Floats:
-        """Give |force| of these (n, 3) readings."""
+        """Return |force| of (n, 3) readings."""
         return np.linalg.norm(np.linalg.solve(self.gain, (reading - self.offset).T), axis=0)
+
+    def values(self, model: str) -> Floats:
+        """
+        Return the true values of a model, in the order of `Model.vector`.
+
+        Offset; gain of model 4, gains of the others; cross-axis xy, xz, yz; misalignment. W of
+        model 9 is that of the sensing axes: lower triangular, from a Cholesky decomposition.
+
+        """
+        gain = np.linalg.cholesky(self.gain @ self.gain.T) if model == '9' else self.gain
+        diagonal = np.diag(gain) - 1.0
+        symmetric, skew = (gain + gain.T) / 2.0, (gain - gain.T) / 2.0
+        cross = symmetric[[0, 0, 1], [1, 2, 2]]
+        parts = {'4': (diagonal[:1],), '7': (diagonal,), '10': (diagonal, cross)}
+        return np.concatenate([self.offset, *parts.get(
+            model, (diagonal, cross, skew[[2, 0, 1], [1, 2, 0]]))])
+
+    def length_slopes(self, force: Floats) -> Floats:
+        """
+        Return the (n, 9) derivative of |force| by the values of model 10, at true forces of 1 g.
+
+        With a = û W⁻¹ the derivative by V_i is -a_i, and that by W_ij is -a_i u_j.
+
+        """
+        a = force @ np.linalg.inv(self.gain)
+        cross = [a[:, i] * force[:, j] + a[:, j] * force[:, i]
+                 for i, j in ((0, 1), (0, 2), (1, 2))]
+        return -np.column_stack([a, a * force, *cross])
 
 
 @dataclass(frozen=True)
 class Case:
-    """A sensor, its poses, and where they were: rows of the truth are those of the poses."""
+    """
+    A sensor and its poses.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        The sensor.
+    poses : Poses
+        Its poses, in g.
+    force : (n, 3) array
+        True specific force of each pose [g].
+    shows_mg : (n,) array
+        Change of |force| by a knock; 0 if the pose was not knocked.
+
+    """
 
     sensor: Sensor
     poses: Poses
@@ -54,7 +97,7 @@ class Case:
 
 
 def draw_sensor(rng: np.random.Generator, kind: str) -> Sensor:
-    """Draw a sensor that needs 4, 7, 10 or 12 parameters: errors of a few percent."""
+    """Draw a sensor of 4, 7, 10 or 12 parameters, with errors of a few percent."""
     gain = np.eye(3) * (1.0 + 0.02 * rng.normal())
     if kind != '4':
         gain = np.diag(1.0 + 0.02 * rng.normal(size=3))
@@ -67,13 +110,13 @@ def draw_sensor(rng: np.random.Generator, kind: str) -> Sensor:
 
 
 def spread(count: int, rng: np.random.Generator) -> Floats:
-    """Spread directions over the sphere, turned anyhow, with some jitter."""
+    """Return directions spread over the sphere, in a random attitude, with jitter."""
     turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     return unit(spread_directions(count) @ turned + JITTER * rng.normal(size=(count, 3)))
 
 
 def unit(vectors: Floats) -> Floats:
-    """Give (n, 3) vectors at length 1."""
+    """Return (n, 3) vectors scaled to length 1."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -85,17 +128,17 @@ def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Float
     Parameters
     ----------
     rng : numpy.random.Generator
-        Source of all chance.
+        Source of all random numbers.
     count : int
-        Poses.
+        Number of poses.
     kind : {'4', '7', '10', '12'}
-        What the sensor needs.
+        Number of parameters of the sensor.
     noise : float or (count,) array
-        Of a pose mean by axis [g].
+        Standard deviation of a pose mean, by axis [g].
     stated : float
-        What the poses say their noise is, over what it is.
+        Ratio of the noise that the poses state to their real noise.
     force : (count, 3) array, optional
-        Directions; without it they are spread.
+        Directions; by default they are spread over the sphere.
 
     """
     sensor = draw_sensor(rng, kind)
@@ -109,7 +152,7 @@ def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Float
 
 
 def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) -> Case:
-    """Knock so many poses in any direction; by how much shows in |a| is told [mg]."""
+    """Return the case with some poses knocked in random directions, by `size` [g]."""
     rows = rng.choice(len(case.poses), count, replace=False)
     reading = case.poses.reading.copy()
     reading[rows] += size * random_directions(count, rng)
@@ -118,22 +161,22 @@ def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) 
 
 
 def misplaced(rng: np.random.Generator, count: int, degrees: float) -> Case:
-    """Draw six faces and more of known orientation, each placed so many degrees off."""
-    said = np.vstack([FACES, spread(count - 6, rng)])
-    across = unit(np.cross(said, random_directions(count, rng)))
+    """Draw poses of known orientation, six faces and others, each misplaced by an angle."""
+    stated = np.vstack([FACES, spread(count - 6, rng)])
+    across = unit(np.cross(stated, random_directions(count, rng)))
     angle = np.radians(degrees)
-    case = draw(rng, count, '12', force=np.cos(angle) * said + np.sin(angle) * across)
-    return replace(case, poses=case.poses.with_columns(reference=said))
+    case = draw(rng, count, '12', force=np.cos(angle) * stated + np.sin(angle) * across)
+    return replace(case, poses=case.poses.with_columns(reference=stated))
 
 
 def without_noise(case: Case) -> Case:
-    """Take the noise away that the poses state."""
+    """Return the case with poses that state no noise."""
     kept = {key: values for key, values in case.poses.columns.items()
             if key not in ('std', 'count')}
     return replace(case, poses=Poses(kept, case.poses.row))
 
 
 def error_mg(calibration: Calibration, sensor: Sensor, rng: np.random.Generator) -> float:
-    """Give the RMS error of |a| on fresh directions [mg]."""
+    """Return the RMS error of |a| on fresh directions [mg]."""
     force = calibration.correct(sensor.reading(random_directions(_FRESH, rng)))
     return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2))) * MG

@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Can a fit be trusted: disturbed poses, bad placement, stated uncertainty, choice of the model.
+Trust in a fit: outliers, bad placement, stated uncertainty, choice of the model.
 
-Poses are spread over the sphere with 8° of jitter unless said; noise of a pose mean 0.3 mg by
-axis, its standard deviation measured from 100 samples. Errors are RMS of |a| on fresh directions,
-the median over the sets. Poor geometry has a page of its own, [geometry](geometry.md).
+Poses are spread over the sphere with 8° of jitter unless a row says otherwise. The noise of a pose
+mean is 0.3 mg by axis; its standard deviation is measured from 100 samples. Errors are RMS errors
+of |a| on fresh directions, the median over the sets. Poor geometry has its own page,
+[geometry](geometry.md).
 
-What is not reached: of 12 poses three residuals are left. Without the noise they have to tell it
-and a knocked pose at once; where the noise is stated too small, the pose that looks worst may be
-left out, and what remains looks quiet. Of 6 poses of a sensor that needs 10 parameters model 7
-fits all exactly, so that nothing shows the cross-axis gains that it lacks: any model is 15 mg off.
+Limits: 12 poses leave three residuals. Without a stated noise these must show the noise and a
+knocked pose at once. If the stated noise is too small, the pose that looks worst may be left out,
+and the others then look quiet. Model 7 fits 6 poses of a sensor of 10 parameters exactly, so that
+nothing shows the cross-axis gains that it lacks.
 
 """
 
@@ -29,7 +30,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.calibrate.norm_fit import form_of, solution_at  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.simulate import path  # noqa: E402
@@ -53,12 +53,16 @@ from scipy.signal import lfilter  # noqa: E402
 
 G = units_of('g')
 _SHOWS_MG = 2.0
+"""Change of |force| from which a knock must be detected [mg]."""
+
 RATE = 100.0
+"""Samples per second of a recording."""
+
 Job = tuple[Any, ...]
 
 
 def fitted(case: Case, model: str = 'auto') -> Calibration | None:
-    """Fit a set; None where it is refused."""
+    """Fit a set; None if the fit is refused."""
     try:
         return fit_poses(case.poses, G, model=model)
     except AccelCalibError:
@@ -66,12 +70,21 @@ def fitted(case: Case, model: str = 'auto') -> Calibration | None:
 
 
 def error_of(calibration: Calibration | None, case: Case, rng: np.random.Generator) -> float:
-    """Give the error of a fit [mg]; infinite where it was refused."""
+    """Return the error of a fit [mg]; infinite if it was refused."""
     return np.inf if calibration is None else error_mg(calibration, case.sensor, rng)
 
 
 def of_knocks(job: Job) -> tuple[float, bool, bool, float]:
-    """Say of a set with knocked poses: error, named well, clean ones lost, error without them."""
+    """
+    Fit a set with knocked poses.
+
+    Returns
+    -------
+    float, bool, bool, float
+        Error [mg]; whether exactly the knocked poses are rejected, those that show little aside;
+        whether a clean pose is rejected; error of a fit to the clean poses [mg].
+
+    """
     count, knocked, measured, seed = job
     rng = np.random.default_rng([seed, count, knocked])
     clean = draw(rng, count)
@@ -89,23 +102,20 @@ def of_knocks(job: Job) -> tuple[float, bool, bool, float]:
 
 
 def of_bound(job: Job) -> tuple[Floats, Floats]:
-    """Give the errors of the ten parameters over their Cramér-Rao bounds, and over the stated."""
+    """Return the errors of model 10 over their Cramér-Rao bounds and over their stated sizes."""
     count, seed = job
     rng = np.random.default_rng([seed, count])
     case = draw(rng, count)
     found = fitted(case, '10')
     assert found is not None
-    form = form_of('10')
-    truth = form.free(case.sensor.gain, case.sensor.offset)
-    a_size = np.full(count, NOISE)
-    jacobian = solution_at(form, truth, case.sensor.reading(case.force), a_size).jacobian
+    jacobian = case.sensor.length_slopes(case.force) / NOISE
     bound = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
-    away = found.model.vector - truth
+    away = found.model.vector - case.sensor.values('10')
     return away / bound, away / np.sqrt(np.diag(found.covariance))
 
 
 def of_placement(job: Job) -> tuple[float, bool]:
-    """Say of badly placed orientations: error, and whether it was detected and said."""
+    """Fit badly placed orientations; return the error [mg] and whether the fit reports them."""
     count, degrees, seed = job
     rng = np.random.default_rng([seed, count])
     case = misplaced(rng, count, degrees)
@@ -115,7 +125,7 @@ def of_placement(job: Job) -> tuple[float, bool]:
 
 
 def of_intervals(job: Job) -> tuple[Floats, Floats]:
-    """Say which parameters and corrected readings of a set are inside their 95 % intervals."""
+    """Return which parameters and corrected readings are inside their 95 % intervals."""
     kind, model, count, noise, seed = job
     rng = np.random.default_rng([seed, count, int(model)])
     each = NOISE * np.exp(rng.normal(size=count)) if noise == 'differs' else NOISE
@@ -127,30 +137,21 @@ def of_intervals(job: Job) -> tuple[Floats, Floats]:
     found = fitted(without_noise(case) if noise == 'not given' else case, model)
     if found is None:
         return np.zeros(0), np.zeros(0)
-    gain = case.sensor.gain
-    if model == '9':
-        gain = np.linalg.cholesky(gain @ gain.T)
-    values = form_of(model).ties @ form_of(model).free(gain, case.sensor.offset) \
-        if model != '12' else _twelve(case)
+    values = case.sensor.values(model)
     deviation = np.sqrt(np.diag(found.covariance))
     force = random_directions(20, rng)
     got = found.correct(case.sensor.reading(force))
+    gain = case.sensor.gain
+    if model == '9':
+        gain = np.linalg.cholesky(gain @ gain.T)
     true = force @ np.linalg.solve(gain, case.sensor.gain).T
     spread = np.sqrt(np.diagonal(found.force_covariance(got), axis1=1, axis2=2))
     inside = np.abs(found.model.vector - values) <= 1.96 * deviation + 1e-12
     return inside.astype(float), (np.abs(got - true) <= 1.96 * spread).ravel().astype(float)
 
 
-def _twelve(case: Case) -> Floats:
-    """Give the true values of model 12: offset, gains, cross-axis, misalignment."""
-    gain = case.sensor.gain
-    symmetric, skew = (gain + gain.T) / 2.0, (gain - gain.T) / 2.0
-    return np.concatenate([case.sensor.offset, np.diag(gain) - 1.0,
-                           symmetric[[0, 0, 1], [1, 2, 2]], skew[[2, 0, 1], [1, 2, 0]]])
-
-
 def of_choice(job: Job) -> dict[str, float]:
-    """Give the errors of auto and of each fixed model."""
+    """Return the errors of auto and of each fixed model [mg]."""
     kind, count, seed = job
     rng = np.random.default_rng([seed, count, int(kind)])
     case = draw(rng, count, kind)
@@ -160,7 +161,7 @@ def of_choice(job: Job) -> dict[str, float]:
 
 
 def of_wiring(job: Job) -> bool:
-    """Say whether a fault of the wiring is named, and nothing is where there is none."""
+    """Return whether a fault of the wiring is reported, or none if there is none."""
     fault, seed = job
     rng = np.random.default_rng([seed, len(fault)])
     case = misplaced(rng, 12, float(rng.choice([0.0, 2.0])))
@@ -179,12 +180,12 @@ def of_wiring(job: Job) -> bool:
             return 'm/s2' in error.advice
         return False
     found = fit_poses(case.poses.with_columns(reading=reading), G)
-    told = [text for text in found.warnings if 'wrong sign' in text or 'swapped' in text]
-    return not told if fault == 'none' else bool(told) and words in told[0]
+    reported = [text for text in found.warnings if 'wrong sign' in text or 'swapped' in text]
+    return not reported if fault == 'none' else bool(reported) and words in reported[0]
 
 
 def of_recording(job: Job) -> Floats:
-    """Say which parameters are inside their intervals, from samples that are correlated [s]."""
+    """Return which parameters are inside their intervals if the samples are correlated."""
     correlation, seed = job
     rng = np.random.default_rng([seed, int(1000 * correlation)])
     sensor = draw_sensor(rng, '10')
@@ -198,7 +199,7 @@ def of_recording(job: Job) -> Floats:
         found = fit_poses(poses, G, model='10')
     except AccelCalibError:
         return np.zeros(0)
-    away = found.model.vector - form_of('10').free(sensor.gain, sensor.offset)
+    away = found.model.vector - sensor.values('10')
     return (np.abs(away) <= 1.96 * np.sqrt(np.diag(found.covariance))).astype(float)
 
 
@@ -218,9 +219,10 @@ def knocks(run: Run, sets: int, seed: int) -> Iterator[Line]:
             yield Line(f'{what}: error [mg] (of a fit to the right rows)',
                        f'{middle:.3f} ({np.median(best):.3f})', f'≤ {most}', sets, middle <= most)
             if knocked:
-                yield _share(f'{what}: all that show by 2 mg named, and no clean one', named, 0.95)
+                yield _share(f'{what}: each that shows by {_SHOWS_MG:g} mg rejected, no clean one',
+                             named, 0.95)
             else:
-                yield _share(f'{what}: no pose thrown out', ~lost, 0.98)
+                yield _share(f'{what}: no pose rejected', ~lost, 0.98)
 
 
 def bounds(run: Run, sets: int, seed: int) -> Iterator[Line]:
@@ -238,19 +240,19 @@ def bounds(run: Run, sets: int, seed: int) -> Iterator[Line]:
 def placements(run: Run, sets: int, seed: int) -> Iterator[Line]:
     """Measure badly placed orientations."""
     for count in (12, 18, 36):
-        error, told = map(np.array, zip(*run(of_placement, [(count, 2.0, seed + k)
-                                                            for k in range(sets)])))
+        error, reported = map(np.array, zip(*run(of_placement, [(count, 2.0, seed + k)
+                                                                for k in range(sets)])))
         middle = float(np.median(error))
         what = f'six faces and {count - 6} more placed'
-        yield _share(f'{what} 2° off: detected, and said', told, 1.0)
+        yield _share(f'{what} 2° off: reported', reported, 1.0)
         yield Line(f'{what} 2° off: error [mg]', f'{middle:.3f}', '≤ 0.4', sets, middle <= 0.4)
-        told = np.array([told for _, told in run(of_placement, [(count, 0.0, seed + k)
-                                                                for k in range(sets)])])
-        yield _share(f'{what} well: the orientations are used', ~told, 0.99)
+        reported = np.array([each for _, each in run(of_placement, [(count, 0.0, seed + k)
+                                                                    for k in range(sets)])])
+        yield _share(f'{what} well: the orientations are used', ~reported, 0.99)
 
 
 def intervals(run: Run, sets: int, seed: int) -> Iterator[Line]:
-    """Measure how often 95 % intervals hold the truth."""
+    """Measure how often 95 % intervals contain the truth."""
     rows = [(kind, model, count, 'measured') for kind, model in
             (('4', '4'), ('7', '7'), ('10', '9'), ('10', '10'), ('12', '12'))
             for count in (12, 36)]
@@ -258,25 +260,27 @@ def intervals(run: Run, sets: int, seed: int) -> Iterator[Line]:
              for noise in ('differs', 'not given', 'understated')]
     words = {'measured': '', 'differs': ', noise that differs by pose (e-fold)',
              'not given': ', noise not given',
-             'understated': ', noise stated a third of what it is'}
+             'understated': ', a third of the noise stated'}
     for kind, model, count, noise in rows:
         jobs = [(kind, model, count, noise, seed + k) for k in range(10 * sets)]
         values, readings = zip(*run(of_intervals, jobs))
-        each = 100.0 * np.mean([part for part in values if len(part)], axis=0)
+        fitted_sets = [part for part in values if len(part)]
+        each = 100.0 * np.mean(fitted_sets, axis=0)
         corrected = 100.0 * np.mean([part for part in readings if len(part)])
         met = bool(np.all((each >= 93.0) & (each <= 97.0)) and 93.0 <= corrected <= 97.0)
-        yield Line(f'model {model}, {count} poses{words[noise]}: 95 % intervals hold',
-                   f'parameters {np.min(each):.1f} to {np.max(each):.1f} %, corrected readings '
-                   f'{corrected:.1f} %', '93 to 97 %', 10 * sets, met)
+        yield Line(f'model {model}, {count} poses{words[noise]}: 95 % intervals contain the '
+                   'truth', f'parameters {np.min(each):.1f} to {np.max(each):.1f} %, corrected '
+                   f'readings {corrected:.1f} %', '93 to 97 %', len(fitted_sets), met)
 
 
 def wiring(run: Run, sets: int, seed: int) -> Iterator[Line]:
-    """Measure whether faults of the wiring are said."""
+    """Measure how often faults of the wiring are reported."""
     words = {'sign': 'one axis with the wrong sign', 'swap': 'two axes swapped',
              'units': 'm/s² given as g', 'none': 'nothing wrong'}
     for fault, what in words.items():
-        told = np.array(run(of_wiring, [(fault, seed + k) for k in range(sets)]))
-        yield _share(f'known orientations, {what}: said in words', told,
+        right = np.array(run(of_wiring, [(fault, seed + k) for k in range(sets)]))
+        yield _share(f'known orientations, {what}: '
+                     + ('nothing reported' if fault == 'none' else 'reported'), right,
                      0.99 if fault == 'none' else 1.0)
 
 
@@ -287,8 +291,8 @@ def recordings(run: Run, sets: int, seed: int) -> Iterator[Line]:
                                                     for k in range(2 * sets)]) if len(part)]
         each = 100.0 * np.mean(held, axis=0)
         yield Line(f'recording of 16 rests of 4 s, samples correlated over {correlation:g} s: 95 '
-                   '% intervals hold', f'parameters {np.min(each):.1f} to {np.max(each):.1f} %, '
-                   f'mean {np.mean(each):.1f} %', '93 to 97 %', len(held),
+                   '% intervals contain the truth', f'parameters {np.min(each):.1f} to '
+                   f'{np.max(each):.1f} %, mean {np.mean(each):.1f} %', '93 to 97 %', len(held),
                    93.0 <= float(np.mean(each)) <= 97.0)
 
 
@@ -320,7 +324,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--sets', type=int, default=200)
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--only', choices=ROWS, action='append')
+    parser.add_argument('--only', choices=ROWS, action='append', help='only these; repeatable')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args(arguments)
     lines = []
@@ -330,8 +334,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in given.only or ROWS:
             lines += ROWS[name](run, given.sets, 100_000 * given.seed)
             print(name, file=sys.stderr, flush=True)
-    text = (f'# Figures of trust\n\n{__doc__.strip()}\n\nMade by `python benchmarks/robustness.py '
-            f'--sets {given.sets} --seed {given.seed} --markdown FILE`.\n\n{table(lines)}\n')
+    command = (f'python benchmarks/robustness.py --sets {given.sets} --seed {given.seed}'
+               + ''.join(f' --only {name}' for name in given.only or ()))
+    text = (f'# Figures of trust\n\n{__doc__.strip()}\n\nMade by `{command} --markdown FILE`.\n\n'
+            f'{table(lines)}\n')
     publish(text, given.markdown)
     return 0
 

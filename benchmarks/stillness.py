@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Measure the stillness detector on simulated recordings and on real ones.
+Stillness detector on simulated and on real recordings, beside simpler rules.
 
-A pose belongs to the rest that it overlaps most, if that is more than half of it; otherwise it is
-false. Its error is its mean less the true specific force of that rest, less the norm error where
-only |a| counts. The normalised error is error / stated noise, and has a standard deviation of 1
-where the statement is right.
+A pose belongs to the rest that it overlaps most, if that is more than half of the pose; otherwise
+it is false. Its error is its mean less the true specific force of that rest; the error of its norm
+is |mean| - 1. The normalised error is error / stated noise; its standard deviation is 1 if the
+statement is right::
+
+    python benchmarks/stillness.py --sets 60 --markdown docs/figures/stillness.md
 
 """
 
@@ -19,55 +21,65 @@ from pathlib import Path
 import sys
 from typing import NamedTuple
 
-from accel_calib.table import Floats
-from figures import Line, publish, table
-import numpy as np
-from stillness_case import Case, case_of, KINDS
-from stillness_real import table_of_real
-import stillness_rules as rules
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
 
-DATA = Path(__file__).parents[2] / 'shared' / 'data'
+from accel_calib.calibrate import fit_poses  # noqa: E402
+from accel_calib.errors import AccelCalibError  # noqa: E402
+from accel_calib.files import read_recording  # noqa: E402
+from accel_calib.table import Floats, numbered, Poses  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, publish, table  # noqa: E402
+import numpy as np  # noqa: E402
+import stillness_case as cases  # noqa: E402
+from stillness_case import Case, case_of, KINDS, Pose, Sensor  # noqa: E402
 
-RULES: dict[str, Callable[[Case], list[rules.Pose]]] = {
-    'ours': lambda case: rules.ours(case, gyro=False),
-    'ours, gyro': lambda case: rules.ours(case, gyro=True),
-    'variance': rules.variance,
-    'gyro': rules.gyro}
+DATA = ROOT.parent / 'shared' / 'data'
 
-WHAT = {'plain': 'hand-turned only', 'tremor': 'and held in the hand, tremor of 1 to 10 mg',
-        'turning': 'and turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
-        'motor': 'a motor of 2 to 32 mg idles'}
+RULES: dict[str, Callable[[Case], list[Pose]]] = {
+    'ours': lambda case: cases.ours(case, gyro=False),
+    'ours, gyro': lambda case: cases.ours(case, gyro=True),
+    'variance': cases.variance,
+    'gyro': cases.gyro}
+
+RECORDINGS = (('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
+              ('xsens_mti_counts', 'native', 38))
+"""Name, unit, and the number of poses that the person took."""
+
+WHAT = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
+        'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
+        'motor': 'a motor of 2 to 32 mg beside it'}
 
 ABOUT = """# Figures of the stillness detector
 
 Made by `python benchmarks/stillness.py {command} --markdown FILE`.
-Each recording has ten rests of 2.5 to 8 s, 50 to 1000 Hz, noise that is white or has a
-correlation time of 20 or 200 ms, and a gyro with 2 mrad/s of noise and a bias. *variance* (three
-times the standard deviation of the first two seconds, as imu_tk and others do) and *gyro* (mean
-rate within 0.5 °/s of that of the first two seconds) are told that the recording begins with a
-rest; ours is not. A false pose lies for its greater part where the sensor moved. A normalised
-error is that of a pose mean over its stated noise std/√count, and should have a standard
-deviation of 1; the largest 1 % are left out of it, and show under *largest*. For false poses it
-is that against the true force in their middle: a tremor below the noise of the sensor harms no
-mean. Footsteps and an idling motor are rests too, for their means are right."""
+Each recording has ten rests of 2.5 to 8 s at 50 to 1000 Hz, noise that is white or has a
+correlation time of 20 or 200 ms, and a gyro with 2 mrad/s of noise and a bias. Two rules beside
+ours know that the recording begins with a rest: *variance* uses three times the standard deviation
+of the first two seconds, as imu_tk and others do; *gyro* requires a mean rate within 0.5 °/s of
+that of the first two seconds. In most of a false pose the sensor moves. The normalised error is
+the error of a pose mean over its stated noise std/√count, without the largest 1 %, which show
+under *largest*; its standard deviation should be 1. For false poses it is the error against the
+true force in their middle: a tremor below the noise of the sensor does no harm to a mean. Rests
+beside footsteps and a motor count as rests, because their means are right."""
 
-NOT_REACHED = """\
-Not reached, or less than others: beside an idling motor the stated noise is too large, for
-vibration averages out faster than the noise it is taken for. With 50 mg a turn that goes on
-slower than the noise wanders (correlation 200 ms) is not always told from it; most rests of a few
-seconds are refused there unless a gyro tells, for they cannot show that they were not turned.
-Steps that stand far out of a quiet sensor's noise cost rests that a threshold learned among them
-keeps. A tremor below some twice the noise passes as
-rest; held against the true force, such poses are as good as their stated noise."""
+LIMITS = """\
+Limits: beside a motor the stated noise is too large, because vibration averages out faster than
+the noise it resembles. With 50 mg of noise, a turn that lasts longer than the correlation time of
+200 ms is not always distinguished from noise. Most rests of a few seconds are refused there
+without a gyro, because their samples cannot show that the sensor was not turned. Steps that are
+clearly larger than the noise of a quiet sensor cost rests that a threshold learned from the steps
+keeps. A tremor below about twice the noise counts as rest; against the true force such poses are
+as good as their stated noise."""
 
 ABOUT_REAL = """\
-A fit of 10 parameters to the poses, every pose kept; nobody knows the truth of these. The gyro of
-the Xsens recording is in counts, which no threshold in °/s fits."""
+A fit of 10 parameters to all poses. The truth of these recordings is not known. The gyro of the
+Xsens recording is in counts, so that a threshold in °/s does not apply."""
 
 
 class Score(NamedTuple):
     """
-    What a rule made of a recording.
+    The poses of a rule in one recording, beside the truth.
 
     Parameters
     ----------
@@ -76,7 +88,7 @@ class Score(NamedTuple):
     resting, used : int
         Samples at rest, and those of them in poses.
     false : (m, 3) array
-        Normalised errors of poses that are no rests.
+        Normalised errors of false poses.
     errors, norms, scores : (m, 3), (m,), (m, 3) arrays
         Errors of pose means, errors of their norms [g], and normalised errors.
     rests, missed : int
@@ -96,8 +108,8 @@ class Score(NamedTuple):
     missed: int
 
 
-def score(case: Case, poses: Sequence[rules.Pose]) -> Score:
-    """Hold poses against the truth."""
+def score(case: Case, poses: Sequence[Pose]) -> Score:
+    """Compare poses with the truth."""
     inside = np.zeros(len(case.time), dtype=bool)
     errors, norms, scores, false = [], [], [], []
     hit: set[int] = set()
@@ -137,7 +149,7 @@ class Sum(NamedTuple):
 
 
 def summed(scores: Sequence[Score]) -> Sum:
-    """Sum up the scores of many recordings."""
+    """Return the sum of the scores of many recordings."""
     errors = 1e3 * np.concatenate([each.errors for each in scores])
     norms = 1e3 * np.concatenate([each.norms for each in scores])
     return Sum(sum(x.taken for x in scores) / max(sum(x.moving for x in scores), 1),
@@ -151,14 +163,14 @@ def summed(scores: Sequence[Score]) -> Sum:
 
 
 def _rms(values: Floats, share: float) -> float:
-    """Give the root mean square of this share of the values, the largest left out."""
+    """Return the root mean square of the smallest values, as many as this share."""
     squares = np.sort(np.square(values), axis=None)
     kept = squares[:int(np.ceil(share * len(squares)))]
     return float(np.sqrt(np.mean(kept))) if len(kept) else np.nan
 
 
 def measured(sets: int, seed: int, noisy: bool) -> dict[tuple[str, str], Sum]:
-    """Run all rules on recordings of all kinds."""
+    """Return the sums of all rules on recordings of all kinds."""
     found: dict[tuple[str, str], list[Score]] = {}
     for kind in KINDS:
         for number in range(sets):
@@ -170,7 +182,7 @@ def measured(sets: int, seed: int, noisy: bool) -> dict[tuple[str, str], Sum]:
 
 
 def compared(found: dict[tuple[str, str], Sum]) -> str:
-    """Give the table of all rules on all kinds, as Markdown."""
+    """Return the table of all rules on all kinds, as Markdown."""
     heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
              'false poses',
              'median error of a mean, mg', 'largest, mg',
@@ -188,7 +200,7 @@ def _figure(value: float) -> str:
 
 
 def lines_of(found: dict[tuple[str, str], Sum], noise: str, sets: int) -> list[Line]:
-    """Give what is asked of the detector beside what was measured."""
+    """Return what is asked of the detector beside what is measured."""
     lines = []
     for rule in ('ours', 'ours, gyro'):
         turning = found['turning', rule]
@@ -200,6 +212,51 @@ def lines_of(found: dict[tuple[str, str], Sum], noise: str, sets: int) -> list[L
                               f'{x.normalised:.2f}', '0.85 to 1.15', sets,
                               0.85 <= x.normalised <= 1.15))
     return lines
+
+
+def real_cases(folder: Path) -> list[tuple[str, Case, int]]:
+    """Return the real recordings, in g if their unit is known, and their numbers of poses."""
+    found = []
+    for name, unit, poses in RECORDINGS:
+        recording = read_recording(folder / f'{name}.csv')
+        units = units_of(unit)  # type: ignore[arg-type]
+        native = units.name == 'native'
+        reading = recording.reading if native else units.to_g(recording.reading)
+        time = recording['time']
+        nothing = np.zeros((0, 2), dtype=np.intp)
+        sensor = Sensor(0.0, 1.0 / float(np.median(np.diff(time))), 0.0)
+        found.append((name, Case('real', sensor, 0.0, time, reading, recording['rate'], reading,
+                                 nothing, np.zeros(len(time), dtype=bool),
+                                 'native' if native else 'g'), poses))
+    return found
+
+
+def table_of_real(folder: Path) -> str:
+    """Return the table of all rules on the real recordings, as Markdown."""
+    rows = ['| recording | rule | poses | taken by hand | samples used | residual, mg '
+            '| chi² per degree of freedom |', '|---|---|---|---|---|---|---|']
+    for name, case, wanted in real_cases(folder):
+        for rule, find in RULES.items():
+            poses = find(case)
+            used = sum((case.time >= each.start) & (case.time <= each.end) for each in poses)
+            rows.append(f'| {name} | {rule} | {len(poses)} | {wanted} | {np.mean(used):.1%} '
+                        f'| {_fitted(poses, case.units)} |')
+    return '\n'.join(rows)
+
+
+def _fitted(poses: Sequence[Pose], unit: str) -> str:
+    if not poses:
+        return 'no poses | '
+    columns = {'time': np.array([each.start for each in poses]),
+               'reading': np.array([each.mean for each in poses]),
+               'std': np.array([each.noise for each in poses]), 'count': np.ones(len(poses))}
+    try:
+        quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit),  # type: ignore
+                            model='10', method='algebraic').quality
+    except AccelCalibError as error:
+        return f'no fit ({type(error).__name__}) | '
+    chi2 = quality.chi2_per_dof
+    return f'{quality.rms_after_mg:.3f} | {"" if chi2 is None else f"{chi2:.1f}"}'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -215,10 +272,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = lines_of(usual, 'noise 0.3 to 5 mg', given.sets)
     lines += lines_of(noisy, 'noise 50 mg', given.sets)
     parts = [ABOUT.format(command=f'--sets {given.sets} --seed {given.seed}'), table(lines),
-             NOT_REACHED, '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg',
+             LIMITS, '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg',
              compared(noisy)]
-    if given.data.is_dir():
-        parts += ['## Real recordings', ABOUT_REAL, table_of_real(given.data, RULES)]
+    parts += ['## Real recordings', f'{ABOUT_REAL}\n\n{table_of_real(given.data)}'
+              if given.data.is_dir() else f'Not measured: {given.data} is missing.']
     text = '\n\n'.join(parts) + '\n'
     publish(text, given.markdown)
     return 0

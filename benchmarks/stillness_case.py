@@ -2,10 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Recordings of a sensor that is put down, held, turned slowly, walked past, or sits by a motor.
+Recordings with and without rests, and the rules that find the rests.
 
-Every recording is a row of stretches: the sensor rests, is carried by hand to the next
-orientation, and so on; what else happens depends on the kind. All is in g, s and rad/s.
+A simulated recording is a sequence of stretches: the sensor rests, is carried by hand to the next
+orientation, and so on. By its kind it is also held in the hand, turned slowly, beside a person who
+walks by, or beside a motor. Forces are in g, all else is SI.
+
+A rule takes a recording and returns poses. Ours is the detector of the package. The two others are
+simple, and get what ours has to find out: that the sensor rests in the first two seconds.
+**variance**: the standard deviation over a sliding second, by axis, is below three times that of
+the first two seconds, or 0.33 mg (imu_tk and others use a multiple of the variance in a first
+rest). **gyro**: the mean rate over half a second is within 0.5 °/s of that of the first two
+seconds. A pose is a stretch of a second or more; both treat the samples as independent.
 
 """
 
@@ -14,9 +22,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import itertools
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from accel_calib.capture import CaptureSettings, StillDetector
 from accel_calib.table import Floats
+from accel_calib.units import units_of
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -30,10 +40,16 @@ _REST, _CARRY, _OTHER = 0, 1, 2
 _GYRO_NOISE = 2e-3    # [rad/s]
 _GYRO_BIAS = 1.5e-2   # [rad/s], by axis
 
+_FIRST = 2.0        # [s] known to be a rest
+_MIN_DWELL = 1.0    # [s]
+_TIMES = 3.0
+_LEAST = 3.3e-4     # [g]
+_TURNING = np.radians(0.5)
+
 
 @dataclass(frozen=True)
 class Sensor:
-    """Noise of a sample [g], samples a second, and correlation time of the noise [s]."""
+    """Noise of a sample [g], samples per second, and correlation time of the noise [s]."""
 
     noise: float
     rate: float
@@ -52,11 +68,11 @@ class Case:
     sensor : Sensor
         The sensor.
     size : float
-        Of what happens: tremor, steps or vibration [g], or the speed of turning [°/s].
+        Of the tremor, steps or vibration [g], or speed of the turning [°/s].
     time, reading, rate, force : arrays
-        Stamps, (n, 3) readings, angular rates, and the true specific force without vibration.
+        (n,) stamps; (n, 3) readings, angular rates and true specific force without vibration.
     rests : (m, 2) array of int
-        First sample of each rest, and the one after its last.
+        Index of the first sample of each rest, and of the one after its last.
     moving : (n,) array of bool
         Whether the sensor is carried, held or turned.
     units : {'g', 'native'}
@@ -77,7 +93,7 @@ class Case:
 
 
 def case_of(kind: str, seed: int, number: int, noisy: bool = False) -> Case:
-    """Draw a recording."""
+    """Draw a recording of a kind."""
     rng = np.random.default_rng([seed, KINDS.index(kind), number, noisy])
     sensor = Sensor(1e-3 * float(NOISY_MG if noisy else rng.choice(NOISES_MG)),
                     float(rng.choice(RATES_HZ)), float(rng.choice(CORRELATION_S)))
@@ -101,7 +117,7 @@ def case_of(kind: str, seed: int, number: int, noisy: bool = False) -> Case:
 
 
 def coloured(rng: np.random.Generator, count: int, rate: float, correlation: float) -> Floats:
-    """Give (count, 3) noise of variance 1 with this correlation time [s]."""
+    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
     keep = np.exp(-1.0 / (rate * correlation)) if correlation > 0.0 else 0.0
     start = int(10.0 * correlation * rate)
     white = rng.normal(size=(count + start, 3))
@@ -109,7 +125,7 @@ def coloured(rng: np.random.Generator, count: int, rate: float, correlation: flo
 
 
 def _stretches(rng: np.random.Generator, kind: str) -> list[tuple[int, float]]:
-    """Give what happens and for how long [s]."""
+    """Return the stretches of a recording: what happens, and for how long [s]."""
     found: list[tuple[int, float]] = []
     for _ in range(10):
         found += [(_REST, rng.uniform(2.5, 8.0)), (_CARRY, rng.uniform(0.8, 2.0))]
@@ -145,14 +161,14 @@ def _motion(rng: np.random.Generator, kind: str, size: float,
 
 
 def _level_axis(rng: np.random.Generator, now: Rotation) -> Floats:
-    """Give a unit vector normal to the vertical, in the body: turning about it tilts."""
+    """Return a horizontal unit vector in the axes of the body: a turn about it tilts."""
     axis = np.cross(now.inv().apply([0.0, 0.0, 1.0]), rng.normal(size=3))
     return np.asarray(axis / np.linalg.norm(axis))
 
 
 def _shaking(rng: np.random.Generator, kind: str, size: float,
              phase: np.ndarray[tuple[int, ...], np.dtype[np.intp]], rate: float) -> Floats:
-    """Give (n, 3) accelerations beside gravity."""
+    """Return (n, 3) accelerations without gravity [g]."""
     count = len(phase)
     carried = 0.08 * coloured(rng, count, rate, 0.05) * (phase == _CARRY)[:, np.newaxis]
     more: dict[str, Callable[[], Floats]] = {
@@ -165,7 +181,7 @@ def _shaking(rng: np.random.Generator, kind: str, size: float,
 
 def _swinging(rng: np.random.Generator, count: int, rate: float, size: float,
               band: tuple[float, float], jitter: float) -> Floats:
-    """Give a swing of one frequency [Hz], which wanders by `jitter`, in a fixed direction."""
+    """Return an oscillation in a fixed direction; its frequency [Hz] wanders by `jitter`."""
     frequency = rng.uniform(*band) + jitter * coloured(rng, count, rate, 1.0)[:, 0]
     phase = 2.0 * np.pi * np.cumsum(frequency) / rate
     direction = rng.normal(size=(2, 3))
@@ -175,7 +191,7 @@ def _swinging(rng: np.random.Generator, count: int, rate: float, size: float,
 
 
 def _steps(rng: np.random.Generator, count: int, rate: float, size: float) -> Floats:
-    """Give the steps of somebody who walks by: knocks that ring and die away."""
+    """Return the steps of a person who walks by: shocks that ring and decay."""
     time = np.arange(0.0, 0.6, 1.0 / rate)
     ringing = np.exp(-time / 0.08) * np.sin(2.0 * np.pi * rng.uniform(12.0, 30.0) * time)
     struck = np.zeros((count, 3))
@@ -186,3 +202,60 @@ def _steps(rng: np.random.Generator, count: int, rate: float, size: float) -> Fl
     direction = rng.normal(size=(int(kept.sum()), 3)) * 0.3 + [0.0, 0.0, 1.0]
     struck[index[kept]] += loud[kept, np.newaxis] * direction
     return np.asarray(lfilter(ringing, [1.0], struck, axis=0))
+
+
+class Pose(NamedTuple):
+    """A still stretch: first and last stamp [s], mean and noise of the mean [g]."""
+
+    start: float
+    end: float
+    mean: Floats
+    noise: Floats
+
+
+def ours(case: Case, gyro: bool) -> list[Pose]:
+    """Return the dwells that the stillness detector finds."""
+    rate = case.rate if gyro else np.full_like(case.rate, np.nan)
+    samples = np.column_stack([case.time, case.reading, rate, np.full((len(rate), 2), np.nan)])
+    detector = StillDetector(CaptureSettings(), units_of(case.units))
+    detector.push(samples)
+    detector.close()
+    return [Pose(each.start, each.end, each.mean, each.std / np.sqrt(each.count))
+            for each in detector.dwells()]
+
+
+def variance(case: Case) -> list[Pose]:
+    """Return the poses by a fixed threshold of the variance."""
+    width = round(case.sensor.rate)
+    first = case.reading[:round(_FIRST * case.sensor.rate)].std(axis=0)
+    mean = _sliding(case.reading, width)
+    spread = np.sqrt(np.maximum(_sliding(np.square(case.reading), width) - mean**2, 0.0))
+    least = _LEAST if case.units == 'g' else 0.0
+    return _poses(case, np.all(spread < np.maximum(_TIMES * first, least), axis=1))
+
+
+def gyro(case: Case) -> list[Pose]:
+    """Return the poses by a threshold of the mean rate."""
+    bias = case.rate[:round(_FIRST * case.sensor.rate)].mean(axis=0)
+    mean = _sliding(case.rate - bias, round(0.5 * case.sensor.rate))
+    return _poses(case, np.linalg.norm(mean, axis=1) < _TURNING)
+
+
+def _sliding(values: Floats, width: int) -> Floats:
+    """Return means over windows centred on each sample; they are shorter at the ends."""
+    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
+    index = np.arange(len(values))
+    low = np.maximum(index - width // 2, 0)
+    high = np.minimum(index + (width + 1) // 2, len(values))
+    return np.asarray((sums[high] - sums[low]) / (high - low)[:, np.newaxis])
+
+
+def _poses(case: Case, still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[Pose]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    found = []
+    for start, stop in edges.reshape(-1, 2):
+        part = case.reading[start:stop]
+        if len(part) >= _MIN_DWELL * case.sensor.rate:
+            found.append(Pose(float(case.time[start]), float(case.time[stop - 1]),
+                              part.mean(axis=0), part.std(axis=0, ddof=1) / np.sqrt(len(part))))
+    return found

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Measure how fast recordings become poses, and in how much memory.
+Speed and memory of the stillness detector.
 
-CPU time of one core over arrays that are in memory already, the least of some repeats; memory is
-the largest that Python and numpy held at once beside the array (`tracemalloc`, in a run of its
-own). The sensor rests for 4 s and is shaken for one, with noise of 2 mg in steps of 1/16384 g.
+Times are CPU time of one core over arrays in memory, the least of several repeats. Memory is the
+largest that Python and numpy hold at once beside the array (`tracemalloc`, in a separate run). The
+sensor rests for 4 s and is shaken for 1 s, with 2 mg of noise in steps of 1/16384 g::
+
+    python benchmarks/stillness_speed.py --seed 1 --markdown docs/figures/stillness_speed.md
 
 """
 
@@ -14,43 +16,50 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import os
 from pathlib import Path
+import platform
 import sys
 import time
 import tracemalloc
 
-from accel_calib.calibrate import fit_poses
-from accel_calib.capture import capture, CaptureSettings, StillDetector
-from accel_calib.files import read_recording
-from accel_calib.table import Recording
-from accel_calib.units import units_of
-from figures import Line, publish, table
-import numpy as np
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-DATA = Path(__file__).parents[2] / 'shared' / 'data'
+from accel_calib.calibrate import fit_poses  # noqa: E402
+from accel_calib.capture import capture, CaptureSettings, StillDetector  # noqa: E402
+from accel_calib.files import read_recording  # noqa: E402
+from accel_calib.table import Recording  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
+import numpy as np  # noqa: E402
+
+DATA = ROOT.parent / 'shared' / 'data'
 SIZES = (10**5, 10**6, 10**7, 3 * 10**7)
 RATES_HZ = (100.0, 1000.0)
 G = units_of('g')
 _REST, _SHAKEN = 4.0, 1.0   # [s]
-_STREAMED = 60_000
+_STREAMED, _BATCH = 60_000, 300
+"""Samples of a stream at 1000 Hz, and of a batch of 0.3 s, as the node pushes them."""
 
 ABOUT = """# Speed of the stillness detector
 
-Made by `python benchmarks/stillness_speed.py --seed {seed} --markdown FILE`. CPU
-time of one core, arrays in memory, the least of some repeats; a machine shared with others. The
-sensor rests for 4 s and is shaken for one. Memory grows with the poses only, 2 kB each."""
+Made by `python benchmarks/stillness_speed.py {command} --markdown FILE`.
+Times are CPU time of one core over arrays in memory, the least of several repeats. The sensor
+rests for 4 s and is shaken for 1 s.
 
-LIMIT = """\
-At 1000 Hz a sample costs {fast:.0f} ns: some twenty passes over readings that stay in the cache,
-for rows, chunk borders, sums, squares and smallest steps. At 100 Hz a sample costs {slow:.0f} ns,
-for a chunk is ten samples and a rest 400. The rule takes some 120 passes over the chunks; a sensor
-that rests all the time is {long:.0f} million samples/s. The rest is {rest:.0f} µs for each rest:
-thirty calls of numpy that join its chunks, and the record that is made of it. To reach 20 million
-there takes a tracker that joins all rests of a block in array calls, or a compiled one."""
+Machine: {machine}."""
+
+COSTS = """\
+A sample costs {fast:.0f} ns at 1000 Hz and {slow:.0f} ns at 100 Hz, where a chunk has ten samples
+and a rest 400. A sensor that always rests gives {long:.0f} million samples/s at 100 Hz. The
+difference is {rest:.0f} µs per rest: some calls of numpy join its chunks, and a record is made of
+it."""
 
 
 def recording_of(size: int, rate: float, seed: int, rest: float = _REST) -> Recording:
-    """Simulate a recording of so many samples at this rate [Hz]."""
+    """Simulate a recording of `size` samples, with rests of `rest` [s]."""
     rng = np.random.default_rng(seed)
     reading = 2e-3 * rng.standard_normal((size, 3))
     period, resting = round((rest + _SHAKEN) * rate), round(rest * rate)
@@ -66,7 +75,7 @@ def recording_of(size: int, rate: float, seed: int, rest: float = _REST) -> Reco
 
 
 def seconds(recording: Recording, repeats: int) -> float:
-    """Give the CPU time that `capture` takes [s]."""
+    """Return the CPU time of `capture` [s]."""
     found = []
     for _ in range(repeats):
         start = time.process_time()
@@ -76,7 +85,7 @@ def seconds(recording: Recording, repeats: int) -> float:
 
 
 def memory(recording: Recording) -> float:
-    """Give the memory that `capture` holds beside the recording [MB]."""
+    """Return the memory that `capture` holds beside the recording [MB]."""
     tracemalloc.start()
     capture(recording, G)
     peak = tracemalloc.get_traced_memory()[1]
@@ -85,7 +94,7 @@ def memory(recording: Recording) -> float:
 
 
 def of_arrays(sizes: Sequence[int], seed: int) -> tuple[list[Line], dict[float, float]]:
-    """Measure arrays of these sizes; give the time of a sample too [s], by rate [Hz]."""
+    """Measure arrays of these sizes; return also the time per sample [s], by rate [Hz]."""
     lines, each = [], {}
     for rate in RATES_HZ:
         for size in sizes:
@@ -102,11 +111,11 @@ def of_arrays(sizes: Sequence[int], seed: int) -> tuple[list[Line], dict[float, 
 
 
 def of_xsens(folder: Path) -> list[Line]:
-    """Measure the real recording: reading the file, finding the poses, fitting them."""
+    """Measure reading, poses and fit of the real recording."""
     units, found = units_of('native'), []
     for _ in range(7):
         marks = [time.process_time()]
-        recording = read_recording(folder / 'xsens_mti_counts.csv').recording
+        recording = read_recording(folder / 'xsens_mti_counts.csv')
         marks.append(time.process_time())
         poses = capture(recording, units).poses
         marks.append(time.process_time())
@@ -123,20 +132,20 @@ def of_xsens(folder: Path) -> list[Line]:
 
 
 def of_stream(seed: int) -> list[Line]:
-    """Measure `StillDetector.push`, sample by sample, with a gyro."""
+    """Measure `StillDetector.push` of batches, with a gyro."""
     recording = recording_of(_STREAMED, 1000.0, seed)
     rate = 2e-3 * np.random.default_rng(seed).standard_normal((_STREAMED, 3))
-    rows = list(zip(recording['time'].tolist(), recording.reading.tolist(), rate.tolist()))
+    samples = np.column_stack([recording['time'], recording.reading, rate,
+                               np.full((_STREAMED, 2), np.nan)])
     detector, took = StillDetector(CaptureSettings(), G), []
-    for row in rows:
+    for batch in np.split(samples, _STREAMED // _BATCH):
         start = time.perf_counter()
-        detector.push(*row)
+        detector.push(batch)
         took.append(time.perf_counter() - start)
-    microseconds = 1e6 * np.array(took)
-    return [Line('push at 1000 Hz: mean, µs', f'{microseconds.mean():.1f}', '', 1, None),
-            Line('push at 1000 Hz: median, µs', f'{np.median(microseconds):.1f}', '', 1, None),
-            Line('push that ends a chunk (one in 100): median, µs',
-                 f'{np.median(microseconds[microseconds > 50.0]):.0f}', '', 1, None)]
+    return [Line(f'push of {_BATCH} samples at 1000 Hz: median, largest, ms',
+                 f'{1e3 * np.median(took):.2f}, {1e3 * np.max(took):.2f}', '', len(took), None),
+            Line(f'push of {_BATCH} samples at 1000 Hz: mean per sample, µs',
+                 f'{1e6 * np.sum(took) / _STREAMED:.2f}', '', len(took), None)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -147,17 +156,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
     parser.add_argument('--markdown', type=Path, help='write the table to this file')
     given = parser.parse_args(arguments)
-    sizes = [size for size in SIZES if size <= given.largest]
+    before = (f'{processor()} before; Python {platform.python_version()}, '
+              f'numpy {np.__version__}')
+    sizes = [size for size in SIZES if size <= given.largest] or [given.largest]
     capture(recording_of(SIZES[0], RATES_HZ[0], given.seed), G)
     lines, each = of_arrays(sizes, given.seed)
-    if given.data.is_dir():
-        lines += of_xsens(given.data)
+    lines += (of_xsens(given.data) if given.data.is_dir()
+              else [Line(f'Xsens: not measured, {given.data} is missing', '', '', 0, None)])
     lines += of_stream(given.seed)
     resting = recording_of(10**6, 100.0, given.seed, rest=1e5)
     slow, fast, still = each[100.0], each[1000.0], seconds(resting, 3) / 10**6
-    told = LIMIT.format(fast=1e9 * fast, slow=1e9 * slow, long=1e-6 / still,
-                        rest=1e6 * (slow - still) * 100.0 * (_REST + _SHAKEN))
-    text = '\n\n'.join([ABOUT.format(seed=given.seed), table(lines), told]) + '\n'
+    costs = COSTS.format(fast=1e9 * fast, slow=1e9 * slow, long=1e-6 / still,
+                         rest=1e6 * (slow - still) * 100.0 * (_REST + _SHAKEN))
+    command = f'--largest {given.largest} --seed {given.seed}'
+    text = f'{ABOUT.format(command=command, machine=before)}\n\n{table(lines)}\n\n{costs}\n'
     publish(text, given.markdown)
     return 0
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How soon a shift is told, and how often one is told that is none: watching, measured.
+Drift monitoring: the delay until a change is reported, and the false alarms.
 
-Each set is a sensor of its own, calibrated (model 10) from poses spread over the sphere, and then
-watched rest by rest, with the smallest departure of `drift_warn`::
+Each set draws a sensor, calibrates it (model 10) from poses spread over the sphere, and monitors
+it rest by rest. Changes below `drift_warn` are ignored::
 
     python benchmarks/watching.py --seed 2030 --markdown docs/figures/watching.md
 
@@ -25,8 +25,8 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.calibrate.watching import compared, rests_of, watching  # noqa: E402
 from accel_calib.model import Model, predict  # noqa: E402
+from accel_calib.monitor import compared, monitor, rests_of  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
@@ -36,23 +36,23 @@ import numpy as np  # noqa: E402
 
 Attitudes = Callable[[int, np.random.Generator], Floats]
 
-SHIFT = 0.005
-KNOCK = 0.05
+SHIFT, KNOCK = 0.005, 0.05
+"""Size of a lasting change, and of a knock [g]."""
+
 LEAST = 0.01 / 9.80665
 """The default of `drift_warn` [g]."""
 
-BEFORE = 10
-AFTER = 30
+BEFORE, AFTER = 10, 30
+"""Rests before and after a change."""
 
-
-NOT_REACHED = """\
-With pose means of 0.5 mg a shift takes a fourth rest now and then: 12 such poses state 1 mg and
-more for one rest in ten, and how well the sensor repeats is told badly by ten rests (were that
-known, 99 % would be told within three). With 1 mg, 5 mg hardly leave what is stated. An offset
-is not seen at rests that lie square to it, and at random attitudes any three errors look like
-some offset, so that knocks are ruled out only when three rests show it clearly. Alarms come
-where the samples say a tenth of how badly 12 poses repeat, and where one rest in twelve is
-knocked."""
+LIMITS = """\
+Limits: with 0.5 mg of noise a change sometimes needs a fourth rest. 12 such poses state 1 mg or
+more for some rests, and ten rests show only roughly how well the sensor repeats. With 1 mg of
+noise a change of 5 mg is hardly larger than the stated uncertainty. Rests in which an offset is
+perpendicular to up do not show it. In random attitudes any three errors look like some offset, so
+that knocks are ruled out only if three rests show it clearly. Alarms occur where the sensor
+repeats ten times worse than its samples state and 12 poses cannot show it, and where one rest in
+twelve is knocked."""
 
 
 def same(count: int, rng: np.random.Generator) -> Floats:
@@ -67,7 +67,21 @@ def few(count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor: poses and noise of a pose mean, and how much worse than that it repeats [g]."""
+    """
+    A kind of sensor.
+
+    Parameters
+    ----------
+    poses : int
+        Poses of its calibration.
+    noise : float
+        Noise of a pose mean, by axis [g].
+    repeats : float
+        Scatter of the pose means that their samples do not show [g].
+    near_faces : bool
+        Whether the poses are near the faces instead of spread over the sphere.
+
+    """
 
     poses: int = 12
     noise: float = 0.0003
@@ -75,11 +89,11 @@ class Sensor:
     near_faces: bool = False
 
     def scattered(self, reading: Floats, rng: np.random.Generator) -> Floats:
-        """Add what the noise of a mean does not account for."""
+        """Add the scatter that the samples do not show."""
         return reading + self.repeats * rng.normal(size=reading.shape)
 
     def made(self, rng: np.random.Generator) -> tuple[Model, Calibration]:
-        """Draw one and calibrate it."""
+        """Draw a sensor and calibrate it."""
         truth = model_with({'offset': 0.05 * rng.normal(size=3),
                             'axis_gain': 0.02 * rng.normal(size=3),
                             'cross_axis': 0.01 * rng.normal(size=3)})
@@ -92,32 +106,32 @@ class Sensor:
         poses = poses.with_columns(reading=self.scattered(poses.reading, rng))
         return truth, fit_poses(poses, units_of('g'), model='10')
 
-    def watched(self, made: tuple[Model, Calibration], up: Floats, shift: Floats,
-                rng: np.random.Generator) -> list[bool]:
-        """Say after each rest whether a departure is told."""
+    def monitored(self, made: tuple[Model, Calibration], up: Floats, shift: Floats,
+                  rng: np.random.Generator) -> list[bool]:
+        """Return after each rest whether a change is reported."""
         truth, calibration = made
         reading = predict(truth, up, {}) + shift + self.noise * rng.normal(size=up.shape)
-        state, told = watching(calibration), []
+        state, reported = monitor(calibration), []
         for rest in rests_of(calibration, self.scattered(reading, rng),
                              np.full(up.shape, self.noise), {}):
             state = compared(state, rest, LEAST)
-            told.append(state.departure is not None)
-        return told
+            reported.append(state.change is not None)
+        return reported
 
 
 def delay(sensor: Sensor, attitudes: Attitudes, *, offset: bool, rng: np.random.Generator) -> int:
-    """Give how many rests after a shift it is told; 0: before it."""
+    """Return the number of rests after which a change is reported; 0: before it happens."""
     made = sensor.made(rng)
     up = attitudes(BEFORE + AFTER, rng)
     way = random_directions(1, rng) if offset else up * rng.choice([-1.0, 1.0])
     shift = SHIFT * way * (np.arange(BEFORE + AFTER) >= BEFORE)[:, np.newaxis]
-    told = sensor.watched(made, up, shift, rng)
-    return 0 if any(told[:BEFORE]) else [*told[BEFORE:], True].index(True) + 1
+    reported = sensor.monitored(made, up, shift, rng)
+    return 0 if any(reported[:BEFORE]) else [*reported[BEFORE:], True].index(True) + 1
 
 
 def delays(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rng: np.random.Generator,
            *, offset: bool = False, asked: bool = True) -> Line:
-    """Make the line of how soon a shift is told."""
+    """Return the line of the delay until a change is reported."""
     found = np.array([delay(sensor, attitudes, offset=offset, rng=rng) for _ in range(sets)])
     shares = [100.0 * np.mean((found > 0) & (found <= rests)) for rests in (3, 4, 6, AFTER)]
     words = (f'{shares[0]:.1f} %; within 4: {shares[1]:.1f}, 6: {shares[2]:.1f}, '
@@ -129,14 +143,14 @@ def delays(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rng: np.r
 
 def alarms(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rests: int,
            rng: np.random.Generator, *, knocked: float = 0.0) -> Line:
-    """Make the line of false alarms."""
+    """Return the line of false alarms."""
     count = wrong = 0
     for _ in range(sets):
         made = sensor.made(rng)
         knock = KNOCK * random_directions(rests, rng)
         knock[rng.random(rests) >= knocked] = 0.0
-        told = np.array(sensor.watched(made, attitudes(rests, rng), knock, rng), int)
-        begun = int(np.sum(np.diff(told, prepend=0) == 1))
+        reported = np.array(sensor.monitored(made, attitudes(rests, rng), knock, rng), int)
+        begun = int(np.sum(np.diff(reported, prepend=0) == 1))
         count, wrong = count + begun, wrong + bool(begun)
     words = f'{count} in {sets * rests:,} rests ({wrong} of {sets} sensors)'
     return Line(f'{what}, {sensor.noise * MG:g} mg, {sensor.poses} poses', words, '0', sets,
@@ -144,17 +158,18 @@ def alarms(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rests: in
 
 
 def one_knock(sets: int, rng: np.random.Generator) -> Line:
-    """Make the line of single knocks."""
+    """Return the line of single knocks."""
     count, sensor = 0, Sensor()
     for _ in range(sets):
         made, up = sensor.made(rng), same(12, rng)
         knock = KNOCK * random_directions(1, rng) * (np.arange(12) == 5)[:, np.newaxis]
-        count += any(sensor.watched(made, up, knock, rng))
-    return Line('one rest knocked by 50 mg, told', f'{count}', '0', sets, count == 0)
+        count += any(sensor.monitored(made, up, knock, rng))
+    return Line('one rest knocked by 50 mg, reported as a change', f'{count}', '0', sets,
+                count == 0)
 
 
 def lines(sets: int, long: int, rests: int, seed: int) -> list[Line]:
-    """Measure all."""
+    """Return all lines."""
     rng = np.random.default_rng(seed)
     sensors = [Sensor(poses, noise) for noise in (0.0001, 0.0003, 0.0005, 0.001)
                for poses in (12, 36)]
@@ -189,28 +204,28 @@ def lines(sets: int, long: int, rests: int, seed: int) -> list[Line]:
 
 
 def heading(given: argparse.Namespace) -> str:
-    """Say what the table is and how it was made."""
+    """Return the heading of the page."""
     command = (f'python benchmarks/watching.py --sets {given.sets} --long {given.long} --rests '
                f'{given.rests} --seed {given.seed}')
-    return f"""# Figures of watching
+    return f"""# Figures of drift monitoring
 
 Made by `{command} --markdown FILE`.
-Noise is that of a pose mean, by axis; {BEFORE} rests come before the shift. A shift of 5 mg of
-length shows in full at each rest; one of 5 mg of an offset by the cosine of the angle between it
-and up, 2.9 mg RMS over all attitudes. Departures below 1 mg are passed over."""
+The noise is that of a pose mean, by axis; {BEFORE} rests precede the change. A change of length by
+5 mg is fully visible at each rest. An offset of 5 mg is visible by the cosine of its angle to up,
+2.9 mg RMS over all attitudes. Changes below 1 mg are ignored."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table, and write it where asked."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
-    parser.add_argument('--sets', type=int, default=200, help='sensors a shift')
-    parser.add_argument('--long', type=int, default=20, help='sensors watched for alarms')
-    parser.add_argument('--rests', type=int, default=10000, help='rests of each of these')
+    parser.add_argument('--sets', type=int, default=200, help='sensors per kind of change')
+    parser.add_argument('--long', type=int, default=20, help='sensors monitored for alarms')
+    parser.add_argument('--rests', type=int, default=10000, help='rests of each of these sensors')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--markdown', type=Path, help='write the table here')
     given = parser.parse_args(arguments)
     text = table(lines(given.sets, given.long, given.rests, given.seed))
-    publish(f'{heading(given)}\n\n{text}\n\n{NOT_REACHED}\n', given.markdown)
+    publish(f'{heading(given)}\n\n{text}\n\n{LIMITS}\n', given.markdown)
 
 
 if __name__ == '__main__':

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One measurement for `recordings`, in a process of its own, printed as JSON.
+One measurement in a fresh process, printed as JSON.
 
-``python recordings_trial.py WHAT PATH [OUT]``; the seconds are those of the work without imports,
-the memory is the largest that the process had.
+``python trial.py WHAT PATH ...``. The time is that of the work, with the imports that it does
+itself; the memory is the largest that the process had, with all imports.
 
 """
 
@@ -15,8 +15,10 @@ from collections.abc import Callable
 from itertools import islice
 import json
 from pathlib import Path
+import subprocess
 import sys
 import time
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -26,35 +28,63 @@ from accel_calib.files import (  # noqa: E402
     correct_bag,
     open_recording,
     read_calibration,
+    read_poses,
     read_samples,
 )
 from accel_calib.units import units_of  # noqa: E402
 
 DESERIALIZED = 400_000
+"""Messages that `rosbags` deserializes, at most."""
+
+MS2 = units_of('m/s2')
+
+
+def trial(what: str, *arguments: object) -> dict[str, Any]:
+    """
+    Run one measurement in a fresh process.
+
+    Parameters
+    ----------
+    what : str
+        Name of a function of this module that takes paths.
+    *arguments
+        The paths.
+
+    Returns
+    -------
+    dict
+        ``result`` of the function, ``seconds`` and ``cpu`` [s], ``megabytes``.
+
+    """
+    done = subprocess.run([sys.executable, __file__, what, *map(str, arguments)],
+                          stdout=subprocess.PIPE, text=True, check=True)
+    found: dict[str, Any] = json.loads(done.stdout)
+    print(what, arguments[0], found if what != 'table' else '', file=sys.stderr, flush=True)
+    return found
 
 
 class Clock:
     """Wall clock and CPU, from the last start to the first stop after it."""
 
     def start(self) -> None:
-        """Begin."""
+        """Start."""
         self.begin = time.perf_counter(), time.process_time()
         self.end: tuple[float, float] | None = None
 
     def stop(self) -> None:
-        """End, unless the work has ended it."""
+        """Stop, unless the work has stopped it."""
         self.end = self.end or (time.perf_counter(), time.process_time())
 
 
 CLOCK = Clock()
 
 
-def deserialize(path: Path) -> int:
+def deserialize(bag: Path) -> int:
     """Deserialize messages one by one through `rosbags`; opening the bag is not timed."""
     from rosbags.highlevel import AnyReader
 
     count = 0
-    with AnyReader([path]) as reader:
+    with AnyReader([bag]) as reader:
         wanted = [c for c in reader.connections if c.topic == '/imu']
         CLOCK.start()
         for connection, _, raw in islice(reader.messages(wanted), DESERIALIZED):
@@ -64,39 +94,48 @@ def deserialize(path: Path) -> int:
     return count
 
 
-def poses(path: Path) -> int:
+def poses(bag: Path) -> int:
     """Find the poses of a bag."""
-    with open_recording(path) as stream:
-        found = capture(stream.blocks, units_of('m/s2'))
+    with open_recording(bag) as stream:
+        found = capture(stream.blocks, MS2)
     if len(found.poses) == 0:
         raise RuntimeError('no poses')
     return found.recorded
 
 
-def read(path: Path) -> int:
+def read(bag: Path) -> int:
     """Read the samples of a bag, and nothing else."""
-    with open_recording(path) as stream:
+    with open_recording(bag) as stream:
         return sum(len(block) for block in stream.blocks)
 
 
-def apply(path: Path) -> int:
+def apply(bag: Path, out: Path, calibration: Path) -> int:
     """Write a corrected copy of a bag."""
-    return correct_bag(path, read_calibration(Path(sys.argv[4])), Path(sys.argv[3]))
+    return correct_bag(bag, read_calibration(calibration), out)
 
 
-def table(path: Path) -> dict[str, list[float]]:
-    """Time reading, poses and fit of a table in counts, over and over; the first is warming up."""
+def table(csv: Path) -> dict[str, list[float]]:
+    """Time reading, poses and fit of a recording in counts, 11 times; the first is a warm-up."""
     units = units_of('native')
     spent: dict[str, list[float]] = {'read': [], 'poses': [], 'fit': []}
     for _ in range(11):
-        recording = timed(spent['read'], lambda: read_samples(path))
+        recording = timed(spent['read'], lambda: read_samples(csv))
         found = timed(spent['poses'], lambda recording=recording: capture(recording, units))
         timed(spent['fit'], lambda found=found: fit_poses(found.poses, units, model='10'))
     return spent
 
 
+def refined(csv: Path) -> str:
+    """Refine model 10 of a pose table, and return the verdict; only the refinement is timed."""
+    from accel_calib.refine import refine
+
+    given = read_poses(csv)
+    CLOCK.start()
+    return refine(given, MS2, base='10').verdict
+
+
 def timed(into: list[float], work: Callable[[], object]) -> object:
-    """Do work and note how long it took."""
+    """Do work and append its duration [s]."""
     begin = time.perf_counter()
     result = work()
     into.append(time.perf_counter() - begin)
@@ -104,16 +143,21 @@ def timed(into: list[float], work: Callable[[], object]) -> object:
 
 
 def largest_memory() -> float:
-    """Give the largest resident memory [MB]; getrusage would count the parent's, before exec."""
+    """
+    Return the largest resident memory of this process [MB].
+
+    `getrusage` would include that of the parent before exec.
+
+    """
     text = Path('/proc/self/status').read_text(encoding='ascii')
     return int(text.partition('VmHWM:')[2].split()[0]) / 1024
 
 
 def main() -> None:
-    """Do what the command line says."""
-    work = {each.__name__: each for each in (deserialize, poses, read, apply, table)}
+    """Do the work that the command line names."""
+    work = {each.__name__: each for each in (deserialize, poses, read, apply, table, refined)}
     CLOCK.start()
-    result = work[sys.argv[1]](Path(sys.argv[2]))
+    result = work[sys.argv[1]](*map(Path, sys.argv[2:]))
     CLOCK.stop()
     seconds, cpu = (last - first for first, last in zip(CLOCK.begin, CLOCK.end, strict=True))
     print(json.dumps({'result': result, 'seconds': seconds, 'cpu': cpu,
