@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Calibrate an accelerometer in place, from nothing but the fact that gravity is 1 g.
+Calibrate an accelerometer in place, with gravity (1 g at rest) as the only reference.
 
 >>> import accel_calib as ac
 >>> poses = ac.capture('recording.mcap')            # or ac.read_poses('poses.csv')
@@ -11,37 +11,38 @@ Calibrate an accelerometer in place, from nothing but the fact that gravity is 1
 >>> calibration.save('calibration.yaml')
 >>> ac.refine(poses, base=calibration)
 
-Two lines cross the package:
+Data take two paths through the package:
 
 1. Imu -> still pose -> fit -> stored calibration -> corrected Imu
 2. poses + calibration -> gap -> named effect -> larger model -> report
 
 The measurement equation
 ------------------------
-There is one, from true specific force to reading, and every part of the package calls it::
+One equation computes the reading from the true specific force. Every part of the package uses it::
 
     u       = ΔR force
     reading = V + W u + sum of effects(u, context)
-    force   = ΔRᵀ u,  with u found from the reading; without effects u = W⁻¹ (reading - V)
+    force   = ΔRᵀ u,  with u solved from the reading; without effects u = W⁻¹ (reading - V)
 
-The symbols are those of NXP AN5286: V is the zero-g offset, W the gain (sensitivity and
-cross-axis), ΔR the mounting: it takes a vector in the levelled frame to the sensor frame.
+The symbols are those of NXP AN5286. V is the zero-g offset, W is the gain (sensitivity and
+cross-axis), and ΔR is the mounting: it transforms a vector from the levelled frame to the sensor
+frame.
 
 Units
 -----
 Specific force and readings are in units of local gravity (g) inside the package, as in IEEE 1293
 and AN5286, so that a still sensor measures |force| = 1 and a gain has no dimension. The public
 functions and the files use the unit of the readings: m/s2, g, or native counts and volts
-(`accel_calib.units`). All else is SI: seconds, rad/s, rad; temperature is in °C.
+(`accel_calib.units`). All other quantities are in SI units: s, rad/s, rad. Temperature is in °C.
 
 Sign and frames
 ---------------
-Specific force, REP-145: a sensor lying flat and still reads +1 g on the axis that points up.
+Forces are specific forces (REP-145): a sensor at rest reads +1 g on the axis that points up.
 The default levelled frame is that of REP-103 (x forward, y left, z up); see
 `accel_calib.calibrate.mounting` for the others.
 
 Arrays are (n, 3): one row per pose or sample, columns x, y, z. A vector in frame a is `vec_a`;
-`mat_ab` takes frame b to a.
+`mat_ab` transforms from frame b to frame a.
 
 """
 
@@ -75,10 +76,11 @@ __all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compar
 
 class _Package(ModuleType):
     """
-    This module, with its public names imported when they are used first.
+    This module. It imports each public name on first use.
 
-    So ``accel-calib --help`` does not wait for numpy. Some functions have the name of a folder;
-    Python sets a folder as an attribute when it imports it, and the function must stay.
+    ``accel-calib --help`` therefore does not wait for numpy. Some functions have the name of a
+    subpackage. Python sets a subpackage as an attribute on import; `__setattr__` prevents that it
+    replaces the function.
 
     """
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The public functions; ``import accel_calib as ac`` has them as ``ac.fit`` and so on."""
+"""The public functions, such as ``ac.fit`` after ``import accel_calib as ac``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
 from .compare import Comparison
-from .errors import InputError
+from .errors import counted, InputError
 from .files import (
     is_bag,
     open_recording,
@@ -42,14 +42,14 @@ __all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compar
 
 Source = str | PathLike[str]
 Data = Any
-"""A table, an (n, 3) array of readings, or a DataFrame with columns by their names in a file."""
+"""A table, an (n, 3) array of readings, or a DataFrame with the column names of a pose table."""
 
 _Table = TypeVar('_Table', bound=Table)
 
 
 class Calibration(calibrate.Calibration):
     """
-    A fitted model, ready to correct.
+    A fitted model that corrects readings.
 
     Attributes
     ----------
@@ -60,19 +60,19 @@ class Calibration(calibrate.Calibration):
     matrix : (3, 3) array
         W⁻¹, in units of the reading.
     rotation : (3, 3) array
-        ΔR, from the levelled frame to the sensor frame.
+        ΔR, transforms from the levelled frame to the sensor frame.
     covariance : (p, p) array
-        Of the values named by `parameters` [g].
+        Covariance of the values named by `parameters` [g²].
     quality : Quality
-        Figures over the poses used.
+        Residuals and other figures over the poses used.
     warnings : tuple of str
-        What a user should know.
+        Warnings for the user.
 
     """
 
     def save(self, path: Source) -> None:
         """
-        Store it as YAML; the previous file is kept as ``<name>.before``.
+        Write the calibration as YAML; the previous file is kept as ``<name>.before``.
 
         Parameters
         ----------
@@ -82,35 +82,35 @@ class Calibration(calibrate.Calibration):
         Raises
         ------
         RefusedFitError
-            If it is not one that a sensor can have.
+            If the calibration is not plausible.
         OSError
-            If it cannot be written.
+            If the file cannot be written.
 
         """
         write_calibration(Path(path), self)
 
     def report(self, path: Source) -> Refinement:
         """
-        Write a page about what it lacks (HTML), from its own poses.
+        Refine the calibration on its own poses, and write a report of the result (HTML).
 
         Parameters
         ----------
         path : str or Path
-            The page.
+            File of the report.
 
         Returns
         -------
         Refinement
-            What the page is about.
+            The result that the report shows.
 
         Raises
         ------
         RefusedFitError
-            If its poses leave nothing to find an effect with.
+            If the poses are too few to find an effect.
         InputError
             If matplotlib is not installed.
         OSError
-            If the page cannot be written.
+            If the file cannot be written.
 
         """
         from .report import check_matplotlib, write_page
@@ -128,19 +128,19 @@ def load(path: Source) -> Calibration:
     Parameters
     ----------
     path : str or Path
-        YAML that `Calibration.save`, a command or the node wrote.
+        YAML file written by `Calibration.save`, a command or the node.
 
     Returns
     -------
     Calibration
-        With a warning if the file was edited by hand.
+        The calibration, with a warning if the file was edited by hand.
 
     Raises
     ------
     StoredCalibrationError
-        If it is damaged, newer than this package, or not one that a sensor can have.
+        If the file is damaged, is newer than this package, or has implausible values.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     return _public(read_calibration(Path(path)))
@@ -158,14 +158,14 @@ def read_poses(path: Source) -> Poses:
     Returns
     -------
     Poses
-        In the unit of the table.
+        The poses, in the unit of the table.
 
     Raises
     ------
     InputError
-        If it is empty, lacks columns, or holds something that is not a finite number.
+        If the table is empty, lacks columns, or contains a value that is not a finite number.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     return read_pose_table(Path(path))
@@ -180,7 +180,7 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
     path : str or Path
         File or folder.
     topic : str
-        Imu topic, for a bag with several.
+        Imu topic, for a bag with several Imu topics.
     sensor : str
         frame_id of the messages to read, for a topic with several sensors.
 
@@ -192,9 +192,10 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
     Raises
     ------
     InputError
-        If it is not what its name says, holds no samples, or samples of several sensors.
+        If the format does not match the file name, or the file contains no samples or samples of
+        several sensors.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     return read_whole_recording(Path(path), topic, sensor)
@@ -211,19 +212,19 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
     recording : str, Path, Recording or DataFrame
         The samples, with ``time``.
     units : {'m/s2', 'g', 'native'}, optional
-        Unit of the readings; by default that of the recording, or m/s².
+        Unit of the readings; by default the unit of the recording, or m/s².
     gravity : float
         Local gravity [m/s²].
     topic, sensor : str
-        As `read_recording`.
+        As in `read_recording`.
     **settings
-        Of `accel_calib.capture.CaptureSettings`, such as ``min_dwell=2.0``; ``still_std_max``
-        is in the unit of the readings.
+        Fields of `accel_calib.capture.CaptureSettings`, such as ``min_dwell=2.0``;
+        ``still_std_max`` is in the unit of the readings.
 
     Returns
     -------
     Poses
-        In the unit of the readings, in order of time.
+        The poses, in the unit of the readings and in order of time.
 
     Raises
     ------
@@ -243,9 +244,9 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         calibrate.check_units(samples, known)
         found = find_still(samples, known, settings_from(settings, known))
     if not len(found.poses):
-        raise InputError(f'there is no still stretch in {found.recorded} samples',
-                         'hold the sensor still in each pose for some seconds, or give '
-                         'still_std_max and min_dwell')
+        raise InputError(f'there is no still stretch in {counted(found.recorded, "sample")}, '
+                         'expected at least one', 'hold the sensor still in each pose for some '
+                         'seconds, or set still_std_max and min_dwell')
     return replace(found.poses, units=known.name)
 
 
@@ -261,7 +262,7 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     poses : str, Path, Poses, DataFrame or (n, 3) array
         The poses.
     units : {'m/s2', 'g', 'native'}, optional
-        Unit of the readings; by default that of the poses, or m/s².
+        Unit of the readings; by default the unit of the poses, or m/s².
     gravity : float
         Local gravity [m/s²].
     model : {'auto', '4', '7', '9', '10', '12'}
@@ -269,26 +270,27 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     method : {'ml', 'algebraic'}
         Maximum likelihood, or the cost functions of AN5286 and the ESGI'95 report.
     flat : int, optional
-        Row of the pose in which the robot was level, from 1: the mounting ΔR follows from it.
+        Row of a pose with the robot level, 1-based. It determines the mounting ΔR up to the
+        heading.
     nose_down : int, optional
-        Row of a pose in which the nose of the robot was tilted straight down, from 1: the heading
-        of the mounting follows from it.
+        Row of a pose with the nose of the robot tilted straight down, 1-based. It determines the
+        heading.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
     sensor : str
-        Name of the sensor; by default that of the poses.
+        Name of the sensor; by default the name in the poses.
 
     Returns
     -------
     Calibration
-        With its uncertainty, quality and warnings.
+        The calibration, with its uncertainty, quality and warnings.
 
     Raises
     ------
     RefusedFitError
         If the poses do not determine the model, or the result is not plausible.
     InputError
-        If the readings are clearly in another unit, or there is no such row.
+        If the readings are clearly in another unit, or a row does not exist.
 
     """
     table = _poses(poses)
@@ -302,30 +304,31 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
            units: UnitName | None = None, gravity: float = STANDARD_GRAVITY, sensor: str = ''
            ) -> Refinement:
     """
-    Find what a calibration lacks, name it, add it, and show how the residual shrinks.
+    Find effects that a calibration lacks, and add them to it.
 
     Parameters
     ----------
     poses : str, Path, Poses, DataFrame or (n, 3) array
-        The poses, with as many columns of context as are known.
+        The poses, with all known columns of context.
     base : {'auto', 'ideal', '4', '7', '10', '12'} or Calibration
-        The model to begin with. A Calibration is compared as it is stored.
+        The model to start from. A stored calibration is compared as it is, without a new fit.
     units : {'m/s2', 'g', 'native'}, optional
-        Unit of the readings; by default that of the base or of the poses, or m/s².
+        Unit of the readings; by default the unit of the base or of the poses, or m/s².
     gravity : float
         Local gravity [m/s²].
     sensor : str
-        Name of the sensor; by default that of the poses.
+        Name of the sensor; by default the name in the poses.
 
     Returns
     -------
     Refinement
-        The verdict, the steps, and the refined calibration.
+        The verdict, the effects with their residuals before and after, and the refined
+        calibration.
 
     Raises
     ------
     RefusedFitError
-        If the poses do not determine the base, or leave nothing to find an effect with.
+        If the poses do not determine the base, or are too few to find an effect.
     InputError
         If the readings are clearly in another unit.
 
@@ -340,7 +343,7 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
 def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibration
            ) -> Verification:
     """
-    Evaluate a calibration on poses that it was not fitted to.
+    Compute the residuals of a calibration on poses that it was not fitted to.
 
     Parameters
     ----------
@@ -352,12 +355,12 @@ def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibra
     Returns
     -------
     Verification
-        Residual before and after [mg], largest error [%], and noise floor [mg].
+        Residual before and after [mg], largest errors [%], and noise floor [mg].
 
     Raises
     ------
     InputError
-        If the readings are clearly in another unit, or the effects need another column.
+        If the readings are clearly in another unit, or lack a column that the effects need.
 
     """
     table = _poses(poses)
@@ -375,7 +378,7 @@ def compare(calibrations: Sequence[Source | calibrate.Calibration]) -> Compariso
     Parameters
     ----------
     calibrations : sequence of str, Path or Calibration
-        At least two.
+        Two or more calibrations.
 
     Returns
     -------
@@ -385,7 +388,7 @@ def compare(calibrations: Sequence[Source | calibrate.Calibration]) -> Compariso
     Raises
     ------
     InputError
-        If they cannot be compared.
+        If the calibrations cannot be compared.
 
     """
     return compare_calibrations([each if isinstance(each, calibrate.Calibration) else load(each)
@@ -415,21 +418,21 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     Parameters
     ----------
     effects : mapping of str to array
-        Values of effects, in the units of the catalogue (g); one value serves all axes.
+        Values by effect, in the units of the catalogue (g); one value is used for all axes.
     recording : bool
-        Simulate samples of a sensor that is turned, instead of pose means.
+        Return samples of a sensor that is turned, instead of pose means.
     poses : int
-        Number of poses, spread evenly over the sphere; the first is flat.
+        Number of poses, spread evenly over the sphere; the first pose is flat.
     directions : (n, 3) array, optional
-        Directions of up in the levelled frame, instead of these.
+        Directions of up in the levelled frame; they replace `poses`.
     noise : float
         Standard deviation of a sample [g].
     samples : int
         Samples per pose.
     rate, dwell, turn : float
-        Of a recording: samples per second, duration of each rest and of each turn [s].
+        For a recording: samples per second, and duration of each rest and of each turn [s].
     temperature : (2,) or (n,) array
-        First and last temperature, or that of each pose [°C].
+        First and last temperature, or the temperature of each pose [°C].
     mounting : (3,) array
         Roll, pitch and yaw of the sensor on the robot [°].
     reference : bool
@@ -441,21 +444,21 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     seed : int
         Seed of the noise.
     **context : array
-        What is known beside the poses, such as ``time`` [s]; n rows each.
+        Further columns of context, such as ``time`` [s]; n rows each.
 
     Returns
     -------
     Poses or Recording
-        In that unit; a recording with angular rate.
+        The readings in that unit. A recording has the angular rate, too.
 
     Raises
     ------
     InputError
-        If an effect is not in the catalogue, or needs context that is not given.
+        If an effect is not in the catalogue, or needs a column that is missing.
 
     """
     known = units_of(units, gravity)
-    # ΔR takes the axes of the robot to those of the sensor, the attitude of the sensor back.
+    # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
     model = model_with(effects, rotation)
     up = _directions(poses) if directions is None else np.asarray(directions, float)
@@ -479,17 +482,17 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
 
 
 def _directions(count: int) -> Floats:
-    """Return directions spread over the sphere, the first flat."""
+    """Return directions spread over the sphere; the first direction is flat."""
     return np.vstack([[[0.0, 0.0, 1.0]], spread_directions(count)[1:]])
 
 
 def _poses(given: Source | Poses | Data) -> Poses:
-    """Return poses from what a user has."""
+    """Return poses from a file, a table, an array or a DataFrame."""
     if isinstance(given, str | PathLike):
         path = Path(given)
         if is_bag(path):
             raise InputError(f'{path} is a recording, expected a pose table',
-                             'capture the poses first')
+                             'call capture first')
         return read_pose_table(path)
     return _table(given, Poses, 'the pose table')
 
@@ -505,15 +508,15 @@ def _table(given: Data, kind: type[_Table], source: str) -> _Table:
     readings = np.asarray(given, float)
     if readings.ndim != 2 or readings.shape[1] != 3 or kind is Recording:
         raise InputError(f'{source} has shape {readings.shape}, expected (n, 3) readings, or '
-                         'columns by name', 'give a table or a DataFrame')
+                         'columns by name', 'pass a table or a DataFrame')
     columns = columns_from(dict(zip(('ax', 'ay', 'az'), readings.T)), needed, source)
     return kind(columns, numbered(columns))
 
 
 def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> Units:
-    """Return the unit that was asked for, or that a file states."""
+    """Return the unit that the caller or the source states."""
     if asked and stated and asked != stated:
-        raise InputError(f'{source} is in {stated}, not in {asked}', f'give units={stated!r}')
+        raise InputError(f'{source} is in {stated}, expected {asked}', f'set units={stated!r}')
     name: Any = asked or stated or 'm/s2'
     return units_of(name, gravity)
 

@@ -23,7 +23,6 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from __future__ import annotations
 
-from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -80,12 +79,9 @@ class Monomial(NamedTuple):
 
 def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
     """Return the monomial that is a function of one component of the force."""
-    def gradient(*u: Any) -> tuple[Any, Any, Any]:
-        found = [0.0, 0.0, 0.0]
-        found[axis] = slope(u[axis])
-        return found[0], found[1], found[2]
-
-    return Monomial(lambda *u: value(u[axis]), gradient)
+    return (Monomial(lambda x, y, z: value(x), lambda x, y, z: (slope(x), 0.0, 0.0)),
+            Monomial(lambda x, y, z: value(y), lambda x, y, z: (0.0, slope(y), 0.0)),
+            Monomial(lambda x, y, z: value(z), lambda x, y, z: (0.0, 0.0, slope(z))))[axis]
 
 
 def _each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list[Monomial]:
@@ -389,21 +385,21 @@ EFFECTS: dict[str, Effect] = {
 
 WANDER = 'offset_wander'
 PROCESSES: dict[str, Effect] = {
-    WANDER: _in_time('offset that changes slowly without a known form', 'bias random walk', (), 'g', 0.001,
-                     terms=(), needs=('time',))}
+    WANDER: _in_time('offset that changes slowly without a known form', 'bias random walk', (),
+                     'g', 0.001, terms=(), needs=('time',))}
 """Random processes. `accel_calib.refine` names them; a model cannot contain them."""
 
 CHANGES: dict[str, Effect] = {
     f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
                               factor=lambda context, shape: context['new'], needs=('new',))
     for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
-"""Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new`` is
-1 for poses taken since then and 0 for the poses of the calibration."""
+"""Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
+is 1 for poses taken since then and 0 for the poses of the calibration."""
 
 
 def effect_named(name: str) -> Effect:
-    """Return the effect with this name in `EFFECTS`, `PROCESSES` or `CHANGES`, or raise KeyError."""
-    return ChainMap(EFFECTS, PROCESSES, CHANGES)[name]
+    """Return the effect with this name, from `EFFECTS`, `PROCESSES` or `CHANGES`."""
+    return EFFECTS.get(name) or PROCESSES.get(name) or CHANGES[name]
 
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')

@@ -1,17 +1,24 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors that a user can fix; each message says what was found, expected and what to do."""
+"""
+Errors that a user can fix, and helpers for their messages.
+
+Each message has three parts: what was found, what was expected, and what to do.
+
+"""
+
+from collections.abc import Sequence
 
 
 class AccelCalibError(Exception):
     """
-    Input of the user cannot be used.
+    The input is not valid.
 
     Parameters
     ----------
     message : str
-        One line: what was found and what was expected.
+        One line: what was found, and what was expected.
     advice : str
         One line: what to do.
 
@@ -27,16 +34,26 @@ class AccelCalibError(Exception):
 
 
 class InputError(AccelCalibError):
-    """A file, a column or a number cannot be read as what it should be."""
+    """A file, a column or a number is not valid."""
 
 
 class RefusedFitError(AccelCalibError):
-    """The poses do not determine what was asked for."""
+    """The poses do not determine the model, or the result is not plausible."""
 
 
 class StoredCalibrationError(AccelCalibError):
-    """A stored calibration is newer than this package, or not of this sensor."""
+    """A stored calibration is newer than this package, or belongs to another sensor."""
 
 
 class DamagedCalibrationError(StoredCalibrationError):
-    """A stored calibration is damaged, or not one that a sensor can have."""
+    """A stored calibration is damaged, or has values that are not plausible."""
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as ``1 pose`` or ``2 poses``."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
+def listed(noun: str, items: Sequence[object]) -> str:
+    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``."""
+    return f'{noun}{"" if len(items) == 1 else "s"} {", ".join(map(str, items))}'

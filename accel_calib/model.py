@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A model is a list of effects with their values: `predict` and `correct` undo each other.
+A model is a list of effects with their values; `correct` is the inverse of `predict`.
 
-With the context fixed, the terms of all effects sum to an offset, a gain and bending terms,
+With the context fixed, the terms of all effects sum to an offset, a gain and bending terms:
 
     reading = V + W u + bend(u),   u = ΔR force
 
-which is `Model.at`. The correction solves this for u by the iteration u <- W⁻¹ (reading - V -
-bend(u)), a contraction as long as the bending terms are small against the gain.
+`Model.at` returns this form. The correction solves it for u by the iteration u <- W⁻¹ (reading - V
+- bend(u)), which converges if the bending terms are small compared with the gain.
 
 """
 
@@ -36,21 +36,21 @@ MODELS: dict[str, tuple[str, ...]] = {
     '10': ('offset', 'axis_gain', 'cross_axis'),
     '12': ('offset', 'axis_gain', 'cross_axis', 'misalignment'),
 }
-"""Effects of each model. Models 9 and 10 differ in their axes alone: 9 fixes them to the sensing
-axes (ESGI'95 report), 10 makes W symmetric (AN5286)."""
+"""Effects of each model. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
+sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
-"""The iteration ends when u changes by less [g]."""
+"""The iteration stops when u changes by less than this [g]."""
 
 LARGEST_FORCE_G = 1e6
-"""The iteration has diverged when u is larger [g]."""
+"""The iteration has diverged when u is larger than this [g]."""
 
 FITTED_SHAPES = ('tau',)
-"""Shape constants that a fit changes; the others are taken from the data once."""
+"""Shape constants that a fit changes; the others are found once from the data."""
 
 _SHAPE_STEP = 1e-4
-"""Relative step of the derivative by a shape constant, the only one taken by difference."""
+"""Relative step of the numerical derivative by a shape constant; all others are analytic."""
 
 
 _IDENTITY = np.eye(3)
@@ -70,7 +70,7 @@ class Terms:
     effects : tuple of Effect
         The effects.
     monomials : tuple of int
-        Indices in `MONOMIALS` that occur.
+        Indices in `MONOMIALS` that the terms use.
     place : (t,) array of int
         Index of the term's monomial in `monomials`.
     axis, value : (t,) array of int
@@ -123,12 +123,12 @@ class Terms:
 
     @cached_property
     def fixed(self) -> bool:
-        """Whether no factor depends on the context."""
+        """Whether all terms are independent of the context."""
         return all(effect.factor is None for effect in self.effects)
 
     def factors(self, shapes: list[Floats], context: Mapping[str, Any], rows: tuple[int, ...]
                 ) -> Floats:
-        """Return the (t, *rows) factors of the terms; what the context lacks (NaN) is 0."""
+        """Return the (t, *rows) factors of the terms; a factor is 0 where its context is NaN."""
         found = np.ones((len(self.weight), *rows))
         start = 0
         for effect, shape, count in zip(self.effects, shapes, self.count.tolist(), strict=True):
@@ -185,9 +185,9 @@ class Basis:
     Parameters
     ----------
     terms : (t, n) array
-        What each term adds to its axis for a value of 1.
+        What each term adds to its axis per unit of its value.
     axis : (t,) array of int
-        That axis.
+        Axis of each term.
     to_value : (p, t) array
         Sums the terms by value.
 
@@ -204,7 +204,7 @@ class Basis:
                          for axis in range(3)]).T.swapaxes(1, 2)
 
     def along(self, rows: Floats) -> Floats:
-        """Return its product with an (n, 3) row of each pose, (n, p)."""
+        """Return the (n, p) product of the derivative with an (n, 3) row per pose."""
         found: Floats = (self.to_value @ (self.terms * rows.T[self.axis])).T
         return found
 
@@ -212,14 +212,14 @@ class Basis:
 @dataclass(frozen=True)
 class AtContext:
     """
-    A model with its context fixed, for n poses or for all poses alike.
+    A model with its context fixed, for each of n poses or in common for all poses.
 
     Parameters
     ----------
     mat_w : (n, 3, 3) or (3, 3) array
-        W.
+        W of each pose, or of all.
     vec_v : (n, 3) or (3,) array
-        V [g].
+        V of each pose, or of all [g].
     terms : Terms
         All terms of the model.
     bend : (b, n) or (b, 1) array
@@ -240,7 +240,7 @@ class AtContext:
         return found
 
     def reading(self, u: Floats) -> Floats:
-        """Return the (n, 3) reading under the (n, 3) force u in the sensor axes [g]."""
+        """Return the (n, 3) reading for the (n, 3) force u in the sensor axes [g]."""
         found = self.vec_v + times(self.mat_w, u)
         return found + self._bend(u) if len(self.bend) else found
 
@@ -254,11 +254,11 @@ class AtContext:
         return found + np.einsum('it,tjn->nij', terms.bends_to_axis, parts)
 
     def inverse_slope(self, u: Floats) -> Floats:
-        """Return the inverse of `slope`, (n, 3, 3), or (3, 3) where it is the same for all."""
+        """Return the inverse of `slope`, (n, 3, 3), or (3, 3) if it is the same for all poses."""
         return np.linalg.inv(self.slope(u) if len(self.bend) else self.mat_w)
 
     def force(self, reading: Floats) -> Floats:
-        """Return the (n, 3) force u of a reading [g]; NaN where the iteration diverges."""
+        """Return the (n, 3) force u for a reading [g]; NaN where the iteration diverges."""
         inverse = np.linalg.inv(self.mat_w)
         affine = times(inverse, reading - self.vec_v)
         if not len(self.bend):
@@ -291,9 +291,9 @@ class Model:
     Parameters
     ----------
     values : mapping of str to (p,) array
-        By name of `accel_calib.effects.EFFECTS`, in the order of the model.
+        Values of each effect, by its name in `accel_calib.effects.EFFECTS`.
     rotation : (3, 3) array
-        ΔR, from the levelled frame to the sensor axes.
+        ΔR, transforms from the levelled frame to the sensor axes.
 
     """
 
@@ -303,7 +303,7 @@ class Model:
     def __post_init__(self) -> None:
         for name, values in self.values.items():
             if name not in EFFECTS and name not in CHANGES:
-                raise ValueError(f'effect {name!r} is none of {", ".join(EFFECTS)}')
+                raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
             effect = effect_named(name)
             if np.shape(values) != (len(effect.values),):
                 raise ValueError(f'effect {name} has values of shape {np.shape(values)}, expected '
@@ -326,7 +326,7 @@ class Model:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Keys of the context without which the model cannot correct."""
+        """Keys of the context that the model needs."""
         return tuple(dict.fromkeys(key for effect in self.terms.effects for key in effect.needs))
 
     @cached_property
@@ -353,7 +353,7 @@ class Model:
         Parameters
         ----------
         context : mapping of str to array
-            What the effects need beside the force; n rows each.
+            Columns that the effects need, n rows each.
 
         Raises
         ------
@@ -390,14 +390,14 @@ class Model:
         u : (n, 3) array
             Force in the sensor axes [g].
         context : mapping of str to array
-            What the effects need, n rows each.
+            Columns that the effects need, n rows each.
         direction : (n, 3) array, optional
-            If given, the derivative of the basis along this direction of the force instead.
+            If given, return the derivative of the basis along this direction of the force.
 
         Returns
         -------
         Basis
-            In the order of ``model.vector``.
+            The derivative, in the order of ``model.vector``.
 
         """
         terms = self.terms
@@ -415,7 +415,7 @@ class Model:
 
     def _by_shape(self, plain: Floats, context: Context
                   ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
-        """Return the terms of the derivative by shape constants that are fitted."""
+        """Return the terms of the derivative by the fitted shape constants."""
         moved, of, index = [plain[:0]], [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
         ends = np.cumsum(self.terms.count)
         for k, effect in enumerate(self.terms.effects):
@@ -434,7 +434,7 @@ class Model:
 
 def difference(factor: Callable[[Mapping[str, Any], Floats], Any], context: Context,
                shape: Floats, place: int) -> Floats:
-    """Return the derivative of a factor by one shape constant."""
+    """Return the numerical derivative of a factor by one shape constant."""
     step = np.zeros(len(shape))
     step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
     change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
@@ -443,23 +443,22 @@ def difference(factor: Callable[[Mapping[str, Any], Floats], Any], context: Cont
 
 
 def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the name of each value of these effects, ``effect.axis``, in the order of vectors."""
+    """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
     return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
 
 
 def fitted_values(effects: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Return which values of these effects a fit changes, (p,)."""
+    """Return a (p,) mask of the values of these effects that a fit changes."""
     entries = [effect_named(name) for name in effects]
     return np.array([part in effect.parameters or part in FITTED_SHAPES
                      for effect in entries for part in effect.values], bool)
 
 
-def with_vector(effects: tuple[str, ...], vector: Floats, rotation: Floats | None = None) -> Model:
-    """Return the model of these effects with the (p,) vector of all values."""
+def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
+    """Return the model of these effects with the (p,) vector of all values and ΔR = I."""
     sizes = [len(effect_named(name).values) for name in effects]
     parts = np.split(vector, np.cumsum(sizes)[:-1]) if sizes else []
-    return Model(dict(zip(effects, parts, strict=True)),
-                 np.eye(3) if rotation is None else rotation)
+    return Model(dict(zip(effects, parts, strict=True)))
 
 
 def with_linear_part(mat_w: Floats, vec_v: Floats, rotation: Floats | None = None) -> Model:
@@ -496,13 +495,13 @@ def check_context(model: Model, context: Mapping[str, Any]) -> None:
     """
     missing = [', '.join(COLUMNS[key].names) for key in model.needs if key not in context]
     if missing:
-        raise InputError(f'the model has effects that need {" and ".join(missing)}, which is not '
-                         'given', 'record it beside the readings')
+        raise InputError(f'the effects of the model need {" and ".join(missing)}, which the input '
+                         'does not have', 'record these columns together with the readings')
 
 
 def predict(model: Model, force: Floats, context: Context) -> Floats:
     """
-    Compute what the sensor reads.
+    Compute the readings of a sensor.
 
     Parameters
     ----------
@@ -511,7 +510,7 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
     force : (n, 3) array
         Specific force in the levelled frame [g].
     context : mapping of str to array
-        What the effects need beside the force; n rows each.
+        Columns that the effects need, n rows each.
 
     Returns
     -------
@@ -523,7 +522,7 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
 
 
 def reading_of(model: Model, u: Floats, context: Context) -> Floats:
-    """Return what the sensor reads under the (n, 3) force u in its own axes [g]."""
+    """Return the (n, 3) readings for the (n, 3) force u in the sensor axes [g]."""
     reading = model.at(context).reading(u)
     for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
         if effect.output is not None:
@@ -533,7 +532,7 @@ def reading_of(model: Model, u: Floats, context: Context) -> Floats:
 
 def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     """
-    Find the specific force in the sensor axes.
+    Compute the specific force in the sensor axes from the readings.
 
     Parameters
     ----------
@@ -542,7 +541,7 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     reading : (n, 3) array
         Readings [g].
     context : mapping of str to array
-        What the effects need beside the reading; n rows each.
+        Columns that the effects need, n rows each.
 
     Returns
     -------
@@ -552,7 +551,7 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
     Raises
     ------
     InputError
-        If the effects are so large that a reading belongs to no one force.
+        If the effects are so large that the force of a reading is not unique.
 
     """
     u = model.at(context).force(reading)
@@ -562,14 +561,14 @@ def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
 
 
 def too_large() -> InputError:
-    """Return the error for a reading that belongs to no one force."""
-    return InputError('the effects of the model are too large to be undone at this reading',
+    """Return the error for a reading whose force is not unique."""
+    return InputError('the effects of the model are too large to be corrected at this reading',
                       'calibrate again, with readings in the range in which the sensor is used')
 
 
 def correct(model: Model, reading: Floats, context: Context) -> Floats:
     """
-    Find the specific force from what the sensor read; the inverse of `predict`.
+    Compute the specific force from the readings; the inverse of `predict`.
 
     Parameters
     ----------
@@ -578,7 +577,7 @@ def correct(model: Model, reading: Floats, context: Context) -> Floats:
     reading : (n, 3) array
         Readings [g].
     context : mapping of str to array
-        What the effects need beside the reading; n rows each.
+        Columns that the effects need, n rows each.
 
     Returns
     -------
@@ -588,7 +587,7 @@ def correct(model: Model, reading: Floats, context: Context) -> Floats:
     Raises
     ------
     InputError
-        If the effects are so large that a reading belongs to no one force.
+        If the effects are so large that the force of a reading is not unique.
 
     """
     return sensor_force(model, reading, context) @ model.rotation
@@ -605,5 +604,5 @@ def force_slope(model: Model, u: Floats, context: Context) -> Floats:
 
 
 def length_rows(model: Model, u: Floats, context: Context) -> Floats:
-    """Return ûᵀA⁻¹, (n, 3): the derivative of |u| by the reading, with A its slope."""
+    """Return the (n, 3) derivative of |u| by the reading: ûᵀA⁻¹, with A the slope."""
     return times(np.swapaxes(model.at(context).inverse_slope(u), -1, -2), unit(u))

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The correction of one reading at a time, for a stream of messages.
+Correction of one reading at a time, for a stream of messages.
 
-A call of numpy takes about a microsecond whatever it does, and `Calibration.correct` makes dozens
-of them: nothing for a recording, too much for single messages. Here the terms of the catalogue
-(`accel_calib.effects`) are summed in floats: with the context fixed, to an offset and a gain, and
-only the terms that bend with the force are iterated, as in `accel_calib.model`.
+Each call of numpy takes about 1 µs, and `Calibration.correct` makes dozens of calls. This does not
+matter for a recording, but it is too slow for single messages. Here the terms of the catalogue
+(`accel_calib.effects`) are summed as Python floats. With the context fixed, the affine terms sum
+to an offset and a gain; only the bending terms are iterated, as in `accel_calib.model`.
 
 """
 
@@ -37,11 +37,11 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """Nine numbers, row by row."""
 
 Known = Mapping[str, Any]
-"""Context of one reading: floats and triples by the keys of `accel_calib.effects.Context`."""
+"""Context of one reading: floats and triples, with the keys of `accel_calib.effects.Context`."""
 
 
 class _Term(NamedTuple):
-    """A term of an effect: its axis, monomial, and weight times value."""
+    """A term of an effect: axis, monomial, and weight times value."""
 
     axis: int
     monomial: int
@@ -49,7 +49,7 @@ class _Term(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """An effect whose factor depends on the context, with its values."""
+    """An effect whose factor depends on the context: its shape and terms."""
 
     effect: Effect
     shape: list[float]
@@ -57,7 +57,7 @@ class _Part(NamedTuple):
 
 
 class _Bend(NamedTuple):
-    """A bending term at a context: its axis, size, value and gradient."""
+    """A bending term with its context fixed: axis, coefficient, value and gradient."""
 
     axis: int
     size: float
@@ -65,9 +65,14 @@ class _Bend(NamedTuple):
     gradient: Callable[[float, float, float], Triple]
 
 
+_NO_BEND: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_SLOW = 3
+"""Iterations after which the slope is computed at the present force."""
+
+
 class OneReading:
     """
-    A calibration, ready for single readings.
+    A calibration prepared for the correction of single readings.
 
     Parameters
     ----------
@@ -111,7 +116,7 @@ class OneReading:
                 bends.append(_Bend(axis, size, *MONOMIALS[monomial]))
 
     def held(self, known: Known) -> Known:
-        """Return the context held at the edge of what the calibration has seen."""
+        """Return the context, limited to the ranges of the calibration."""
         ranges = self._calibration.ranges
         if not ranges:
             return known
@@ -125,12 +130,12 @@ class OneReading:
         Parameters
         ----------
         known : mapping
-            What the effects need.
+            Context that the effects need.
 
         Raises
         ------
         InputError
-            If something is missing.
+            If a quantity is missing.
 
         """
         if not self._varying:
@@ -148,7 +153,7 @@ class OneReading:
 
     @cached_property
     def _spread_rows(self) -> tuple[Floats, Floats]:
-        """Return which term has which monomial, (m, t), and its part of the root, (t, 3 p)."""
+        """Return the (m, t) monomial of each term, and its (t, 3 p) part of the root."""
         model = self._calibration.model
         variances, axes = np.linalg.eigh(self._calibration.covariance)
         root = axes * np.sqrt(np.maximum(variances, 0.0))
@@ -167,12 +172,12 @@ class OneReading:
 
     @property
     def monomials(self) -> tuple[int, ...]:
-        """Return the indices of the monomials of the model, the affine ones first."""
+        """Return the indices of the monomials of the model; the affine monomials are first."""
         used = self._calibration.model.terms.monomials
         return (*range(AFFINE), *(index for index in used if index >= AFFINE))
 
     def spread_basis(self, known: Known) -> Floats:
-        """Return what each monomial adds to the basis times a root of the covariance, (m, 3 p)."""
+        """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
         factors: list[float] = []
         model = self._calibration.model
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
@@ -189,12 +194,12 @@ class OneReading:
 
 
 def _fitted(effect: Effect) -> list[int]:
-    """Return the places of the fitted constants in the shape of an effect."""
+    """Return the indices of the fitted constants in the shape of an effect."""
     return [place for place, name in enumerate(effect.shape) if name in FITTED_SHAPES]
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
-    """Return the factor of an effect: a float for all terms, or a list with one for each."""
+    """Return the factor of an effect: one float for all terms, or a list with one per term."""
     factor = effect.factor(known, shape) if effect.factor is not None else 1.0
     return factor.tolist() if isinstance(factor, np.ndarray) else float(factor)
 
@@ -207,13 +212,13 @@ def _row(axis: int, values: Floats) -> Floats:
 
 class AtReading:
     """
-    A calibration with its context fixed; made by `OneReading.at`.
+    A calibration with its context fixed; `OneReading.at` returns it.
 
     Attributes
     ----------
     correct : callable
-        Reading x, y, z -> specific force in the levelled frame, times the scale. Raises
-        InputError if the effects cannot be undone.
+        Reading x, y, z -> specific force in the levelled frame, times the scale. It raises
+        InputError if the effects cannot be corrected.
 
     """
 
@@ -232,38 +237,67 @@ class AtReading:
                                    _times(owner.turn, *offset))
 
     def _solving(self, inverse: Matrix, offset: Triple) -> Callable[[float, float, float], Triple]:
-        """Return the function that solves for u as `model.AtContext.force` does, and turns it."""
+        """
+        Return the function that solves for u, and rotates it.
+
+        The method is Newton's, with a slope that is computed again only if convergence is slow.
+        `model.AtContext.force` solves the same equation for many readings.
+
+        """
         undone = _affine([part / self._owner.per_g for part in inverse], offset)
-        bends, turn, near, far = self._bends, self._owner.turn, CONVERGED_G, LARGEST_FORCE_G
+        turn, bend, near, far = self._owner.turn, self._bend, CONVERGED_G, LARGEST_FORCE_G
+        a, b, c, d, e, f, g, h, i = _NO_BEND
 
         def correct(x: float, y: float, z: float) -> Triple:
-            start = u = undone(x, y, z)
-            for _ in range(LARGEST_ITERATIONS):
-                added = [0.0, 0.0, 0.0]
-                for axis, size, value, _ in bends:
-                    added[axis] += size * value(*u)
-                p, q, r = _times(inverse, *added)
-                now = start[0] - p, start[1] - q, start[2] - r
-                if not (abs(now[0]) < far and abs(now[1]) < far and abs(now[2]) < far):
+            nonlocal a, b, c, d, e, f, g, h, i
+            p, q, r = left, mid, right = undone(x, y, z)
+            last = near
+            for count in range(LARGEST_ITERATIONS):
+                j, k, m = _times(inverse, *bend(p, q, r))
+                j, k, m = p + j - left, q + k - mid, r + m - right
+                if count == _SLOW:
+                    a, b, c, d, e, f, g, h, i = _product(_inverse(self._slope_at((p, q, r))),
+                                                         self._gain)
+                j, k, m = (a * j + b * k + c * m, d * j + e * k + f * m, g * j + h * k + i * m)
+                p, q, r = p - j, q - k, r - m
+                if not (-far < p < far and -far < q < far and -far < r < far):
                     break
-                if (abs(now[0] - u[0]) < near and abs(now[1] - u[1]) < near
-                        and abs(now[2] - u[2]) < near):
-                    return _times(turn, *now)
-                u = now
+                step = max(abs(j), abs(k), abs(m))
+                if step * step < near * last:  # the next step would be smaller than that
+                    return _times(turn, p, q, r)
+                last = step
             raise too_large()
 
         return correct
 
+    def _bend(self, x: float, y: float, z: float) -> list[float]:
+        """Return what the bending terms add to a reading at a force [g]."""
+        added = [0.0, 0.0, 0.0]
+        for axis, size, value, _ in self._bends:
+            added[axis] += size * value(x, y, z)
+        return added
+
+    def _slope_at(self, u: Triple) -> Matrix:
+        """Return the slope of the reading at a force."""
+        slope = list(self._gain)
+        for axis, size, _, gradient in self._bends:
+            i, j, k = gradient(*u)
+            slope[3 * axis] += size * float(i)
+            slope[3 * axis + 1] += size * float(j)
+            slope[3 * axis + 2] += size * float(k)
+        a, b, c, d, e, f, g, h, i = slope
+        return a, b, c, d, e, f, g, h, i
+
     def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
         """
-        Return a covariance with the uncertainty of the calibration added.
+        Return the covariance of a corrected force, with the uncertainty of the calibration.
 
         Parameters
         ----------
         force : 3 floats
-            What `correct` returned.
+            Corrected force, as `correct` returns it.
         own : 9 floats
-            Covariance of the corrected force without it, row by row.
+            Covariance of the corrected force from the noise of the reading, row by row.
 
         """
         if self._bends:
@@ -276,7 +310,7 @@ class AtReading:
 
     @cached_property
     def _form(self) -> Floats:
-        """(10, 9) array: the covariance as a quadratic form of the force."""
+        """(10, 9) array, the covariance as a quadratic form of the force."""
         basis = self._owner.spread_basis(self._known).reshape(AFFINE, 3, -1)
         moved = np.reshape(_product(self._owner.turn, _inverse(self._gain)), (3, 3)) @ basis
         moved[1:] = np.einsum('ij,ikp->jkp', np.reshape(self._owner.back, (3, 3)), moved[1:])
@@ -288,11 +322,7 @@ class AtReading:
 
     def _bent_spread(self, u: Triple) -> list[float]:
         monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
-        slope = list(self._gain)
-        for axis, size, _, gradient in self._bends:
-            for j, part in enumerate(gradient(*u)):
-                slope[3 * axis + j] += size * float(part)
-        to_force = np.reshape(_product(self._owner.turn, _inverse(slope)), (3, 3))
+        to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
         moved = to_force @ np.dot(monomials, self._basis).reshape(3, -1)
         added: list[float] = (moved @ moved.T).ravel().tolist()
         return added
@@ -308,7 +338,7 @@ def _flat(matrix: Floats) -> Matrix:
 
 
 def _affine(matrix: Sequence[float], less: Triple) -> Callable[[float, float, float], Triple]:
-    """Return the function matrix @ vector - less."""
+    """Return the function v -> matrix @ v - less."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = less
 
@@ -330,7 +360,7 @@ def _product(one: Sequence[float], other: Sequence[float]) -> Matrix:
 
 
 def _inverse(matrix: Sequence[float]) -> Matrix:
-    """Return the inverse of a gain, which the gate has checked to be far from singular."""
+    """Return the inverse of a gain. `calibrate.gate` has checked that it is not singular."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     size = a * p + b * q + c * r

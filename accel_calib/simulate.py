@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Seeded poses and recordings from a model: the forward equation with noise.
+Simulated poses and recordings of a model: the forward equation with seeded noise.
 
-All readings are in g; `accel_calib.units` converts them. Directions are directions of up in the
-levelled frame, unit vectors of specific force.
+All readings are in g; `accel_calib.units` converts them. A direction is the direction of up in the
+levelled frame, a unit vector of specific force.
 
 """
 
@@ -24,12 +24,12 @@ from .table import Floats, numbered, Poses, Recording
 
 def parse_effect(text: str) -> tuple[str, Floats]:
     """
-    Read ``NAME=VALUE,…``, values in the unit that the catalogue gives for the effect.
+    Parse ``NAME=VALUE,…``, with values in the unit of the catalogue.
 
     Parameters
     ----------
     text : str
-        Such as ``offset=0.01,-0.02,0.03`` or ``quadratic=0.002``: one value serves all axes.
+        For example ``offset=0.01,-0.02,0.03``, or ``quadratic=0.002`` for all axes.
 
     Returns
     -------
@@ -39,12 +39,12 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     Raises
     ------
     InputError
-        As `model_with`, or if it is not of this form.
+        If the text is not of this form, or as `model_with`.
 
     """
     name, equals, values = text.partition('=')
     if not equals:
-        raise InputError(f'effect {text!r} is not of the form NAME=VALUE,…',
+        raise InputError(f'effect is {text!r}, expected NAME=VALUE,…',
                          f'use one of {", ".join(EFFECTS)}')
     try:
         numbers = np.array([float(part) for part in values.split(',')])
@@ -53,16 +53,17 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     return name, _values_of(name, numbers, repr(values))
 
 
-def _values_of(name: str, given: ArrayLike, shown: str = '') -> Floats:
-    """Return the values of an effect; one value serves all axes."""
+def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
+    """Return the values of an effect; one value is used for all axes."""
     if name not in EFFECTS:
         raise InputError(f'effect {name!r} is not in the catalogue',
                          f'use one of {", ".join(EFFECTS)}')
     values, names = np.atleast_1d(np.asarray(given, float)), EFFECTS[name].values
     if not np.all(np.isfinite(values)) or values.shape not in ((1,), (len(names),)):
-        raise InputError(f'effect {name} has values {shown or values.tolist()}, expected 1 or '
-                         f'{len(names)} numbers ({", ".join(names)}) in {EFFECTS[name].unit}',
-                         f'write {name}={",".join(["0.001"] * len(names))}, for instance')
+        count = '1 number' if len(names) == 1 else f'1 or {len(names)} numbers'
+        raise InputError(f'effect {name} has values {text or values.tolist()}, expected {count} '
+                         f'({", ".join(names)}) in {EFFECTS[name].unit}',
+                         f'write for example {name}={",".join(["0.001"] * len(names))}')
     return np.broadcast_to(values, len(names)).copy()
 
 
@@ -73,14 +74,14 @@ def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None)
     Parameters
     ----------
     effects : mapping of str to array
-        Values by effect, in the units of the catalogue; one value serves all axes.
+        Values by effect, in the units of the catalogue; one value is used for all axes.
     rotation : (3, 3) array, optional
         ΔR.
 
     Raises
     ------
     InputError
-        If an effect is not in the catalogue, or its values are not that many finite numbers.
+        If an effect is not in the catalogue, or has not the expected number of finite values.
 
     """
     values = {name: _values_of(name, given) for name, given in effects.items()}
@@ -107,12 +108,12 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     samples : int
         Independent samples per pose.
     context : mapping of str to array, optional
-        What the effects need, n rows each.
+        Columns that the effects need, n rows each.
 
     Returns
     -------
     Poses
-        In g, with std, count and context.
+        Poses in g, with std, count and context.
 
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
@@ -123,7 +124,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
 
 
 def _between(start: Floats, end: Floats) -> Floats:
-    """Return the unit vector, normal to `start`, in which the arc to `end` begins."""
+    """Return the unit tangent at `start` of the arc to `end`."""
     normal = end - start * (start @ end)
     if np.linalg.norm(normal) < 1e-9:
         normal = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
@@ -131,21 +132,21 @@ def _between(start: Floats, end: Floats) -> Floats:
 
 
 def _turn(start: Floats, end: Floats, seconds: float, count: int) -> tuple[Floats, Floats]:
-    """Return force and rate, (count, 3), of a turn along the shortest arc, at rest at its ends."""
+    """Return the (count, 3) force and rate of a smooth turn along the shortest arc."""
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
     share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
     speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
     along = _between(start, end)
     arc = np.arctan2(np.linalg.norm(np.cross(start, end)), start @ end)
     force = np.cos(arc * share) * start + np.sin(arc * share) * along
-    # The direction of up turns opposite to the body: df/dt = -ω × f.
+    # In body axes, up turns opposite to the body: df/dt = -ω × f.
     change = arc * speed * (np.cos(arc * share) * along - np.sin(arc * share) * start)
     return force, np.cross(change, force)
 
 
 def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple[Floats, Floats]:
     """
-    Rest in each direction and turn smoothly to the next.
+    Return the path of a sensor that rests in each direction and turns smoothly to the next.
 
     Parameters
     ----------
@@ -154,7 +155,7 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
     rate_hz : float
         Samples per second.
     dwell, turn : float
-        Seconds of each rest and of each turn.
+        Duration of each rest and of each turn [s].
 
     Returns
     -------
@@ -195,12 +196,12 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     rate_hz, dwell, turn : float
         As `path`.
     temperatures : sequence of float
-        First and last temperature [°C]; between them it changes in proportion to time.
+        First and last temperature [°C]; the temperature changes linearly in time.
 
     Returns
     -------
     Recording
-        In g, with angular rate and the true force as reference.
+        Samples in g, with angular rate, and the true force as ``reference``.
 
     """
     force, rate = path(directions, rate_hz, dwell, turn)

@@ -14,7 +14,7 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 def spread_directions(count: int) -> Floats:
     """
-    Spread directions evenly over the sphere (Fibonacci lattice).
+    Return directions that are spread evenly over the sphere (Fibonacci lattice).
 
     Returns
     -------
@@ -28,13 +28,13 @@ def spread_directions(count: int) -> Floats:
 
 
 def unit(vectors: Floats) -> Floats:
-    """Give (n, 3) vectors at length 1; zeros stay zeros."""
+    """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """
-    Draw directions evenly over the sphere.
+    Return random directions, uniformly distributed over the sphere.
 
     Returns
     -------
@@ -47,12 +47,12 @@ def random_directions(count: int, rng: np.random.Generator) -> Floats:
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """
-    Give the rotation of fixed-axis roll, pitch and yaw [rad], as in URDF.
+    Return the rotation matrix of fixed-axis roll, pitch and yaw [rad], as in URDF.
 
     Returns
     -------
     (3, 3) array
-        From the axes of the turned body to those it is turned in.
+        It transforms from the axes of the rotated body to the fixed axes.
 
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Readings with what is known beside them: poses and recordings.
+Tables of readings with their context: poses and recordings.
 
-`COLUMNS` is the one list of columns: files, simulation, effects and help take names, units and
-meanings from it.
+`COLUMNS` is the only list of columns. Files, simulation, effects and documentation read names,
+units and meanings there.
 
 """
 
@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import counted, InputError
 from .html_table import table
 from .units import Floats, UnitName
 
@@ -31,8 +31,8 @@ class Column:
     """
     One quantity of a table: its names in a file, its unit and its meaning.
 
-    Three names make an (n, 3) array, one name an (n,) array. Columns that are `made` are never in
-    a file.
+    A column with three names is an (n, 3) array, with one name an (n,) array. Columns with `made`
+    set are computed and never stored in a file.
 
     """
 
@@ -44,7 +44,7 @@ class Column:
 
 COLUMNS: dict[str, Column] = {
     'time': Column(('time',), 's', 'header stamp'),
-    'reading': Column(('ax', 'ay', 'az'), 'unit of the reading', 'what the sensor reads'),
+    'reading': Column(('ax', 'ay', 'az'), 'unit of the reading', 'reading of the sensor'),
     'std': Column(('std_x', 'std_y', 'std_z'), 'unit of the reading',
                   'standard deviation of the samples of a pose'),
     'count': Column(('count',), '', 'independent samples of a pose: std/√count is the noise '
@@ -55,18 +55,20 @@ COLUMNS: dict[str, Column] = {
     'reference': Column(('ref_x', 'ref_y', 'ref_z'), 'unit of the reading',
                         'true specific force (known orientation); in g for native units'),
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
-                       'pose; made from the order of the poses'),
-    'orientation': Column(('orientation',), '', 'rows that share it had the same orientation'),
-    'label': Column(('label',), '', 'a word of the user'),
-    'doubtful': Column(('doubtful',), '', '1: the sensor may have moved, as later rests show'),
+                       'pose; computed from the order of the poses'),
+    'orientation': Column(('orientation',), '',
+                          'rows with the same number have the same orientation'),
+    'label': Column(('label',), '', 'free text'),
+    'doubtful': Column(('doubtful',), '',
+                       '1: the sensor may have moved, according to later rests'),
     'new': Column(('new',), '', '1 for poses taken since a stored calibration, 0 for its own',
                   made=True),
 }
 
 _Self = TypeVar('_Self', bound='Table')
 
-_SHOWN = 20
-"""Rows that a notebook shows."""
+_PREVIEW_ROWS = 20
+"""Number of rows in the preview of a notebook."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -81,9 +83,9 @@ class Table:
     row : (n,) array of int
         Row numbers in the source, from 1.
     units : {'m/s2', 'g', 'native', ''}
-        Unit of the readings; empty if the source does not say it.
+        Unit of the readings; empty if the source does not state it.
     sensor : str
-        Name of the sensor; empty if the source does not say it.
+        Name of the sensor; empty if the source does not state it.
 
     """
 
@@ -94,7 +96,7 @@ class Table:
 
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
-            raise ValueError('a table needs readings')
+            raise ValueError('the table has no readings, expected the column reading')
         for key, values in self.columns.items():
             width = len(COLUMNS[key].names)
             shape = (len(self.row),) if width == 1 else (len(self.row), width)
@@ -112,24 +114,25 @@ class Table:
 
     def __repr__(self) -> str:
         about = [', '.join(self.columns), self.units, self.sensor]
-        return f'{type(self).__name__}({len(self)} rows: {"; ".join(filter(None, about))})'
+        rows = counted(len(self), 'row')
+        return f'{type(self).__name__}({rows}: {"; ".join(filter(None, about))})'
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table, for notebooks."""
         keys = [key for key in COLUMNS if key in self]
         names = [name for key in keys for name in COLUMNS[key].names]
-        first = self.take(slice(_SHOWN))
+        first = self.take(slice(_PREVIEW_ROWS))
         cells = [[str(row)] for row in first.row]
         for key in keys:
             for line, values in zip(cells, np.atleast_2d(first[key].T).T.reshape(len(first), -1)):
                 line += [f'{each:.6g}' if first[key].dtype.kind in 'fi' else str(each)
                          for each in values]
-        more = f'<p>{self!r}</p>' if len(self) > _SHOWN else ''
+        more = f'<p>{self!r}</p>' if len(self) > _PREVIEW_ROWS else ''
         return table(['row', *names], cells) + more
 
     @property
     def reading(self) -> Floats:
-        """(n, 3) array, the readings in their own unit."""
+        """(n, 3) array, the readings in the unit `units`."""
         return self.columns['reading']
 
     def take(self: _Self, which: NDArray[Any] | slice) -> _Self:
@@ -159,7 +162,7 @@ class Recording(Table):
     def __post_init__(self) -> None:
         super().__post_init__()
         if 'time' not in self.columns:
-            raise ValueError('a recording needs times')
+            raise ValueError('the recording has no times, expected the column time')
 
 
 def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
@@ -170,21 +173,21 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
 def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
                  ) -> dict[str, NDArray[Any]]:
     """
-    Return columns by the keys of `COLUMNS` from columns by their names in a file.
+    Return columns under the keys of `COLUMNS`, from columns under their names in a file.
 
     Parameters
     ----------
     given : mapping of str to array
         n values for each name; other names than those of `COLUMNS` are ignored.
     needed : sequence of str
-        Keys that must be there.
+        Required keys.
     source : str
-        What to call the source in errors.
+        Name of the source in error messages.
 
     Raises
     ------
     InputError
-        If a column is missing, in part or whole, or holds what it cannot hold.
+        If a required column is missing, part of a column is missing, or a value is not valid.
 
     """
     columns: dict[str, NDArray[Any]] = {}
@@ -207,8 +210,8 @@ def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[s
             keys.append(key)
         elif key in needed or len(missing) < len(column.names):
             raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
-                             f'{", ".join(missing)}',
-                             f'name the columns {", ".join(column.names)} in the header line')
+                             f'{", ".join(missing)}', f'add the columns '
+                             f'{", ".join(column.names)}, or correct the header line')
     return keys
 
 
@@ -226,10 +229,11 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
         if key != 'label' and not np.all(np.isfinite(values)):
             bad = int(np.argmin(np.isfinite(values.reshape(len(values), -1)).all(axis=1)))
             raise InputError(f'{source}: row {bad + 1} of {", ".join(COLUMNS[key].names)} holds a '
-                             'number that is not finite', 'correct the row or remove it')
+                             'number that is not finite, expected finite numbers',
+                             'correct the row or remove it')
     if 'count' in columns and not np.all(columns['count'] > 0):
-        raise InputError(f'{source}: column count holds numbers that are not above 0',
-                         'give the number of samples of each pose')
+        raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
+                         'positive numbers', 'enter the number of samples of each pose')
     if 'std' in columns and not np.all(columns['std'] >= 0):
-        raise InputError(f'{source}: column std_x, std_y or std_z holds negative numbers',
-                         'give standard deviations')
+        raise InputError(f'{source}: column std_x, std_y or std_z holds negative numbers, '
+                         'expected 0 or more', 'enter standard deviations')

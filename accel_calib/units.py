@@ -31,10 +31,10 @@ class Units:
     Parameters
     ----------
     name : {'m/s2', 'g', 'native'}
-        Native is any other: counts, volts.
+        ``native`` is any other unit, such as counts or volts.
     per_g : float
-        Readings in this unit that make 1 g of local gravity: the local gravity [m/s²] for
-        ``m/s2``, 1 for ``g``, and for ``native`` the sensitivity, found by the fit.
+        Value of 1 g of local gravity in this unit: the local gravity [m/s²] for ``m/s2``, 1 for
+        ``g``, and the sensitivity for ``native``, which the fit estimates.
 
     """
 
@@ -43,22 +43,24 @@ class Units:
 
     def __post_init__(self) -> None:
         if self.name not in UNIT_NAMES:
-            raise ValueError(f'unit {self.name!r} is none of {UNIT_NAMES}')
+            raise ValueError(f'unit is {self.name!r}, expected one of {UNIT_NAMES}')
         if not self.per_g > 0.0:
             raise ValueError(f'per_g is {self.per_g}, expected a positive number')
 
     def to_g(self, reading: Floats) -> Floats:
-        """Return readings of this unit in g."""
+        """Convert readings from this unit to g."""
         return reading / self.per_g
 
     def from_g(self, reading_g: Floats) -> Floats:
-        """Return readings in g in this unit."""
+        """Convert readings from g to this unit."""
         return reading_g * self.per_g
 
 
 def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:
     """
-    Return the unit of a name; the sensitivity of native units is 1 until a fit finds it.
+    Return the unit with this name.
+
+    The sensitivity of native units is 1 until a fit estimates it.
 
     Parameters
     ----------

@@ -1,13 +1,16 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a refinement in words and short numbers, for terminal and page."""
+"""Text about the result of a refinement, for the terminal and the report."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .effects import effect_named
+from .errors import counted
 from .units import MG
 
 if TYPE_CHECKING:
@@ -16,42 +19,44 @@ if TYPE_CHECKING:
 _LEAST_P = 1e-16
 _IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
 _VERDICTS = {
-    'no_gap': 'Nothing beyond the noise: these poses call for no further effect.',
-    'explained': 'The gap is explained: beyond the named effects only noise is left.',
+    'no_gap': 'No gap beyond the noise: these poses support no further effect.',
+    'explained': 'The gap is explained: only noise remains beyond the named effects.',
     'unexplained': 'A gap remains that no effect of the catalogue explains.',
 }
 
 
 def verdict_words(result: Refinement) -> str:
-    """Return what the verdict means."""
+    """Return the verdict as a sentence."""
     words = _VERDICTS[result.verdict]
     if result.verdict == 'unexplained' and result.steps:
         words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
                  'it.')
     if result.noise_floor_mg is None:
-        words += (' The noise of the poses is not known (no std and count), so they are judged by '
-                  'their own scatter.')
+        words += (' The noise of the poses is not known (no std and count), so their scatter is '
+                  'taken as the noise.')
     return words
 
 
 def residual_words(result: Refinement) -> str:
-    """Return how the residual went from the base to the end."""
+    """Return the residual of the base and of the refined model, and the noise floor."""
     floor = ('not known' if result.noise_floor_mg is None
              else f'{short(result.noise_floor_mg)} mg')
     residual = f'{short(result.gap_mg)} mg'
     if result.steps:
         residual = f'{short(result.gap_mg)} -> {short(result.remaining_gap_mg)} mg'
-    return f'residual {residual} over {len(result.poses_g)} poses, noise floor {floor}'
+    poses = result.poses_g
+    count = int(np.sum(poses['new'] > 0.0)) if 'new' in poses else len(poses)
+    return f'residual {residual} over {counted(count, "pose")}, noise floor {floor}'
 
 
 def base_words(result: Refinement) -> str:
-    """Return the name of the base."""
+    """Return the name of the base model."""
     name = result.calibration.name
     return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
 def short(value: float) -> str:
-    """Return a number with three digits."""
+    """Return a number with three significant digits."""
     return f'{value:.3g}'
 
 
@@ -61,7 +66,7 @@ def chance(p_value: float) -> str:
 
 
 def values_of(step: Step) -> list[tuple[str, str]]:
-    """Return each value of a step by name, with its unit: mg rather than g."""
+    """Return name and text of each value of a step; values in g are given in mg."""
     effect = effect_named(step.effect)
     milli = effect.unit in _IN_MILLI
     unit, scale = (f'm{effect.unit}', MG) if milli else (effect.unit, 1.0)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Start the calibrator beside a driver of the robot.
+Start the calibrator for the driver of a robot.
 
     ros2 launch accel_calib calibrator.launch.py imu:=camera/imu output:=camera/imu_calibrated
 
@@ -22,8 +22,8 @@ def generate_launch_description() -> LaunchDescription:
         'namespace': ('', 'Namespace of the node; the topics are relative to it.'),
         'imu': ('imu/data_raw', 'Topic of the readings (sensor_msgs/Imu).'),
         'output': ('imu/data_calibrated', 'Topic of the corrected readings.'),
-        'params_file': (str(params_file), 'Parameters of the node.'),
-        'calibration_file': ('', 'Where the calibration is kept; empty: as in params_file.'),
+        'params_file': (str(params_file), 'File with the parameters of the node.'),
+        'calibration_file': ('', 'File of the calibration; empty: as in params_file.'),
         'sensor': ('', 'Name of the sensor; empty: as in params_file.'),
     }
     declared = [DeclareLaunchArgument(name, default_value=default, description=description)
@@ -32,7 +32,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _calibrator(context: LaunchContext) -> list[Node]:
-    """Give the node; an empty argument must not override the parameter file."""
+    """Return the node; an empty argument does not override the parameter file."""
     given = {name: LaunchConfiguration(name).perform(context)
              for name in ('calibration_file', 'sensor')}
     overrides = {name: ParameterValue(value, value_type=str)

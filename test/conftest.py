@@ -4,9 +4,9 @@
 """
 Fixtures for the tests of the nodes.
 
-`bench` gives each test a DDS domain of its own and runs nodes as processes. Header stamps are the
-clock of the calibrator, so that a test may feed a minute of readings in a second. Waits are
-bounded, and wait for a condition.
+`bench` runs nodes as processes, with a separate DDS domain per test. The clock of the calibrator
+are the header stamps, so that a test can publish a minute of readings in a second. Each wait has a
+condition and a time limit.
 
 """
 
@@ -27,10 +27,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 collect_ignore_glob = [] if find_spec('rclpy') else ['test_ros_*.py']
-"""Without ROS the other tests run."""
+"""Without ROS only the other tests run."""
 _DOMAINS = itertools.cycle(range(1, 102))
 for _ in range(os.getpid() % 101):
-    next(_DOMAINS)  # two runs on one machine must not meet
+    next(_DOMAINS)  # two test runs on one machine need different domains
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -55,7 +55,7 @@ class Bench:
         from rclpy.node import Node
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=self._domain)
-        # Without a log: rcl keeps one publisher of /rosout by name for all contexts.
+        # Without /rosout: rcl has one publisher per node name for all contexts.
         self.node = Node('bench', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -94,7 +94,7 @@ class Bench:
         return process
 
     def end(self, process: subprocess.Popen[str], number: int) -> tuple[int, str]:
-        """Send a signal; return the exit status and all that was printed."""
+        """Send a signal, and return the exit status and the output."""
         process.send_signal(number)
         printed = process.communicate(timeout=10)[0]
         return process.returncode, printed
@@ -105,7 +105,7 @@ class Bench:
         while not until():
             late = time.monotonic() > ends
             assert not late, f'not so within {seconds} s'
-            # Checks take time too: on a busy machine messages would pile up between them.
+            # Checks take time, too: on a busy machine messages would accumulate.
             look_again = time.monotonic() + 0.02
             while time.monotonic() < look_again:
                 self._executor.spin_once(timeout_sec=0.02)
@@ -121,7 +121,7 @@ class Bench:
         return heard
 
     def client(self, name: str) -> Any:
-        """Return a client of a service of the calibrator, once it is there."""
+        """Wait for a service of the calibrator, and return its client."""
         from diagnostic_msgs.srv import SelfTest
         from std_srvs.srv import SetBool, Trigger
         kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
@@ -138,7 +138,7 @@ class Bench:
         return future.result()
 
     def call_while(self, name: str, make: Callable[[], Any]) -> Any:
-        """Call a service of the calibrator while messages go on; return its answer."""
+        """Call a service of the calibrator while messages continue, and return its answer."""
         client = self.client(name)
         self.send(make())
         future = client.call_async(client.srv_type.Request())
@@ -169,10 +169,10 @@ class Bench:
 
     def feed(self, readings: Any) -> None:
         """
-        Publish readings in m/s², `RATE` a second by their stamps, and faster by the clock.
+        Publish readings [m/s²], at `RATE` by their stamps but faster in real time.
 
         The output of the calibrator sets the pace, because sensor data are dropped while it is
-        busy; without a calibration it needs `passthrough`.
+        busy. Without a calibration, this needs `passthrough`.
 
         """
         if not self._came_out:
@@ -187,7 +187,7 @@ class Bench:
             self.spin(lambda batch=batch: len(self._came_out) >= len(batch), 5.0)
 
     def echo(self, messages: Iterable[Any], heard: list[Any]) -> list[Any]:
-        """Publish messages, each after the output for the one before; return the output."""
+        """Publish messages, each after the output of the previous one, and return the output."""
         heard.clear()
         for k, message in enumerate(messages):
             self.send(message)
@@ -195,7 +195,7 @@ class Bench:
         return heard
 
     def exchange(self, heard: list[Any], make: Callable[[], Any]) -> Any:
-        """Publish what `make` returns, repeatedly, until something is heard; return that."""
+        """Publish messages of `make` until there is output, and return the first output."""
         heard.clear()
 
         def sent() -> bool:
@@ -206,8 +206,8 @@ class Bench:
         return heard[0]
 
     def close(self) -> None:
-        """Leave DDS, then end all that was started."""
-        self._leave()  # first: a killed process leaves its part of shared memory as it was
+        """Leave DDS, and kill all started processes."""
+        self._leave()  # first, because a killed process leaves its shared memory unchanged
         for process in self._processes:
             if process.poll() is None:
                 process.kill()

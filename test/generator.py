@@ -4,25 +4,24 @@
 """
 A simulator of a still accelerometer that shares no code with the package.
 
-What the package finds is checked against this, so it is written apart, from the table of effects
-alone, with numpy and nothing else. A set of poses is made sample by sample: the true specific
-force u in the axes of the sensor, the common errors V + W u, what the hidden effects add, the
-vibration of each sample, the limits and the grid of the output; then the mean and the standard
-deviation of the samples of each pose. Temperature, supply, time, rate and variance are recorded
-whether or not they do anything.
+The results of the package are tested with this simulator. It is therefore independent: it is based
+only on the table of effects, and uses only numpy. A set of poses is simulated sample by sample:
+the true specific force u in the sensor axes, the common errors V + W u, the contributions of the
+hidden effects, the vibration of each sample, and the limits and the grid of the output. Then mean
+and standard deviation of the samples of each pose are computed. Temperature, supply, time, rate
+and variance are always recorded, also if they have no effect.
 
-Forces are in g, up is positive; the columns are those of a pose table in m/s², with rad/s, °C, V
-and s.
+Forces are in g, and up is positive. The columns are those of a pose table in m/s², with rad/s, °C,
+V and s.
 
 The size of an effect
 ---------------------
-Common errors take up part of any effect. What is left of its contribution to |a| after a least
-squares fit of the 9 free parameters of V and symmetric W, over the noise of each pose mean in
-|a|, RMS over the poses, is its size. The values of the effects are scaled to the size asked for.
-There are two exceptions. The error of quantisation is as large in g as that of another effect of
-the size, while its sample noise is small against the step, so that its size is larger than asked
-for. Saturation clips at least `LEAST_CLIPPED` poses, though its size be larger by that.
-
+Common errors absorb a part of each effect. The size of an effect is the rest of its contribution
+to |a| after a least squares fit of the 9 free parameters of V and symmetric W, relative to the
+noise of each pose mean in |a|, RMS over the poses. The values of the effects are scaled to the
+requested size. There are two exceptions. For quantisation, the error in g is that of another
+effect of the requested size, but the sample noise is small compared with the step, so the size is
+larger. Saturation clips at least `LEAST_CLIPPED` poses, even if the size is then larger.
 """
 
 from __future__ import annotations
@@ -44,44 +43,44 @@ NOMINAL_SUPPLY = 3.3
 HOUR = 3600.0
 
 LEAST_CLIPPED = 3
-"""Poses that end at the rail: a single one is like any other disturbed pose."""
+"""Smallest number of clipped poses; a single clipped pose looks like an outlier."""
 
 QUIET_STEP = 20.0
-"""Step of a coarse grid over the sample noise."""
+"""Ratio of the step of a coarse grid to the sample noise."""
 
 PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 """Axes i, j of cross coupling: k u_i u_j is added to axis i."""
 
 OUTSIDE = ('ripple', 'temperature_rate', 'periodic_offset', 'repeatability')
-"""What can be hidden and is in no catalogue."""
+"""Effects that can be hidden but are not in the catalogue."""
 
 
 @dataclass(frozen=True)
 class Setup:
     """
-    How a set is taken.
+    Settings of the simulation of a set.
 
     Parameters
     ----------
     poses, samples : int
-        Number of poses, and of samples of each.
+        Number of poses, and of samples per pose.
     noise_mg, step_mg : float
-        Least standard deviation of the samples of an axis, and step of the output [mg].
+        Smallest standard deviation of the samples of an axis, and step of the output [mg].
     shaking : float
-        The standard deviation of the samples is up to so many times the least.
+        Largest ratio of the standard deviation of the samples to the smallest one.
     temperature : {'wandering', 'rising'}
-        Rising with time, or not.
+        Course of the temperature.
     rates : {'any', 'small', 'sizeable'}
-        Angular rates; any is one or the other. They are sizeable where a lever arm is hidden.
+        Angular rates; any: one of the others. They are sizeable if a lever arm is hidden.
     hysteresis : {'unit', 'sign', 'previous'}
-        What hysteresis is in proportion to, by axis: the unit vector from the present force to
-        the one before, the sign of that difference, or the force before.
+        Quantity to which hysteresis is proportional, by axis: the unit vector from the present
+        force to the previous one, the sign of this difference, or the previous force.
     start : float
         Time of the first pose [s].
     knocked : int
-        Poses that are off by 10 to 50 mg.
+        Number of poses with an error of 10 to 50 mg.
     dropped : tuple of str
-        Columns that are left out.
+        Columns that the table does not have.
 
     """
 
@@ -110,13 +109,13 @@ class Around:
     elapsed : (n,) array
         Time since the first pose [s].
     temperature, supply : (n,) array
-        [°C], [V].
+        Temperature [°C] and supply [V].
     rate : (n, 3) array
-        [rad/s].
+        Angular rate [rad/s].
     shaking : (n, 3, samples) array
-        What vibration and noise add to each sample [g].
+        Contribution of vibration and noise to each sample [g].
     sigma : (n, 3) array
-        The standard deviation it was drawn with [g].
+        Standard deviation of this contribution [g].
 
     """
 
@@ -132,7 +131,7 @@ class Around:
 @dataclass(frozen=True)
 class Traits:
     """
-    What is particular to one sensor and its day, apart from the values of the effects.
+    Random properties of a sensor and a set, except for the values of the effects.
 
     Parameters
     ----------
@@ -141,11 +140,11 @@ class Traits:
     tau, instant, beat : float
         Time constant of the warm-up, instant of the step, period of the periodic offset [s].
     period, phase : (3,) array
-        Of the ripple [g], by axis [rad].
+        Period [g] and phase [rad] of the ripple, by axis.
     walk, scatter : (n, 3) array
-        A random walk in time, and random numbers for each pose.
+        Random walk in time, and random numbers for each pose.
     hysteresis : str
-        As `Setup.hysteresis`.
+        As in `Setup.hysteresis`.
 
     """
 
@@ -169,13 +168,13 @@ class Simulated:
     Parameters
     ----------
     columns : mapping of str to (n,) array
-        As in the file.
+        Columns of the pose table.
     truth : mapping of str to mapping of str to float
         Values of each hidden effect: g, g/g, g/g², g/g³, g/°C, 1/°C, g/h, m, s.
     sizes : mapping of str to float
         Size of each hidden effect.
     knocked : mapping of int to float
-        Rows, from 1, of knocked poses, and how much of the knock shows in |a| [g].
+        Rows of knocked poses, 1-based, and the error of |a| by the knock [g].
     noise : (n,) array
         Standard deviation of the pose mean in |a| [g].
     around : Around
@@ -183,10 +182,10 @@ class Simulated:
     traits : Traits
         The truth about the sensor.
     values : mapping of str to (p,) array
-        Values of each hidden effect in the order of `basis`; the rail, or the step, of what acts
-        on the output.
+        Values of each hidden effect in the order of `basis`; limit or step of an effect on the
+        output.
     setup : Setup
-        How it was taken.
+        Settings of the simulation.
 
     """
 
@@ -204,16 +203,16 @@ class Simulated:
 def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None,
              setup: Setup = Setup()) -> Simulated:
     """
-    Draw a sensor and its surroundings, and take poses.
+    Return simulated poses of a random sensor.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Decides everything that is drawn.
+        Source of all random numbers.
     hidden : mapping of str to float
-        Sizes of the hidden effects by name, of `EFFECTS`.
+        Sizes of the hidden effects, by name in `EFFECTS`.
     setup : Setup
-        How to take the poses.
+        Settings of the simulation.
 
     Returns
     -------
@@ -238,20 +237,20 @@ def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None
         values['saturation'] = _rail(hidden['saturation'], values, around, traits)
     unknown = set(hidden) - set(values)
     if unknown:
-        raise ValueError(f'{unknown} is none of {EFFECTS}')
+        raise ValueError(f'hidden effects {unknown}, expected some of {list(EFFECTS)}')
     return _measured(rng, setup, around, traits, values)
 
 
 def again(rng: np.random.Generator, before: Simulated) -> Simulated:
     """
-    Take other poses with the same sensor, at the same times and temperatures.
+    Return other poses of the same sensor, at the same times and temperatures.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Decides everything that is drawn.
+        Source of all random numbers.
     before : Simulated
-        The set to repeat in other orientations; nothing is knocked.
+        The set to repeat in other orientations, without knocks.
 
     """
     setup = replace(before.setup, knocked=0)
@@ -280,7 +279,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _around(rng: np.random.Generator, setup: Setup, turning: bool) -> Around:
-    """Draw where, when and how each pose is taken."""
+    """Return random orientation, time and context of each pose."""
     n = setup.poses
     force = _unit(rng.normal(size=(n, 3)))
     elapsed = np.cumsum(rng.uniform(10.0, 60.0, n))
@@ -296,7 +295,7 @@ def _around(rng: np.random.Generator, setup: Setup, turning: bool) -> Around:
 
 
 def _temperature(rng: np.random.Generator, share: Floats, rising: bool) -> Floats:
-    """Draw temperatures between 10 and 40 °C for these shares of the span."""
+    """Return random temperatures between 10 and 40 °C at these shares of the time span."""
     waves = rng.uniform(1.5, 5.0, 3)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     wave = np.sum(np.sin(2.0 * np.pi * np.outer(share, waves) + phases), axis=1)
@@ -308,7 +307,7 @@ def _temperature(rng: np.random.Generator, share: Floats, rising: bool) -> Float
 
 
 def _traits(rng: np.random.Generator, setup: Setup, elapsed: Floats) -> Traits:
-    """Draw a sensor."""
+    """Return the random properties of a sensor."""
     n, span = len(elapsed), elapsed[-1]
     gain = np.eye(3) + np.diag(rng.normal(size=3) * 0.02)
     for i, j in ((0, 1), (0, 2), (1, 2)):
@@ -323,7 +322,7 @@ def _traits(rng: np.random.Generator, setup: Setup, elapsed: Floats) -> Traits:
 
 
 def _by_axis(shape: Callable[[Around, Traits], Floats]) -> Callable[[Around, Traits], Floats]:
-    """Make (n, 3, 3) of an (n, 3) shape: each axis has its own value."""
+    """Return the (n, 3, 3) basis of an (n, 3) shape, with one value per axis."""
     def basis(around: Around, traits: Traits) -> Floats:
         return shape(around, traits)[:, :, np.newaxis] * np.eye(3)
 
@@ -387,18 +386,18 @@ EFFECTS: dict[str, Callable[[Around, Traits], Floats] | None] = {
         lambda a, t: np.sin(2.0 * np.pi * a.elapsed / t.beat + t.phase[0])),
     'repeatability': _by_axis(lambda a, t: t.scatter),
 }
-"""What each effect adds, (n, 3, p) for p values; None for what acts on the output."""
+"""The (n, 3, p) basis of each effect with p values; None for effects on the output."""
 
 ON_OUTPUT = ('saturation', 'quantisation')
 
 
 def plain_reading(around: Around, traits: Traits) -> Floats:
-    """Give V + W u, (n, 3) [g]."""
+    """Return the (n, 3) readings V + W u [g]."""
     return traits.offset + around.force @ traits.gain.T
 
 
 def basis_of(name: str, around: Around, traits: Traits) -> Floats:
-    """Give the (n, 3, p) reading that values of 1 of an effect add [g]."""
+    """Return the (n, 3, p) derivative of the reading by the values of an effect [g]."""
     shape = EFFECTS[name]
     if shape is None:
         raise ValueError(f'{name} acts on the output')
@@ -406,19 +405,19 @@ def basis_of(name: str, around: Around, traits: Traits) -> Floats:
 
 
 def noise_in_norm(around: Around, traits: Traits) -> Floats:
-    """Give the (n,) standard deviation of a pose mean, seen in |a| [g]."""
+    """Return the (n,) standard deviations of |a| of the pose means [g]."""
     rows = around.force @ np.linalg.inv(traits.gain)
     return np.linalg.norm(rows * around.sigma, axis=1) / np.sqrt(around.shaking.shape[2])
 
 
 def size_of(added: Floats, around: Around, traits: Traits) -> float:
     """
-    Give the size of an effect.
+    Return the size of an effect.
 
     Parameters
     ----------
     added : (n, 3) array
-        What it adds to the mean readings [g].
+        Contribution of the effect to the mean readings [g].
     around, traits : Around, Traits
         The poses and the sensor.
 
@@ -435,7 +434,7 @@ def size_of(added: Floats, around: Around, traits: Traits) -> float:
 
 def _scaled(rng: np.random.Generator, name: str, wanted: float, around: Around,
             traits: Traits) -> Floats:
-    """Draw the values of an effect and scale them to a size."""
+    """Return random values of an effect, scaled to a size."""
     basis = basis_of(name, around, traits)
     values = rng.normal(size=basis.shape[2]) * 1e-3 / np.sqrt(np.mean(basis ** 2))
     for _ in range(6):
@@ -444,7 +443,7 @@ def _scaled(rng: np.random.Generator, name: str, wanted: float, around: Around,
 
 
 def _samples(values: Mapping[str, Floats], around: Around, traits: Traits) -> Floats:
-    """Give the (n, 3, samples) output before limits and grid [g]."""
+    """Return the (n, 3, samples) output before limits and grid [g]."""
     reading = plain_reading(around, traits)
     for name, value in values.items():
         if name not in ON_OUTPUT:
@@ -454,7 +453,7 @@ def _samples(values: Mapping[str, Floats], around: Around, traits: Traits) -> Fl
 
 def _rail(wanted: float, values: Mapping[str, Floats], around: Around,
           traits: Traits) -> Floats:
-    """Find the rail, (1,) [g], at which saturation has a size."""
+    """Return the (1,) limit at which saturation has a size [g]."""
     samples = _samples(values, around, traits)
     farthest = np.sort(np.max(np.abs(np.mean(samples, axis=2)), axis=1))
     low, high = 0.5, float(farthest[-1 - LEAST_CLIPPED])
@@ -467,7 +466,7 @@ def _rail(wanted: float, values: Mapping[str, Floats], around: Around,
 
 def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Traits,
               values: Mapping[str, Floats]) -> Simulated:
-    """Take the samples and average them."""
+    """Return the set of the averaged samples."""
     samples = _samples(values, around, traits)
     rows = np.sort(rng.choice(setup.poses, setup.knocked, replace=False))
     knocks = _unit(rng.normal(size=(len(rows), 3))) * rng.uniform(0.01, 0.05, (len(rows), 1))
@@ -485,7 +484,7 @@ def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Tr
 
 
 def _size(name: str, values: Mapping[str, Floats], around: Around, traits: Traits) -> float:
-    """Give the size of one of the hidden effects."""
+    """Return the size of a hidden effect."""
     if name not in ON_OUTPUT:
         return size_of(basis_of(name, around, traits) @ values[name], around, traits)
     samples, limit = _samples(values, around, traits), float(values[name][0])
@@ -495,7 +494,7 @@ def _size(name: str, values: Mapping[str, Floats], around: Around, traits: Trait
 
 
 def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
-    """Give the values of an effect by the names and in the units of the catalogue."""
+    """Return the values of an effect with the names and units of the catalogue."""
     if name == 'supply_ratio':  # W u is about its mean gain times u
         parts = np.array([np.trace(traits.gain) / 3.0, *traits.offset]) * values[0]
         return dict(zip(('gain', 'x', 'y', 'z'), parts.tolist(), strict=True))
@@ -508,7 +507,7 @@ def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
 
 
 def _columns(output: Floats, around: Around, setup: Setup) -> dict[str, Floats]:
-    """Give the columns of the pose table."""
+    """Return the columns of the pose table."""
     mean = np.mean(output, axis=2) * STANDARD_GRAVITY
     std = np.std(output, axis=2, ddof=1) * STANDARD_GRAVITY
     columns = {'time': np.round(setup.start + around.elapsed, 3)}

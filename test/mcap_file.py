@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A writer of MCAP files of every make, after the specification, without the package."""
+"""An independent writer of MCAP files of every kind, according to the specification."""
 
 from pathlib import Path
 import struct
@@ -31,10 +31,10 @@ def record(code, content):
 
 class McapFile:
     """
-    Write messages, given in the order of the file, as (channel, log time [ns], bytes).
+    Writer of messages (channel, log time [ns], bytes) in the order of the file.
 
-    With an attachment before the chunks, metadata behind them, and checksums of all that can have
-    one.
+    The file has an attachment before the chunks, metadata after them, and all possible checksums.
+
     """
 
     def __init__(self, topics, compression='', chunk=4000, in_chunks=True, summary=True):

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What several tests share: the folder of real recordings, and a sensor to recover."""
+"""Helpers of several tests: the folder of real recordings, and a simulated sensor."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 
 
 def data(name: str) -> Path:
-    """Give a real recording, or skip the test where it is missing."""
+    """Return the path of a real recording, or skip the test if it is missing."""
     path = DATA / name
     if not path.exists():
         pytest.skip(f'{path} is not here')
@@ -22,7 +22,7 @@ def data(name: str) -> Path:
 
 
 def sensor(rng: np.random.Generator, *effects: str) -> Model:
-    """Draw a sensor with common errors; offset, gains and cross-axis unless said."""
+    """Return a random sensor with these effects; by default offset, gains and cross-axis."""
     sizes = {'offset': 0.05, 'gain': 0.02, 'axis_gain': 0.02, 'cross_axis': 0.01,
              'misalignment': 0.01}
     names = effects or ('offset', 'axis_gain', 'cross_axis')

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages read and corrected as arrays are those that `rosbags` deserializes, in all storages."""
+"""Messages read as arrays equal those that `rosbags` deserializes, for all storages."""
 
 from dataclasses import replace
 from functools import cache
@@ -50,7 +50,7 @@ def imu(rng, stamp, frame_id, little_endian=True):
 
 @cache
 def messages(seed, *, shuffled=False, frame_ids=('imu',), little_endian=True):
-    """Give (channel, log time, bytes); some a little out of order, as writers of logs are."""
+    """Return (channel, log time, bytes); some messages are slightly out of order."""
     rng = np.random.default_rng(seed)
     made = []
     for k in range(COUNT):
@@ -93,7 +93,7 @@ def split(path, made):
 
 
 def write(folder, make, made):
-    """Write a bag of some make."""
+    """Write a bag of one kind."""
     by_rosbags = {'sqlite3': (StoragePlugin.SQLITE3,), 'mcap by rosbags': (StoragePlugin.MCAP,),
                   'zstd by rosbags': (StoragePlugin.MCAP, CompressionMode.STORAGE),
                   'sqlite3 messages': (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
@@ -108,7 +108,7 @@ def write(folder, make, made):
 
 
 def deserialized(path, topic='/imu/a'):
-    """Give stamp, rate and acceleration of each message, one by one through `rosbags`."""
+    """Return stamp, rate and acceleration of each message, deserialized by `rosbags`."""
     rows = []
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages(
@@ -142,10 +142,10 @@ def test_samples_are_those_that_rosbags_deserializes(make, topic, tmp_path):
 def test_messages_of_another_sensor_are_refused_until_one_is_chosen(make, names, calibration,
                                                                     tmp_path):
     path = write(tmp_path, make, messages(20, frame_ids=names * 50 + names[1:] * 100))
-    says = f"/imu/a: message 2 is of the sensor '{names[1]}', those before it are of '{names[0]}'"
-    with pytest.raises(InputError, match=says):
+    message = f"/imu/a: message 2 is from the sensor '{names[1]}', expected '{names[0]}' as before"
+    with pytest.raises(InputError, match=message):
         read_recording(path, '/imu/a')
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
     found = read_recording(path, '/imu/a', names[1])
@@ -176,17 +176,17 @@ def calibration():
 
 @pytest.mark.parametrize('turned', [False, True])
 @pytest.mark.parametrize('make', MAKES)
-def test_a_corrected_bag_holds_all_else_as_it_was(make, turned, calibration, tmp_path):
+def test_a_corrected_bag_keeps_all_other_content(make, turned, calibration, tmp_path):
     if turned:
         model = replace(calibration.model, rotation=rotation_from_rpy(0.2, -0.4, 1.0))
         calibration = replace(calibration, model=model)
     shuffled = make not in ('no chunks', 'no summary', 'split')
     path = write(tmp_path, make, messages(4, shuffled=shuffled))
-    told = []
+    calls = []
     count = correct_bag(path, calibration, tmp_path / 'out', '/imu/a',
-                        lambda done, of: told.append((done, of)))
+                        lambda done, of: calls.append((done, of)))
     assert count == COUNT
-    assert told[-1] == (COUNT, COUNT) or make == 'split'  # whose metadata count the first file
+    assert calls[-1] == (COUNT, COUNT) or make == 'split'  # whose metadata count the first file
     with AnyReader([path]) as before, AnyReader([tmp_path / 'out']) as after:
         pairs = zip(before.messages(), after.messages(), strict=True)
         for (c0, t0, raw0), (c1, t1, raw1) in pairs:
@@ -211,7 +211,7 @@ def test_a_corrected_bag_holds_all_else_as_it_was(make, turned, calibration, tmp
 
 
 def records_in(data):
-    """Give (code, place, content) of each record."""
+    """Yield code, place and content of each record."""
     found, place = [], 8
     while place < len(data) - 8:
         code, size = struct.unpack_from('<BQ', data, place)
@@ -243,17 +243,17 @@ def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
     lambda raw: b'', lambda raw: raw[:100], lambda raw: raw[:-8], lambda raw: raw + bytes(8),
     lambda raw: raw[:12] + b'\xff' * 4 + raw[16:], lambda raw: b'\x00\x03' + raw[2:]],
     ids=['empty', 'short', 'a double less', 'a double more', 'long frame_id', 'parameter list'])
-def test_a_broken_message_is_told_in_one_line(make, spoil, calibration, tmp_path):
+def test_a_damaged_message_is_reported_in_one_line(make, spoil, calibration, tmp_path):
     made = list(messages(9))
     which = [k for k, (channel, _, _) in enumerate(made) if channel == 0][100]
     broken = spoil(made[which][2])
     made[which] = (0, made[which][1], broken)
     path = write(tmp_path, make, made)
-    says = f'/imu/a: message 101, of {len(broken)} bytes, is not whole'
-    with pytest.raises(InputError, match=says) as refusal:
+    message = f'/imu/a: message 101 of {len(broken)} bytes is damaged'
+    with pytest.raises(InputError, match=message) as refusal:
         read_recording(path, '/imu/a')
     assert '\n' not in str(refusal.value)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
     assert len(read_recording(path, '/imu/b')) == COUNT
@@ -261,38 +261,38 @@ def test_a_broken_message_is_told_in_one_line(make, spoil, calibration, tmp_path
 
 @pytest.mark.parametrize('make', ['mcap', 'lz4', 'zstd', 'no summary'])
 @pytest.mark.parametrize('share', [0.2, 0.5, 0.8])
-def test_a_damaged_chunk_is_told_in_one_line(make, share, calibration, tmp_path):
+def test_a_damaged_chunk_is_reported_in_one_line(make, share, calibration, tmp_path):
     path = write(tmp_path, make, messages(10))
     data = bytearray(path.read_bytes())
     _, place, content = [each for each in records_in(data) if each[0] == 6][-1]
     start = place + 9 + int(share * len(content))
     data[start:start + 64] = b'\xa5' * 64
     path.write_bytes(data)
-    with pytest.raises(InputError, match='is not a whole bag') as refusal:
+    with pytest.raises(InputError, match='is damaged or not a bag') as refusal:
         read_recording(path, '/imu/a')
     assert '\n' not in str(refusal.value)
-    with pytest.raises(InputError, match='is not a whole bag'):
+    with pytest.raises(InputError, match='is damaged or not a bag'):
         correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
 @pytest.mark.parametrize('make', ['mcap', 'no chunks', 'sqlite3', 'zstd by rosbags'])
 @pytest.mark.parametrize('share', [0.001, 0.1, 0.5, 0.9])
-def test_a_file_that_is_cut_short_is_told_in_one_line(make, share, calibration, tmp_path):
+def test_a_truncated_file_is_reported_in_one_line(make, share, calibration, tmp_path):
     path = write(tmp_path, make, messages(13))
     file = path if path.is_file() else next(path.glob('*[p3]'))
     data = file.read_bytes()
     file.write_bytes(data[:int(share * len(data))])
     for each in {path, file}:
-        with pytest.raises(InputError, match='is not a whole bag') as refusal:
+        with pytest.raises(InputError, match='is damaged or not a bag') as refusal:
             read_recording(each, '/imu/a')
         assert '\n' not in str(refusal.value)
-        with pytest.raises(InputError, match='is not a whole bag'):
+        with pytest.raises(InputError, match='is damaged or not a bag'):
             correct_bag(each, calibration, tmp_path / 'out', '/imu/a')
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_topic_without_messages_is_told_in_one_line(tmp_path, calibration):
+def test_a_topic_without_messages_is_reported_in_one_line(tmp_path, calibration):
     for make in ('mcap', 'sqlite3'):
         path = write(tmp_path, make, [each for each in messages(11) if each[0]])
         with pytest.raises(InputError, match='has no message on /imu/a'):
@@ -301,7 +301,7 @@ def test_a_topic_without_messages_is_told_in_one_line(tmp_path, calibration):
             correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
 
 
-def test_blocks_give_the_poses_of_the_whole(tmp_path, monkeypatch):
+def test_poses_do_not_depend_on_the_size_of_blocks(tmp_path, monkeypatch):
     rng = np.random.default_rng(12)
     recording = simulate_recording(sensor(rng), spread_directions(8), rng, dwell=2.0, turn=0.5)
     made = []

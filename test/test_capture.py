@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recordings to poses: real files, repeated poses, long dwells, bad input."""
+"""From recordings to poses: real files, repeated poses, long dwells, invalid input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def real(name: str) -> Recording:
 
 
 def visited(directions, seed=0, seconds=3.0, noise=2e-3) -> Recording:
-    """Give a recording at 100 Hz that rests in these directions, with a shake in between."""
+    """Return a recording at 100 Hz with rests in these directions, and shaking in between."""
     rng = np.random.default_rng(seed)
     parts = []
     for direction in directions:
@@ -71,7 +71,7 @@ def test_poses_of_real_recordings_are_found_without_the_gyro(name, unit, poses):
     assert len(result.poses) == poses
 
 
-def test_streaming_a_real_recording_gives_the_same_poses():
+def test_streaming_a_real_recording_finds_the_same_poses():
     samples = real('mpu9150_imu1.csv')
     detector = StillDetector(CaptureSettings(), units_of('m/s2'))
     table = np.column_stack([samples['time'], samples.reading, samples['rate'],
@@ -93,7 +93,7 @@ def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation():
     assert 'orientation' not in result.poses
 
 
-def test_max_dwell_cuts_a_dwell_of_changing_temperature():
+def test_max_dwell_splits_a_dwell_of_changing_temperature():
     result = capture(real('sensehat_lsm9ds1_temperature.csv'), G, CaptureSettings(max_dwell=3600))
     poses = result.poses
     assert 60 < len(poses) < 80
@@ -146,7 +146,7 @@ def test_a_recording_of_a_few_samples_has_no_poses(rows):
     assert result.samples == 0
 
 
-def test_stamps_that_stand_still_are_reported_and_give_no_pose():
+def test_stamps_that_stop_are_reported_and_make_no_pose():
     samples = recording(time=np.zeros(250_000), reading=np.tile([0.0, 0.0, 1.0], (250_000, 1)))
     result = capture(samples, G)
     assert len(result.poses) == 0

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: results, JSON, and one line for bad input."""
+"""The command line: results, JSON, and one line for invalid input."""
 
 import json
 import subprocess
@@ -59,7 +59,7 @@ def test_fit_finds_the_effects_that_were_simulated(poses, capsys):
 
 
 @pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
-def test_fit_tells_the_next_pose_until_more_no_longer_pay(model, tmp_path, capsys):
+def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_path, capsys):
     few, many = tmp_path / 'few.csv', tmp_path / 'many.csv'
     run('simulate', '-o', few, '--poses', 12)
     run('simulate', '-o', many, '--poses', 30)
@@ -70,28 +70,28 @@ def test_fit_tells_the_next_pose_until_more_no_longer_pay(model, tmp_path, capsy
     result = run_json(capsys, 'fit', many, '--model', model)[1]
     assert result['next_pose'] is None
     assert run('fit', many, '--model', model) == 0
-    assert (f'next pose: more poses no longer help: 30 poses determine |a| to '
+    assert (f'next pose: more poses no longer help: 30 poses determine |a| to within '
             f'{result["uncertainty_mg"]:.2g} mg' in capsys.readouterr().out) or model == 'auto'
 
 
-def test_fit_tells_what_six_faces_do_not_determine(tmp_path, capsys):
+def test_fit_reports_what_six_faces_do_not_determine(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
     rows = [f'{sign * 9.8 * (k == 0) + 0.2},{sign * 9.8 * (k == 1)},{sign * 9.8 * (k == 2)}'
             for k in range(3) for sign in (1, -1, 1.001, -1.001)]
     path.write_text('\n'.join(['ax,ay,az', *rows]) + '\n', encoding='utf-8')
     status, result = run_json(capsys, 'fit', path)
-    told = result['identifiability']
-    assert (status, told['model'], told['dilution']) == (0, '10', None)
-    unseen = [name for name, each in told['parameters'].items() if not each['determined']]
+    found = result['identifiability']
+    assert (status, found['model'], found['dilution']) == (0, '10', None)
+    unseen = [name for name, each in found['parameters'].items() if not each['determined']]
     assert unseen == ['cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz']
-    assert [each['words'] for each in told['undetermined']] == unseen
-    assert told['undetermined'][0]['weights']['cross_axis.xy'] == pytest.approx(1.0, abs=1e-3)
-    assert told['parameters']['offset.x']['dilution'] < 1.0
+    assert [each['words'] for each in found['undetermined']] == unseen
+    assert found['undetermined'][0]['weights']['cross_axis.xy'] == pytest.approx(1.0, abs=1e-3)
+    assert found['parameters']['offset.x']['dilution'] < 1.0
 
 
 @pytest.mark.parametrize(('model', 'keys'), [('9', {'shifts', 'scales', 'angles'}),
                                              ('12', {'matrix', 'shift'})])
-def test_fit_adds_the_reports_own_names(model, keys, tmp_path, capsys):
+def test_fit_adds_the_names_of_the_report(model, keys, tmp_path, capsys):
     path = tmp_path / 'poses.csv'
     run('simulate', '-o', path, *EFFECTS, '--reference')
     capsys.readouterr()
@@ -147,7 +147,7 @@ def test_a_recording_is_captured_fitted_and_corrected(tmp_path, capsys):
     np.testing.assert_allclose(lengths, 9.80665, atol=0.01)
 
 
-def test_several_tables_give_a_list_in_their_order(tmp_path, capsys):
+def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     tables = []
     for seed in range(3):
         tables.append(tmp_path / f'{seed}.csv')
@@ -176,7 +176,7 @@ def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
     assert status == 2
     assert set(result) == {'error', 'advice'}
     assert 'turn the sensor so that' in result['advice']
-    assert printed.err.startswith('accel-calib fit: 5 poses, model 10 needs')
+    assert printed.err.startswith('accel-calib fit: 5 poses, expected at least 9 poses')
     assert printed.err.count('\n') == 1
 
 
@@ -186,17 +186,18 @@ def bad_table(folder, text):
     return path
 
 
-@pytest.mark.parametrize(('text', 'says'), [
+@pytest.mark.parametrize(('text', 'message'), [
     ('', 'is empty'), ('ax,ay,az\n1,2,x\n', "'x', expected a finite number"),
-    ('ax,ay,az\n' + '9000,100,16000\n' * 12, 'units of the readings: native'),
+    ('ax,ay,az\n' + '9000,100,16000\n' * 12, 'units of the readings to native'),
     ('ax,ay,az\n' + '0,0,9.8\n' * 12, 'all have the same orientation'),
 ])
-def test_a_bad_table_leaves_what_was_stored(text, says, calibration, tmp_path, capsys):
+def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibration, tmp_path,
+                                                          capsys):
     stored = calibration.read_text()
     capsys.readouterr()
     assert run('fit', bad_table(tmp_path, text), '-o', calibration) == 2
     printed = capsys.readouterr()
-    assert says in printed.err
+    assert message in printed.err
     assert printed.err.count('\n') == 1
     assert printed.out == ''
     assert calibration.read_text() == stored
@@ -240,10 +241,10 @@ def test_a_newer_calibration_is_refused(calibration, poses, capsys):
     calibration.write_text(calibration.read_text().replace('version: 2\n', 'version: 7\n'))
     capsys.readouterr()
     assert run('verify', poses, '-c', calibration) == 2
-    assert 'has version 7, this package reads up to 2' in capsys.readouterr().err
+    assert 'has version 7, expected 2 or less' in capsys.readouterr().err
 
 
-def test_stored_calibration_says_whose_it_is(calibration):
+def test_stored_calibration_names_its_sensor(calibration):
     found = read_calibration(calibration)
     assert found.sensor == 'imu_link'
     assert found.date[:2] == '20'
@@ -291,11 +292,11 @@ def test_only_what_is_used_is_imported(arguments, without, poses):
 
 
 @pytest.mark.parametrize('terminal', [True, False])
-def test_progress_is_shown_on_a_terminal_alone(terminal, monkeypatch, capsys):
+def test_progress_is_shown_only_on_a_terminal(terminal, monkeypatch, capsys):
     monkeypatch.setenv('TERM', 'xterm')
     monkeypatch.setattr(sys.stderr, 'isatty', lambda: terminal)
-    with progress('samples') as told:
-        told(500, 1000)
+    with progress('samples') as update:
+        update(500, 1000)
     shown = capsys.readouterr()
     assert shown.out == ''
     assert ('500 of 1,000 samples' in shown.err) is terminal
@@ -307,7 +308,7 @@ def test_json_holds_no_nan():
         'a': [1.0, None], 'b': [None, None]}
 
 
-def test_disturbed_row_is_named(poses, capsys):
+def test_outlier_is_reported_with_its_row(poses, capsys):
     table = read_poses(poses)
     reading = table.reading.copy()
     reading[6] *= 1.05

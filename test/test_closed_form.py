@@ -20,7 +20,7 @@ NAMES = ('4', '7', '10')
 @pytest.mark.parametrize('name', NAMES)
 @pytest.mark.parametrize(('scale', 'shift'), [(1.0, 0.0), (9.81, 0.0), (4060.0, 33000.0),
                                               (0.3468, 1.775), (1e-6, 5e-6)])
-def test_exact_poses_give_the_sensor_back_in_any_unit(name, scale, shift):
+def test_exact_poses_recover_the_sensor_in_any_unit(name, scale, shift):
     model = sensor(np.random.default_rng(4), *MODELS[name])
     reading = predict(model, spread_directions(14), {}) * scale + shift
     mat_w, vec_v = closed_form(name, reading)
@@ -48,7 +48,7 @@ def test_poses_on_a_hyperboloid_are_refused(method):
     reading = np.vstack([surface, surface * [1, 1, -1]])
     assert not np.any(np.isfinite(closed_form('10', reading)[0]))
     poses = Poses({'reading': reading}, np.arange(1, len(reading) + 1))
-    with pytest.raises(RefusedFitError, match='lie on no'):
+    with pytest.raises(RefusedFitError, match='not on an ellipsoid'):
         fit_poses(poses, units_of('g'), model='10', method=method)
 
 

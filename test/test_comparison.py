@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Repeat runs: calibrations of one sensor agree, and those of a sensor that changed do not."""
+"""Comparison: calibrations of one sensor agree, and those of a changed sensor do not."""
 
 from dataclasses import replace
 import json
@@ -58,7 +58,7 @@ def test_runs_of_one_sensor_agree(count, sets, measured):
     assert alarms <= 0.1 * sets
 
 
-def test_twenty_runs_spread_as_they_state():
+def test_the_spread_of_twenty_runs_matches_their_uncertainty():
     rng = np.random.default_rng(1001)
     found = compare(runs_of(sensor(rng), rng, 20, 24))
     assert found.agree
@@ -71,7 +71,7 @@ def test_twenty_runs_spread_as_they_state():
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
-def test_a_milli_g_in_one_run_is_found_and_the_run_named(axis):
+def test_a_change_of_1_mg_in_one_run_is_found_and_the_run_is_named(axis):
     rng = np.random.default_rng(axis)
     model = sensor(rng)
     runs = runs_of(model, rng, 5, 20)
@@ -84,7 +84,7 @@ def test_a_milli_g_in_one_run_is_found_and_the_run_named(axis):
     assert found.runs[3].largest_mg == pytest.approx(1.0, abs=0.6)
 
 
-def test_of_two_neither_is_named():
+def test_of_two_runs_that_differ_neither_is_named():
     rng = np.random.default_rng(7)
     model = sensor(rng)
     found = compare(runs_of(model, rng, 1, 24)
@@ -98,11 +98,11 @@ def test_rotation_free_parameters_are_those_of_any_axes():
     poses = poses_of(sensor(rng), rng, 20)
     nine, ten = (fit_poses(poses, G, model=name) for name in ('9', '10'))
     turned = level(nine, poses.reading[4], 'ros')
-    told = [rotation_free(run, {}, 1.0) for run in (nine, ten, turned)]
-    for other in told[1:]:
-        np.testing.assert_allclose(other.values, told[0].values, atol=1e-7)
+    free = [rotation_free(run, {}, 1.0) for run in (nine, ten, turned)]
+    for other in free[1:]:
+        np.testing.assert_allclose(other.values, free[0].values, atol=1e-7)
     spread = [one.slope @ run.covariance @ one.slope.T
-              for one, run in zip(told, (nine, ten), strict=False)]
+              for one, run in zip(free, (nine, ten), strict=False)]
     np.testing.assert_allclose(spread[0], spread[1], rtol=1e-3, atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.diag(spread[1])[:3]), ten.offset_sd, rtol=1e-6)
 
@@ -113,14 +113,14 @@ def test_slope_of_the_rotation_free_parameters_is_their_derivative():
     poses = simulate_poses(sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment'),
                            directions, rng, context={'reference': directions})
     run = fit_poses(poses, G)
-    told = rotation_free(run, {}, 1.0)
-    for k, column in enumerate(told.slope.T):
+    free = rotation_free(run, {}, 1.0)
+    for k, column in enumerate(free.slope.T):
         values = run.model.vector.copy()
         values[k] += 1e-6
         sizes = np.cumsum([len(part) for part in run.model.values.values()])[:-1]
         moved = replace(run, model=Model(dict(zip(run.model.effects, np.split(values, sizes),
                                                   strict=True))))
-        change = (rotation_free(moved, {}, 1.0).values - told.values) / 1e-6
+        change = (rotation_free(moved, {}, 1.0).values - free.values) / 1e-6
         np.testing.assert_allclose(change, column, atol=1e-5)
 
 
@@ -142,14 +142,14 @@ def test_models_with_other_axes_agree(first, second):
     assert alarms <= 1
 
 
-def test_a_model_that_leaves_out_what_is_there_does_not_agree_and_it_is_said():
+def test_a_model_that_omits_an_existing_effect_does_not_agree_and_a_note_names_it():
     rng = np.random.default_rng(5)
     model = sensor(rng)
     runs = runs_of(model, rng, 1, name='7') + runs_of(model, rng, 2)
     found = compare(runs)
     assert not found.agree
     assert found.outlier == 0
-    assert any('run 1 (model 7) leaves out what model 10 finds' in note for note in found.notes)
+    assert any('run 1 (model 7) omits parameters of model 10' in note for note in found.notes)
 
 
 def test_smaller_models_agree_where_they_are_right():
@@ -160,7 +160,7 @@ def test_smaller_models_agree_where_they_are_right():
     assert found.dof == 2 * 9
 
 
-def test_auto_that_takes_now_a_smaller_and_now_a_larger_model_raises_no_alarm():
+def test_runs_with_different_models_by_auto_agree():
     alarms, models = 0, set()
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -173,13 +173,13 @@ def test_auto_that_takes_now_a_smaller_and_now_a_larger_model_raises_no_alarm():
     assert alarms <= 2
 
 
-def test_a_smaller_model_whose_poses_carry_no_larger_one_counts_as_sure():
+def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one():
     rng = np.random.default_rng(16)
     model = sensor(rng, 'offset', 'gain')
     found = compare([*runs_of(model, rng, 1, 6, '4'), *runs_of(model, rng, 1, 24)])
     assert found.agree
     assert found.dof == 9
-    assert any('gain.xy, gain.xz, gain.yz: left out by the model of run 1' in note
+    assert any('the model of run 1 omits gain.xy, gain.xz, gain.yz' in note
                for note in found.notes)
 
 
@@ -195,7 +195,7 @@ def test_metres_and_g_are_converted():
     assert found.parameters[0].values[1] == pytest.approx(model.values['offset'][0], abs=1e-3)
 
 
-def test_native_runs_agree_though_each_has_a_scale_of_its_own():
+def test_native_runs_agree_although_their_scales_differ():
     rng = np.random.default_rng(1009)
     model, counts = sensor(rng), Units('native', 4060.0)
 
@@ -230,7 +230,7 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
     assert any('taken at 1' in note and 'temperature' in note for note in found.notes)
 
 
-def test_shared_poses_are_told():
+def test_shared_poses_cause_a_note():
     rng = np.random.default_rng(11)
     model = sensor(rng)
     poses = [poses_of(model, rng, 14) for _ in range(2)]
@@ -238,11 +238,11 @@ def test_shared_poses_are_told():
             ((poses[0], '10'), (poses[0], '7'), (poses[1], '10'))]
     notes = compare(runs).notes
     assert [note for note in notes if 'share' in note] == [
-        'runs 1 and 2 share the same poses: they are not independent, and that they agree says '
+        'runs 1 and 2 share all their poses: they are not independent, so their agreement means '
         'little']
 
 
-def test_levelled_runs_are_compared_in_what_is_up():
+def test_levelled_runs_are_compared_in_the_direction_of_up():
     rng = np.random.default_rng(12)
     model = sensor(rng)
     runs = runs_of(model, rng, 2, 20)
@@ -255,18 +255,18 @@ def test_levelled_runs_are_compared_in_what_is_up():
 
 @pytest.mark.parametrize(('change', 'message'), [
     ({'sensor': 'other'}, 'of the sensors imu and other'),
-    ({'units': Units('native', 400.0)}, 'run 2 is in native units, another in g'),
+    ({'units': Units('native', 400.0)}, 'run 2 is in native units and another run in g'),
     ({'covariance': np.full((9, 9), np.nan)}, 'run 2 has no uncertainty')])
-def test_what_cannot_be_compared_is_refused(change, message):
+def test_calibrations_that_cannot_be_compared_are_refused(change, message):
     rng = np.random.default_rng(13)
     run = replace(runs_of(sensor(rng), rng, 1)[0], sensor='imu')
     with pytest.raises(InputError, match=message):
         compare([run, replace(run, **change)])
-    with pytest.raises(InputError, match='nothing to compare'):
+    with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
         compare([run])
 
 
-def test_the_command_answers_by_its_exit_status(tmp_path, capsys):
+def test_the_exit_status_of_compare_is_its_answer(tmp_path, capsys):
     rng = np.random.default_rng(14)
     model = sensor(rng)
     runs = [*runs_of(model, rng, 3, 20), *runs_of(with_offset(model, 0, 3e-3), rng, 1, 20)]
@@ -274,17 +274,17 @@ def test_the_command_answers_by_its_exit_status(tmp_path, capsys):
     for path, run in zip(paths, runs, strict=True):
         write_calibration(path, run)
 
-    def told(*which):
+    def result_of(*which):
         status = main(['compare', *(str(paths[k]) for k in which), '--json', '-'])
         return status, json.loads(capsys.readouterr().out)
 
-    status, result = told(0, 1, 2)
+    status, result = result_of(0, 1, 2)
     assert (status, result['agree'], result['outlier']) == (0, True, None)
-    status, result = told(0, 3, 1, 2)
+    status, result = result_of(0, 3, 1, 2)
     assert (status, result['agree'], result['outlier']) == (1, False, 2)
     assert result['runs'][1]['file'] == str(paths[3])
     assert set(result) == {'agree', 'p_value', 'chi2', 'dof', 'outlier', 'runs', 'parameters',
                            'tilt_deg', 'notes'}
-    status, result = told(0)
+    status, result = result_of(0)
     assert status == 2
     assert set(result) == {'error', 'advice'}

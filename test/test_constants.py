@@ -3,6 +3,8 @@
 
 """Constants that decide results: each test fails if its constant changes by a factor of ten."""
 
+from itertools import pairwise
+
 from accel_calib.capture import capture
 from accel_calib.effects import EFFECTS
 from accel_calib.refine import refine
@@ -40,7 +42,7 @@ def candidate(name, falls_by, parameters):
 
 
 @pytest.mark.parametrize(('ahead', 'chosen'), [(3.0, 'supply_ratio'), (7.5, 'cross_coupling')])
-def test_of_effects_that_are_as_good_the_smaller_is_chosen(ahead, chosen):
+def test_among_equally_good_effects_the_smaller_one_is_chosen(ahead, chosen):
     """``_AS_GOOD``."""
     small, part = candidate('supply_ratio', 50.0, 4)
     large, whole = candidate('cross_coupling', 50.0 + ahead, 6)
@@ -60,7 +62,7 @@ def test_time_constants_are_tried_closely_and_not_more_closely():
     shapes = list(EFFECTS['warm_up'].shapes({'time': time}))
     taus = np.array([shape[1] for shape in shapes])
     worst = 0.0
-    for one, other in zip(taus, taus[1:], strict=False):
+    for one, other in pairwise(taus):
         if one < 300.0 or other > 1800.0:
             continue
         true = np.exp(-time / np.sqrt(one * other))
@@ -71,7 +73,7 @@ def test_time_constants_are_tried_closely_and_not_more_closely():
 
 
 @pytest.mark.parametrize(('unknown_mg', 'named'), [(1.0, ['quadratic']), (2.5, [])])
-def test_names_that_explain_a_small_part_of_a_gap_are_taken_back(unknown_mg, named):
+def test_effects_that_explain_a_small_part_of_a_gap_are_removed(unknown_mg, named):
     """``_LEAST_SHARE``."""
     rng = np.random.default_rng(4)
     model = model_with({'offset': [0.02, -0.01, 0.03], 'quadratic': [0.005, -0.005, 0.005]})

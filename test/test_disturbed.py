@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Disturbed poses are found, clean ones are kept."""
+"""Outliers are found, and clean poses are kept."""
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.simulate import simulate_poses
@@ -15,7 +15,7 @@ G = units_of('g')
 
 
 def knocked(seed, count, bad):
-    """Give poses of which the first `bad` are knocked by 50 mg, outwards or inwards."""
+    """Return poses of which the first `bad` are shifted by 50 mg, outwards or inwards."""
     rng = np.random.default_rng(seed)
     poses = simulate_poses(sensor(rng), spread_directions(count), rng)
     reading = poses.reading.copy()
@@ -27,13 +27,13 @@ def left_out(poses, **settings):
     return {each.row for each in fit_poses(poses, G, model='10', **settings).rejected}
 
 
-def test_two_knocked_of_twelve_cost_hardly_a_clean_pose():
+def test_two_knocked_poses_of_twelve_are_found_with_few_clean_poses_lost():
     clean = [len(left_out(knocked(seed, 12, 2)) - {1, 2}) for seed in range(40)]
     assert np.count_nonzero(clean) <= 6
 
 
 @pytest.mark.parametrize('count', [36, 400])
-def test_noise_stated_too_small_throws_nothing_out(count):
+def test_underestimated_noise_makes_no_outliers(count):
     thrown = []
     for seed in range(10):
         poses = knocked(seed, count, 0)
@@ -42,13 +42,13 @@ def test_noise_stated_too_small_throws_nothing_out(count):
 
 
 @pytest.mark.parametrize('count', [100, 400])
-def test_a_fifth_knocked_is_found_whole(count):
+def test_all_outliers_are_found_if_a_fifth_of_the_poses_is_knocked(count):
     bad = count // 5
     poses = knocked(7, count, bad)
     assert left_out(poses) == set(poses.row[:bad].tolist())
 
 
 @pytest.mark.parametrize('count', [40, 400])
-def test_no_more_than_a_quarter_is_ever_left_out(count):
+def test_at_most_a_quarter_of_the_poses_is_left_out(count):
     poses = knocked(8, count, 2 * count // 5)
     assert len(left_out(poses)) <= count // 4

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses to calibration: known sensors recovered inside the stated uncertainty, or refused."""
+"""From poses to a calibration: known sensors are recovered within the stated uncertainty."""
 
 from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
 from accel_calib.errors import InputError, RefusedFitError
@@ -32,7 +32,7 @@ def in_units(poses, units):
 @pytest.mark.parametrize(('name', 'effects'), [
     ('4', ('offset', 'gain')), ('7', ('offset', 'axis_gain')),
     ('10', ('offset', 'axis_gain', 'cross_axis'))])
-def test_stated_deviations_hold_the_truth(name, effects):
+def test_stated_deviations_contain_the_truth(name, effects):
     pulls = []
     for seed in range(40):
         model, poses = simulated(seed, 24, *effects)
@@ -50,9 +50,9 @@ def test_auto_takes_the_model_that_the_sensor_has(model):
     assert names.count(model) >= 17
 
 
-def test_auto_says_why():
+def test_auto_states_the_reason_for_its_choice():
     calibration = fit_poses(simulated(1, 20)[1], G)
-    assert 'model 10 lowers the residual of model 7 from' in calibration.reason
+    assert 'model 10 reduces the residual of model 7 from' in calibration.reason
 
 
 @pytest.mark.parametrize('units', [units_of('m/s2'), units_of('m/s2', 9.78), G])
@@ -132,7 +132,7 @@ def test_algebraic_keeps_every_row():
     assert calibration.rejected == ()
 
 
-def test_noisy_poses_weigh_less():
+def test_noisy_poses_have_less_weight():
     model, poses = simulated(8, 30)
     rng = np.random.default_rng(8)
     std = poses['std'].copy()
@@ -149,7 +149,7 @@ def without(poses, *keys):
     return Poses({key: poses[key] for key in poses.columns if key not in keys}, poses.row)
 
 
-def test_unknown_noise_is_taken_from_the_residuals():
+def test_unknown_noise_is_estimated_from_the_residuals():
     poses = simulated(9, 60)[1]
     known = fit_poses(poses, G, model='10')
     unknown = fit_poses(without(poses, 'std'), G, model='10')
@@ -158,7 +158,7 @@ def test_unknown_noise_is_taken_from_the_residuals():
     assert any('uncertainty comes from the residuals' in text for text in unknown.warnings)
 
 
-def test_held_out_gap_is_that_of_fitting_without_the_pose():
+def test_held_out_residual_is_that_of_a_fit_without_the_pose():
     poses = without(simulated(10, 16)[1], 'std')
     errors = []
     for k in range(16):
@@ -168,7 +168,7 @@ def test_held_out_gap_is_that_of_fitting_without_the_pose():
     assert held_out == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.02)
 
 
-def test_noise_floor_is_the_gap_of_the_right_model():
+def test_noise_floor_is_the_residual_of_the_correct_model():
     gaps, floors = [], []
     for seed in range(30):
         quality = fit_poses(simulated(seed, 24)[1], G, model='10').quality
@@ -200,22 +200,22 @@ FIVE = np.repeat(spread_directions(5), 3, axis=0)
 FACES = np.vstack([np.eye(3), -np.eye(3)])
 
 
-@pytest.mark.parametrize(('directions', 'says'), [
+@pytest.mark.parametrize(('directions', 'message'), [
     (cone(45), 'within'), (RING, 'lie in a plane'), (SAME, 'all have the same orientation'),
-    (FIVE, 'point in 5 directions'), (np.repeat(FACES, 2, axis=0), 'point in 6 directions'),
-    (FACES, '6 poses, model 10 needs at least 9'), (SAME[:1], '1 pose, model 10')])
+    (FIVE, 'have 5 directions'), (np.repeat(FACES, 2, axis=0), 'have 6 directions'),
+    (FACES, '6 poses, expected at least 9 poses .* model 10'), (SAME[:1], '1 pose, expected')])
 @pytest.mark.parametrize('units', ['g', 'm/s2'])
-def test_poses_that_cannot_carry_the_model_are_refused_with_the_way_to_turn(
-        directions, says, units):
+def test_poses_that_do_not_determine_the_model_are_refused_with_advice(
+        directions, message, units):
     rng = np.random.default_rng(12)
     poses = in_units(simulate_poses(sensor(rng), directions, rng), units_of(units))
-    with pytest.raises(RefusedFitError, match=says) as refusal:
+    with pytest.raises(RefusedFitError, match=message) as refusal:
         fit_poses(poses, units_of(units), model='10')
     assert 'turn the sensor so that' in refusal.value.advice
 
 
 @pytest.mark.parametrize('directions', [cone(45), RING, SAME, FACES[:3]])
-def test_poses_in_counts_that_cannot_carry_the_model_are_refused(directions):
+def test_poses_in_counts_that_do_not_determine_the_model_are_refused(directions):
     rng = np.random.default_rng(12)
     poses = simulate_poses(sensor(rng), directions, rng)
     poses = poses.with_columns(reading=poses.reading * 400 + 2000, std=poses['std'] * 400)
@@ -231,24 +231,25 @@ def test_six_faces_are_offered_the_smaller_model():
     assert fit_poses(poses, G).name in ('4', '7')
 
 
-@pytest.mark.parametrize(('scale', 'units', 'says'), [
-    (16384.0, 'm/s2', 'native'), (1.0, 'm/s2', 'readings: g'), (9.81, 'g', 'readings: m/s2')])
-def test_readings_plainly_in_another_unit_are_refused(scale, units, says):
+@pytest.mark.parametrize(('scale', 'units', 'message'), [
+    (16384.0, 'm/s2', 'native'), (1.0, 'm/s2', 'readings to g'),
+    (9.81, 'g', 'readings to m/s2')])
+def test_readings_clearly_in_another_unit_are_refused(scale, units, message):
     poses = simulated(14, 20)[1]
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         fit_poses(poses.with_columns(reading=poses.reading * scale), units_of(units))
 
 
 def placed(seed, degrees, count=12, **settings):
-    """Six faces and more, each turned by so much from where it is said to be."""
+    """Return a sensor, and poses that are rotated from their stated orientation."""
     rng = np.random.default_rng(seed)
-    said = np.vstack([FACES, spread_directions(count - 6)]) if count > 6 else FACES
-    across = np.cross(said, random_directions(count, rng))
+    stated = np.vstack([FACES, spread_directions(count - 6)]) if count > 6 else FACES
+    across = np.cross(stated, random_directions(count, rng))
     angle = np.radians(degrees)
-    real = said * np.cos(angle) + np.sin(angle) * across / np.linalg.norm(
+    real = stated * np.cos(angle) + np.sin(angle) * across / np.linalg.norm(
         across, axis=1, keepdims=True)
     model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
-    return model, simulate_poses(model, real, rng, **settings).with_columns(reference=said)
+    return model, simulate_poses(model, real, rng, **settings).with_columns(reference=stated)
 
 
 def error_mg(calibration, model):
@@ -257,7 +258,7 @@ def error_mg(calibration, model):
 
 
 @pytest.mark.parametrize('model', ['auto', '12'])
-def test_badly_placed_orientations_give_way_to_the_norm(model):
+def test_badly_placed_orientations_are_replaced_by_a_fit_of_the_norm(model):
     found, errors, turned = [], [], []
     for seed in range(20):
         truth, poses = placed(seed, 2.0)
@@ -267,18 +268,18 @@ def test_badly_placed_orientations_give_way_to_the_norm(model):
         across = calibration.correct(predict(truth, np.eye(3), {}))
         turned.append(np.degrees(np.max(np.abs(across - across.T)) / 2))
     assert found == ['10'] * 20
-    assert 'uses |force| = 1 g alone' in calibration.warnings[0]
-    assert '° (RMS) off' in calibration.reason
+    assert 'uses only |force| = 1 g' in calibration.warnings[0]
+    assert '° (RMS) from a fit' in calibration.reason
     assert np.median(errors) < 0.4
     assert np.median(turned) < 1.0  # the axes follow the orientations, on average
 
 
-def test_one_misplaced_pose_is_named_and_does_not_turn_the_axes():
+def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
     truth, poses = placed(3, 0.0)
-    said = poses['reference'].copy()
-    said[4] = said[[4]] @ rotation_from_rpy(0.2, 0.0, 0.0).T
-    calibration = fit_poses(poses.with_columns(reference=said), G)
-    assert 'the most in row 5' in calibration.reason
+    stated = poses['reference'].copy()
+    stated[4] = stated[[4]] @ rotation_from_rpy(0.2, 0.0, 0.0).T
+    calibration = fit_poses(poses.with_columns(reference=stated), G)
+    assert 'most in row 5' in calibration.reason
     np.testing.assert_allclose(calibration.correct(predict(truth, np.eye(3), {})), np.eye(3),
                                atol=4e-3)
 
@@ -292,7 +293,7 @@ def test_well_placed_orientations_are_used(noise_g):
 def test_six_faces_alone_warn_of_their_placement():
     calibration = fit_poses(placed(1, 2.0, 6)[1], G)
     assert calibration.name == '12'
-    assert any('off the given orientations' in text for text in calibration.warnings)
+    assert any('from the known orientations' in text for text in calibration.warnings)
     assert not fit_poses(placed(1, 0.0, 6)[1], G).warnings
 
 
@@ -302,7 +303,7 @@ def test_model_12_without_orientations_is_refused():
 
 
 @pytest.mark.parametrize('frame', ['ros', 'ned', 'android', 'win8'])
-def test_levelled_calibration_gives_flat_in_its_frame(frame):
+def test_levelled_calibration_reads_flat_in_its_frame(frame):
     rng = np.random.default_rng(16)
     tilted = rotation_from_rpy(0.3, -0.2, 1.0) @ np.array([0.0, 0.0, 1.0])
     model, poses = simulated(16, 30)
@@ -349,7 +350,7 @@ def test_readings_without_any_noise_are_fitted(model):
     assert outlook(calibration, model).uncertainty_mg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_auto_with_as_many_poses_as_parameters_says_that_nothing_is_left():
+def test_auto_with_as_many_poses_as_parameters_warns():
     calibration = fit_poses(simulated(9, 9)[1], G, model='10')
-    assert 'just as many poses as free parameters' in ' '.join(calibration.warnings)
+    assert 'only as many poses as free parameters' in ' '.join(calibration.warnings)
     assert fit_poses(simulated(9, 9)[1], G).name in ('4', '7', '10')

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""No wrong calibration: bad rows, absurd numbers and edited files never pass for a result."""
+"""The gate: bad rows, absurd numbers and edited files never lead to a wrong calibration."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -11,8 +11,8 @@ from pathlib import Path
 from accel_calib.calibrate import fit_poses, gated
 from accel_calib.cli.main import main
 from accel_calib.errors import AccelCalibError, RefusedFitError, StoredCalibrationError
-from accel_calib.files import format_calibration, parse_calibration, read_calibration, read_poses
-from accel_calib.files.calibration_yaml import EDITED
+from accel_calib.files import read_calibration, read_poses
+from accel_calib.files.calibration_yaml import EDITED, format_calibration, parse_calibration
 from accel_calib.model import Model, predict
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, spread_directions
@@ -63,7 +63,7 @@ def test_a_bad_row_among_real_poses_is_left_out_and_named(name, row):
 
 
 def bad_row(rng, reading, kind):
-    """Make a row that has nothing to do with the poses."""
+    """Return a row that is unrelated to the poses."""
     k = rng.integers(len(reading))
     return {'zeros': np.zeros(3), 'any': rng.normal(size=3) * 10.0 ** rng.uniform(-2, 3),
             'other unit': reading[k] / 9.80665, 'swapped': reading[k][[1, 0, 2]],
@@ -75,7 +75,7 @@ def bad_row(rng, reading, kind):
 @pytest.mark.parametrize('kind', ['zeros', 'any', 'other unit', 'swapped', 'upside down', 'off',
                                   'huge'])
 @pytest.mark.parametrize('with_noise', [True, False])
-def test_one_bad_row_never_moves_the_result_silently(kind, with_noise):
+def test_one_bad_row_never_changes_the_result_without_a_warning(kind, with_noise):
     for seed in range(12):
         rng = np.random.default_rng((seed, 9))
         count, model = int(rng.integers(12, 30)), sensor(rng)
@@ -98,7 +98,7 @@ def test_one_bad_row_never_moves_the_result_silently(kind, with_noise):
 
 @pytest.mark.parametrize('value', [1e150, -1e300, 1e20, 1e6])
 @pytest.mark.parametrize('model', ['auto', '4', '7', '9', '10'])
-def test_an_absurd_cell_is_left_out_or_refused_in_words(value, model):
+def test_an_absurd_cell_is_left_out_or_refused_with_a_message(value, model):
     reading = TWELVE.copy()
     reading = np.vstack([reading, reading[3]])
     reading[12, 1] = value
@@ -119,7 +119,7 @@ def test_an_absurd_deviation_is_left_out_and_named(value):
     assert 'not at rest' in found.rejected[0].reason
 
 
-def test_what_is_no_sphere_at_all_is_refused_in_words():
+def test_poses_that_are_not_on_a_sphere_are_refused_with_a_message():
     rng = np.random.default_rng(3)
     for _ in range(20):
         reading = rng.normal(size=(int(rng.integers(6, 20)), 3)) * 6.0
@@ -134,40 +134,40 @@ def calibration():
     return fit_poses(poses, G, model='10', sensor='imu')
 
 
-@pytest.mark.parametrize(('values', 'says'), [
+@pytest.mark.parametrize(('values', 'message'), [
     ({'axis_gain': [-1.0, 0.0, 0.0]}, 'singular or a mirror image'),
     ({'axis_gain': [-2.0, 0.0, 0.0]}, 'singular or a mirror image'),
-    ({'axis_gain': [30.0, 0.0, 0.0]}, 'no ellipsoid of an accelerometer'),
+    ({'axis_gain': [30.0, 0.0, 0.0]}, 'not on an ellipsoid of an accelerometer: the gains are'),
     ({'offset': [50.0, 0.0, 0.0]}, 'zero-g offset is 50 g'),
-    ({'cross_axis': [0.9, 0.9, 0.9]}, 'singular or a mirror image|no ellipsoid'),
+    ({'cross_axis': [0.9, 0.9, 0.9]}, 'singular or a mirror image|not on an ellipsoid'),
 ])
-def test_values_that_no_accelerometer_has_are_refused(values, says, calibration):
+def test_values_that_no_accelerometer_has_are_refused(values, message, calibration):
     changed = {name: np.array(part) for name, part in {**calibration.model.values,
                                                        **values}.items()}
-    with pytest.raises(RefusedFitError, match=says):
+    with pytest.raises(RefusedFitError, match=message):
         gated(replace(calibration, model=Model(changed)))
 
 
-@pytest.mark.parametrize(('change', 'says'), [
+@pytest.mark.parametrize(('change', 'message'), [
     (lambda c: -c, 'positive semidefinite'),
     (lambda c: c * np.where(np.eye(9) > 0, 1.0, 1e3), 'positive semidefinite'),
     (lambda c: c + np.triu(np.full((9, 9), 1.0), 1) * c[0, 0], 'symmetric'),
-    (lambda c: c * np.nan, 'not a finite number'),
+    (lambda c: c * np.nan, 'covariance that is not finite'),
     (lambda c: c * 1e9, 'do not determine the calibration'),
 ])
-def test_a_covariance_that_is_none_is_refused(change, says, calibration):
-    with pytest.raises(RefusedFitError, match=says):
+def test_an_invalid_covariance_is_refused(change, message, calibration):
+    with pytest.raises(RefusedFitError, match=message):
         gated(replace(calibration, covariance=change(calibration.covariance)))
 
 
 @pytest.mark.parametrize('rotation', [np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.01,
                                       np.zeros((3, 3))])
-def test_a_mounting_that_is_no_rotation_is_refused(rotation, calibration):
-    with pytest.raises(RefusedFitError, match='not a rotation'):
+def test_a_mounting_that_is_not_a_rotation_is_refused(rotation, calibration):
+    with pytest.raises(RefusedFitError, match='expected a rotation'):
         gated(replace(calibration, model=Model(calibration.model.values, rotation)))
 
 
-def test_a_file_edited_by_hand_is_used_and_said_to_be(calibration):
+def test_a_file_edited_by_hand_is_used_with_a_warning(calibration):
     text = format_calibration(calibration)
     assert EDITED not in parse_calibration(text, 'x.yaml').warnings
     edited = parse_calibration(text.replace('sensor: imu', 'sensor: other'), 'x.yaml')
@@ -182,7 +182,7 @@ def test_a_file_edited_by_hand_is_used_and_said_to_be(calibration):
     ('method: ml', 'method: [ml]'), ('warnings:', 'warnings: 3\nwas:'),
     ('rejected: []', 'rejected: [{row: one, reason: x}]'), ("date: ''", 'date: 2026-11-02'),
     ('row: [1, 2', 'row: [1.5, 2'), ('row: [1, 2', 'row: [[1], 2')])
-def test_a_file_with_a_value_of_another_kind_is_refused_in_one_line(old, new, calibration):
+def test_a_file_with_a_value_of_another_type_is_refused_in_one_line(old, new, calibration):
     text = format_calibration(calibration)
     assert old in text
     with pytest.raises(StoredCalibrationError) as refusal:
@@ -203,7 +203,7 @@ def test_calibrations_of_version_1_still_load_and_correct_as_they_did():
             found.model.effects)
 
 
-def test_effects_of_the_context_are_held_at_the_edge_of_what_was_seen():
+def test_context_is_limited_to_the_ranges_of_the_poses():
     rng, count = np.random.default_rng(7), 40
     model = model_with({'offset_temperature': np.array([1e-3, -5e-4, 8e-4])})
     poses = simulate_poses(model, spread_directions(count), rng,

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The simulator that the refinement is checked with does what it says."""
+"""The independent simulator, with which the refinement is tested, is correct."""
 
 import ast
 import csv
@@ -69,7 +69,7 @@ def test_a_coarse_grid_holds_the_samples() -> None:
     assert np.median(np.abs(corrected(made) - made.around.force)) > 1e-3
 
 
-def test_a_rail_ends_the_readings() -> None:
+def test_saturation_clips_the_readings() -> None:
     made = simulate(np.random.default_rng(5), {'saturation': 3.0}, Setup(poses=60))
     assert np.max(np.abs(reading_of(made.columns))) <= made.truth['saturation']['limit'] + 1e-12
     ends = np.abs(reading_of(made.columns)) > made.truth['saturation']['limit'] - 0.005
@@ -129,7 +129,7 @@ def test_the_same_sensor_takes_other_poses(name: str) -> None:
     assert 0.5 < np.mean(other.noise) / np.mean(made.noise) < 2.0
 
 
-def test_what_is_outside_the_catalogue_is_listed() -> None:
+def test_effects_outside_the_catalogue_are_listed() -> None:
     assert set(OUTSIDE) < set(EFFECTS)
 
 

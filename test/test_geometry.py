@@ -1,12 +1,12 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the poses determine, what they leave open, and which pose comes next."""
+"""What poses determine, what they do not determine, and the next pose."""
 
 import re
 
 from accel_calib.calibrate import fit_poses, next_pose
 from accel_calib.calibrate.pose_planning import missing_poses
-from accel_calib.calibrate.refusal import carries, refuse_if_unfit
+from accel_calib.calibrate.refusal import determines, refuse_if_unfit
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate.geometry import dilution, poses_needed, rows_of
 from accel_calib.estimate.identifiability import error_left_in, identifiability
@@ -31,7 +31,7 @@ def unit(vectors):
 
 
 def about(directions, count, degrees, rng):
-    """Repeat directions up to a count, each a little off."""
+    """Return directions repeated up to a count, each with a small deviation."""
     chosen = directions[np.arange(count) % len(directions)]
     return unit(chosen + rng.normal(size=chosen.shape) * np.radians(degrees))
 
@@ -44,7 +44,7 @@ def cone(degrees, rng, count=12):
 
 
 def named(text):
-    """Give the direction that words such as ``(+x -z)`` name."""
+    """Return the direction that a text such as ``(+x -z)`` names."""
     signs = dict.fromkeys('xyz', 0.0)
     for sign, axis in re.findall(r'([+-])([xyz])', re.findall(r'\(([^)]*)\)', text)[-1]):
         signs[axis] = float(f'{sign}1')
@@ -56,7 +56,7 @@ def all_named(text):
 
 
 @pytest.mark.parametrize('model', ['10', '9'])
-def test_faces_alone_leave_the_cross_axis_gains_open_and_nothing_else(model):
+def test_faces_alone_determine_all_but_the_cross_axis_gains(model):
     found = identifiability(model, np.repeat(FACES, 2, axis=0))
     assert found.open_parameters == CROSS
     assert tuple(each.words for each in found.undetermined) == CROSS
@@ -73,14 +73,14 @@ def test_faces_alone_determine_the_smaller_models(model):
     assert found.dilution <= 1.01
 
 
-def test_poses_in_a_plane_leave_open_what_lies_across_it():
+def test_poses_in_a_plane_do_not_determine_the_axis_across_it():
     assert identifiability('4', RING).open_parameters == ('offset.z',)
     assert identifiability('10', RING).open_parameters == (
         'offset.z', 'axis_gain.z', 'cross_axis.xz', 'cross_axis.yz')
 
 
 @pytest.mark.parametrize('model', ['4', '7', '10', '12'])
-def test_what_is_left_open_is_not_seen_by_any_pose(model):
+def test_undetermined_combinations_change_no_pose(model):
     directions = RING @ rotation_from_rpy(0.5, 0.4, 0.3).T
     found = identifiability(model, directions)
     names = list(found.deviations)
@@ -92,7 +92,7 @@ def test_what_is_left_open_is_not_seen_by_any_pose(model):
         np.testing.assert_allclose(rows @ vector, 0.0, atol=5e-3)
 
 
-def test_weak_combination_is_told_with_its_weights():
+def test_weak_combination_is_reported_with_its_weights():
     found = identifiability('7', cone(45.0, np.random.default_rng(1)))
     (open_,) = found.undetermined
     assert {'axis_gain.x', 'axis_gain.y'} < set(open_.weights) <= set(found.deviations)
@@ -140,7 +140,7 @@ def test_expected_error_is_that_of_fits():
     (lambda rng: about(spread_directions(36), 36, 10.0, rng), 0.0, 0.0)],
     ids=['five, 1°', 'five, 2°', 'cone', 'plane, 3°', 'random', 'spread', '36 spread'])
 def test_poses_are_refused_where_a_fit_would_be_wrong_and_only_there(draw, least, most):
-    refused = [not carries('10', draw(np.random.default_rng(seed))) for seed in range(100)]
+    refused = [not determines('10', draw(np.random.default_rng(seed))) for seed in range(100)]
     assert least <= np.mean(refused) <= most
 
 
@@ -149,7 +149,7 @@ def test_poses_are_refused_where_a_fit_would_be_wrong_and_only_there(draw, least
     cone(45.0, np.random.default_rng(4)), np.repeat(spread_directions(5), 3, axis=0)])
 @pytest.mark.parametrize('model', ['4', '7', '10'])
 def test_poses_that_a_refusal_asks_for_make_the_fit_possible(model, directions):
-    if carries(model, directions):
+    if determines(model, directions):
         assert refuse_if_unfit(model, directions) is None
         return
     with pytest.raises(RefusedFitError) as refusal:
@@ -170,14 +170,14 @@ def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, ope
     rng = np.random.default_rng(5)
     known = {'reference': directions} if model == '12' else {}
     poses = simulate_poses(sensor(rng), directions, rng, context=known)
-    with pytest.raises(RefusedFitError, match=f'left open: {re.escape(open_)}') as refusal:
+    with pytest.raises(RefusedFitError, match=f'not determined: {re.escape(open_)}') as refusal:
         fit_poses(poses, G, model=model)
     if offer:
-        assert re.search(rf'or use {offer}, which these poses determine: it leaves out '
-                         r'cross_axis, which in a common sensor makes \|a\| wrong by 1\d mg$',
+        assert re.search(rf'or use {offer}, which these poses determine: it omits cross_axis, '
+                         r'which causes an error of \|a\| of 1\d mg in a common sensor$',
                          refusal.value.advice)
     else:
-        assert refusal.value.advice.endswith('hold it still and go on')
+        assert refusal.value.advice.endswith('hold it still and continue')
 
 
 @pytest.mark.parametrize('directions', [FACES, spread_directions(12),
@@ -197,32 +197,32 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
 
 
-def test_known_faces_carry_model_12():
+def test_known_faces_determine_model_12():
     rng = np.random.default_rng(6)
     poses = simulate_poses(sensor(rng), FACES, rng)
     assert fit_poses(poses, G, model='12').name == '12'
 
 
-def test_noisy_poses_do_not_carry_a_model():
+def test_noisy_poses_do_not_determine_a_model():
     directions = spread_directions(12)
     noise = np.where(np.arange(12) < 5, 300.0, 1.0)
     refuse_if_unfit('7', directions, noise)
-    with pytest.raises(RefusedFitError, match='some of the 12 poses are noisy') as refusal:
+    with pytest.raises(RefusedFitError, match='some of the 12 poses are too noisy') as refusal:
         refuse_if_unfit('10', directions, noise)
     assert 'or use model 7' in refusal.value.advice
 
 
-def test_auto_says_what_the_poses_did_not_let_it_see():
+def test_auto_warns_of_effects_that_the_poses_cannot_show():
     rng = np.random.default_rng(7)
     poses = simulate_poses(sensor(rng, 'offset', 'axis_gain'), np.repeat(FACES, 3, axis=0), rng)
-    (told,) = [text for text in fit_poses(poses, G).warnings if 'do not determine' in text]
-    assert ', '.join(CROSS[:2]) + ' and ' + CROSS[2] in told
-    assert carries('10', np.vstack([FACES, all_named(told)]))
+    (warning,) = [text for text in fit_poses(poses, G).warnings if 'do not determine' in text]
+    assert ', '.join(CROSS[:2]) + ' and ' + CROSS[2] in warning
+    assert determines('10', np.vstack([FACES, all_named(warning)]))
     free = fit_poses(simulate_poses(sensor(rng), spread_directions(18), rng), G)
     assert not any('do not determine' in text for text in free.warnings)
 
 
-def test_next_pose_is_told_in_words_and_as_a_direction():
+def test_next_pose_has_words_and_a_direction():
     for count in range(12):
         asked = next_pose(spread_directions(20)[:count])
         assert asked.words.startswith('turn the sensor so that the ')
@@ -232,7 +232,7 @@ def test_next_pose_is_told_in_words_and_as_a_direction():
 
 
 @pytest.mark.parametrize('count', [1, 5, 40])
-def test_the_same_attitude_is_never_asked_for_again(count):
+def test_no_orientation_is_suggested_twice(count):
     for face in FACES:
         tilted = about(face[np.newaxis], count, 2.0, np.random.default_rng(count))
         asked = next_pose(tilted)
@@ -240,7 +240,7 @@ def test_the_same_attitude_is_never_asked_for_again(count):
 
 
 def follow(count, model='10', noise=None):
-    """Turn as asked, up to so many poses."""
+    """Return the suggested poses, at most so many."""
     directions = np.zeros((0, 3))
     while len(directions) < count:
         asked = next_pose(directions, model, None if noise is None else noise[:len(directions)])
@@ -251,22 +251,22 @@ def follow(count, model='10', noise=None):
 
 
 @pytest.mark.parametrize('model', ['4', '7', '9', '10'])
-def test_following_ends_when_a_pose_more_no_longer_pays(model):
+def test_planning_ends_when_another_pose_no_longer_helps(model):
     directions = follow(40, model)
     assert 12 < len(directions) < 22
     found = identifiability(model, directions)
     assert found.dilution < 1.5
     asked = next_pose(directions, model)
     assert asked.words == (f'more poses no longer help: {len(directions)} poses determine |a| to '
-                           f'{found.mean_dilution:.2g} times the noise of a pose')
+                           f'within {found.mean_dilution:.2g} times the noise of a pose')
     assert asked.error == pytest.approx(found.mean_dilution)
 
 
-def test_how_well_the_poses_determine_is_told_in_mg():
+def test_the_accuracy_that_poses_allow_is_stated_in_mg():
     directions = follow(40)
     expected = identifiability('10', directions).mean_dilution * 0.4
     words = next_pose(directions, noise_g=0.0004).words
-    assert words.endswith(f'determine |a| to {expected:.2g} mg')
+    assert words.endswith(f'determine |a| to within {expected:.2g} mg')
 
 
 def test_poses_without_a_spread_never_seem_enough():
@@ -275,14 +275,14 @@ def test_poses_without_a_spread_never_seem_enough():
         assert next_pose(directions).direction is not None
 
 
-def test_following_reaches_the_aim_with_far_fewer_poses_than_random_order():
+def test_planned_poses_are_far_fewer_than_random_poses():
     assert identifiability('10', follow(12)).mean_dilution < 0.95
     at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
                  .mean_dilution for seed in range(50)]
     assert np.median(at_random) > 1.4
 
 
-def test_a_noisy_pose_does_not_stand_for_its_direction():
+def test_a_noisy_pose_does_not_count_for_its_direction():
     directions = spread_directions(14)
     noise = np.where(directions[:, 2] > 0.6, 30.0, 1.0)
     assert next_pose(directions, noise=noise).direction[2] > 0.5

@@ -57,7 +57,7 @@ def test_rest_counts_before_it_ends_and_is_updated_later(readings: Readings) -> 
     assert counts[-1] > 150
 
 
-def test_poses_held_are_replaced_by_their_final_average(readings: Readings) -> None:
+def test_provisional_poses_are_replaced_by_their_final_average(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
     changes = push_all(live, readings(FACES, dwell=2.0))
     assert len(live.book.poses()) == 3
@@ -79,7 +79,7 @@ def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate:
     assert 'doubtful' not in live.book.poses()
 
 
-def test_time_that_jumps_back_ends_a_rest_and_no_more(readings: Readings) -> None:
+def test_time_that_jumps_back_only_ends_a_rest(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(repeated='merge'), UNITS)
     for _ in range(3):
         push_all(live, readings(FACES, dwell=2.0), start=100.0)
@@ -97,7 +97,7 @@ def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings)
     assert len(live.book.poses()) == 2
 
 
-def test_without_auto_capture_only_the_pose_asked_for_is_kept(readings: Readings) -> None:
+def test_without_auto_capture_only_requested_poses_are_captured(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     turned = readings(FACES, dwell=2.0)
     push_all(live, turned[:90], capture=False)
@@ -108,7 +108,7 @@ def test_without_auto_capture_only_the_pose_asked_for_is_kept(readings: Readings
     assert poses['reading'][0, 2] > 9.0
 
 
-def test_moving_sensor_is_no_pose() -> None:
+def test_moving_sensor_is_not_a_pose() -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     rng = np.random.default_rng(1)
     push_all(live, [0, 0, GRAVITY] + rng.normal(size=(500, 3)) * 3.0)
@@ -127,7 +127,7 @@ def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
     assert len(book.poses()) == 2
 
 
-def test_book_of_a_robot_that_parks_for_years_stays_small() -> None:
+def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
     book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
     directions = spread_directions(6)
     for k in range(600):
@@ -149,7 +149,7 @@ def test_stored_poses_are_added_as_they_were() -> None:
     assert len(dwells_of(poses)) == 8
 
 
-def test_fit_keeps_what_was_flat_before(stored: Callable[..., Path]) -> None:
+def test_fit_keeps_the_mounting(stored: Callable[..., Path]) -> None:
     flat = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
     before = read_calibration(stored(flat=flat))
     again = fitted(before.poses, UNITS, CalibratorSettings(model='10'), '', before, {})
@@ -214,7 +214,7 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
     assert active.drift is None
 
 
-def test_rest_that_ends_late_does_not_hide_the_ongoing_one(
+def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(
         stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     active = ActiveCalibration(GRAVITY)
@@ -246,7 +246,8 @@ def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
     assert rest.context['temperature'] == pytest.approx(26.0)
 
 
-def test_robot_that_stands_for_hours_is_liveed_all_the_while(stored: Callable[..., Path]) -> None:
+def test_robot_that_stands_for_hours_is_monitored_all_the_time(
+        stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     active, live = ActiveCalibration(GRAVITY), LiveCapture(CaptureSettings(), UNITS)
     active.adopt(calibration)
@@ -267,7 +268,7 @@ def test_robot_that_stands_for_hours_is_liveed_all_the_while(stored: Callable[..
     assert 2500.0 < left_at < 4500.0
 
 
-def test_pose_from_before_the_first_temperature_gets_that_of_the_next() -> None:
+def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
     book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
     book.end(dwell(0.0, [0, 0, 1]))
     for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
@@ -286,7 +287,7 @@ def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float
     assert book.poses()['temperature'][1] == 38.0
 
 
-def test_poses_of_a_noisier_time_are_marked_and_stay() -> None:
+def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     rng = np.random.default_rng(3)
     live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
     start, changes = 0.0, []
@@ -310,4 +311,5 @@ def test_poses_of_a_noisier_time_are_marked_and_stay() -> None:
     assert 'doubtful' in calibration.rejected[0].reason
     needed = fit_poses(poses.take(slice(0, 13)), UNITS, model='10')
     assert not needed.rejected
-    assert 'the sensor may have moved in the poses 1, 2, 3' in ' '.join(needed.warnings)
+    assert ('the sensor may have moved during the poses of rows 1, 2, 3'
+            in ' '.join(needed.warnings))

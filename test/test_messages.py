@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialized Imu messages: their layout, and what a calibration changes in them."""
+"""Serialized Imu messages: layout and correction."""
 
 from dataclasses import replace
 import struct
@@ -60,7 +60,7 @@ def test_without_a_mounting_only_the_acceleration_changes(calibration):
     np.testing.assert_array_equal(found[:, rest], fields[:, rest])
 
 
-def test_with_a_mounting_the_message_speaks_of_one_frame(levelled):
+def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     fields, rotation = messages(), levelled.model.rotation
     found = corrected(levelled, fields)
     np.testing.assert_allclose(found[:, imu.ANGULAR_VELOCITY],
@@ -94,7 +94,7 @@ def test_conventions_for_no_covariance_are_kept(levelled, first):
         np.testing.assert_array_equal(found[:, part], fields[:, part])
 
 
-def test_the_given_messages_are_left_as_they_were(levelled):
+def test_correction_does_not_change_its_input(levelled):
     fields = messages()
     before = fields.copy()
     corrected(levelled, fields)
@@ -126,7 +126,7 @@ def covariance(kind, rng):
 
 
 def random_message(rng, frame_id=None):
-    """Return a serialized message with all fields drawn, and random bytes as padding."""
+    """Return a serialized message with random fields and padding."""
     name = (rng.choice(NAMES) if frame_id is None else frame_id).encode() + b'\0'
     doubles = rng.normal(size=37) * 5.0
     for part in (imu.ORIENTATION_COVARIANCE, imu.ANGULAR_VELOCITY_COVARIANCE,
@@ -152,7 +152,7 @@ def every(data):
 
 
 def with_effects(calibration, *, effects, turned):
-    """Return a calibration with effects and a mounting, if they are asked for."""
+    """Return a calibration, with effects and a mounting if requested."""
     values = dict(calibration.model.values)
     if effects:
         values |= {name: np.array(each) for name, each in EFFECTS.items()}
@@ -164,8 +164,8 @@ def with_effects(calibration, *, effects, turned):
 @pytest.mark.parametrize('effects', [False, True])
 @pytest.mark.parametrize('turned', [False, True])
 @pytest.mark.parametrize('frame_id', ['', 'base_link'])
-def test_messages_are_corrected_one_by_one_as_they_are_together(calibration, effects, turned,
-                                                                frame_id):
+def test_single_messages_and_arrays_are_corrected_equally(calibration, effects, turned,
+                                                          frame_id):
     calibration = with_effects(calibration, effects=effects, turned=turned)
     rng = np.random.default_rng(3)
     rewriters = {}
@@ -210,7 +210,7 @@ def test_each_message_is_corrected_at_its_own_temperature(calibration):
         rewriter(data, float('nan'))
 
 
-def test_no_force_beyond_100_g_comes_out(calibration):
+def test_no_force_beyond_100_g_is_published(calibration):
     data = bytearray(random_message(np.random.default_rng(9), 'imu'))
     layout = layout_of(bytes(data))
     rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, '')
@@ -224,7 +224,7 @@ def test_no_force_beyond_100_g_comes_out(calibration):
         assert rewriter(bytes(data), 20.0) is None
 
 
-def test_messages_together_are_what_each_is():
+def test_messages_as_arrays_equal_the_single_messages():
     rng = np.random.default_rng(4)
     raws = [random_message(rng) for _ in range(50)]
     raws = [swapped(raw) if k % 3 == 0 else raw for k, raw in enumerate(raws)]

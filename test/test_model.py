@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The measurement equation: predict and correct undo each other."""
+"""The measurement equation: correct is the inverse of predict."""
 
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
@@ -42,7 +42,7 @@ SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0}
 
 
 def values_of(name, rng):
-    """Draw values of a common size for an effect."""
+    """Return random values of typical size for an effect."""
     effect = EFFECTS[name]
     return np.array([*rng.normal(size=len(effect.parameters)) * effect.typical * 0.3,
                      *(SHAPES[part] for part in effect.shape)])
@@ -59,11 +59,11 @@ def test_predict_and_correct_undo_each_other_with_every_effect(rng, context):
 
 
 @pytest.mark.parametrize('name', ADDED)
-def test_values_move_the_reading_as_their_basis_says(name, rng, context):
+def test_basis_is_the_derivative_of_the_reading_by_the_values(name, rng, context):
     force, values = random_directions(40, rng), values_of(name, rng)
     basis = parameter_basis(Model({name: values}), force, context)
     for k, part in enumerate(EFFECTS[name].values):
-        if part in ('start', 'instant'):  # given by the data, not fitted
+        if part in ('start', 'instant'):  # taken from the data, not fitted
             continue
         step = np.zeros(len(values))
         step[k] = 1e-4 * max(abs(values[k]), 1.0)
@@ -128,12 +128,12 @@ def test_gain_and_offset_make_the_equation_of_an5286(rng):
 
 def test_missing_context_is_named():
     model = Model({'offset_temperature': np.ones(3)})
-    with pytest.raises(InputError, match='need temperature, which is not given'):
+    with pytest.raises(InputError, match='need temperature, which the input does not have'):
         correct(model, np.ones((1, 3)), {})
 
 
-def test_effects_too_large_to_undo_are_refused():
-    with pytest.raises(InputError, match='too large to be undone'):
+def test_effects_too_large_to_be_corrected_are_refused():
+    with pytest.raises(InputError, match='too large to be corrected'):
         correct(Model({'quadratic': np.full(3, 5.0)}), np.full((1, 3), -3.0), {})
 
 
@@ -144,7 +144,7 @@ def test_model_refuses_what_is_not_in_the_catalogue(values):
 
 
 @pytest.mark.parametrize('name', MODELS)
-def test_vector_and_names_go_together(name):
+def test_vector_and_names_have_the_same_order(name):
     names = parameter_names(MODELS[name])
     model = with_vector(MODELS[name], np.arange(float(len(names))))
     assert model.effects == MODELS[name]

@@ -35,7 +35,7 @@ def made(truth: Model, rng: np.random.Generator, *, poses: int = 12, noise: floa
 def rested(before: Drift, calibration: Calibration, truth: Model, up: Any,
            rng: np.random.Generator, *, shift: Any = 0.0, noise: float = NOISE,
            temperature: float | None = None) -> Drift:
-    """Return the state after one rest in each attitude, the readings shifted [g]."""
+    """Return the state after one rest in each orientation, with shifted readings [g]."""
     mean = predict(truth, np.atleast_2d(np.asarray(up, float)), {}) + shift
     mean = mean + noise * rng.normal(size=mean.shape)
     context = {} if temperature is None else {'temperature': np.full(len(mean), temperature)}
@@ -59,7 +59,7 @@ def test_shift_of_5_mg_is_reported_at_the_third_rest(noise: float, seed: int) ->
     assert (state.since, state.lasted) == (5, 3)
 
 
-def test_noise_and_the_uncertainty_of_the_calibration_are_no_change() -> None:
+def test_noise_and_uncertainty_of_the_calibration_are_not_a_change() -> None:
     rng = np.random.default_rng(1)
     for directions in ([UP] * 800, random_directions(800, rng)):
         truth = sensor(rng)
@@ -70,7 +70,7 @@ def test_noise_and_the_uncertainty_of_the_calibration_are_no_change() -> None:
 
 
 @pytest.mark.parametrize('knock', [-0.05, 0.004, 0.05, 0.2])
-def test_one_knock_is_no_change_nor_are_two(knock: float) -> None:
+def test_one_or_two_knocks_are_not_a_change(knock: float) -> None:
     rng = np.random.default_rng(2)
     truth = sensor(rng)
     calibration = made(truth, rng)
@@ -82,7 +82,7 @@ def test_one_knock_is_no_change_nor_are_two(knock: float) -> None:
     assert rested(state, calibration, truth, [UP] * 6, rng).change is None
 
 
-def test_what_poses_leave_open_is_no_change() -> None:
+def test_undetermined_parameters_are_not_a_change() -> None:
     rng = np.random.default_rng(3)
     truth = sensor(rng)
     near_faces = np.vstack([np.eye(3), -np.eye(3)] * 3) + 0.04 * rng.normal(size=(18, 3))
@@ -120,7 +120,7 @@ def test_offset_and_gain_are_distinguished_where_the_attitudes_allow() -> None:
     assert 'has changed by' not in status(state)
 
 
-def test_change_stays_until_rests_are_clearly_without_it() -> None:
+def test_change_clears_only_when_rests_clearly_read_1_g_again() -> None:
     rng = np.random.default_rng(5)
     truth = sensor(rng)
     calibration = made(truth, rng)
@@ -136,7 +136,7 @@ def test_change_stays_until_rests_are_clearly_without_it() -> None:
     assert (state.change, state.since, state.lasted) == (None, 0, 0)
 
 
-def test_sensor_that_repeats_worse_than_stated_is_not_taken_for_a_changed_one() -> None:
+def test_sensor_that_repeats_worse_than_stated_is_not_reported_as_changed() -> None:
     rng = np.random.default_rng(6)
     truth = sensor(rng)
     calibration = made(truth, rng, noise=0.0001)
@@ -149,7 +149,7 @@ def test_sensor_that_repeats_worse_than_stated_is_not_taken_for_a_changed_one() 
     assert state.scatter == pytest.approx(2.5, rel=0.5)
 
 
-def test_poses_that_repeat_badly_widen_what_is_stated() -> None:
+def test_poses_that_repeat_badly_increase_the_stated_uncertainty() -> None:
     rng = np.random.default_rng(7)
     truth = sensor(rng)
     table = simulate_poses(truth, spread_directions(36), rng, noise_g=0.001)
@@ -173,8 +173,8 @@ def test_changes_too_small_to_matter_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(('temperature', 'words'), [
-    (38.2, 'the temperature is 38.2 °C, it was 24.0 to 25.3 °C when calibrated: capture poses at '
-           'this temperature and call ~/refine'),
+    (38.2, 'the temperature is 38.2 °C, but the sensor was calibrated at 24.0 to 25.3 °C: capture '
+           'poses at this temperature and call ~/refine'),
     (26.0, 'call ~/reset, capture poses and call ~/fit'),
     (None, 'call ~/reset, capture poses and call ~/fit')])
 def test_advice_names_the_temperature_where_it_changed(
@@ -184,10 +184,10 @@ def test_advice_names_the_temperature_where_it_changed(
     calibration = made(truth, rng, temperature=np.linspace(24.0, 25.3, 12))
     state = rested(monitor(calibration), calibration, truth, [UP] * 4, rng,
                    temperature=temperature)
-    assert 'mg stated' in status(state)
+    assert 'stated uncertainty' in status(state)
     state = rested(state, calibration, truth, [UP] * 3, rng, shift=-0.005 * UP,
                    temperature=temperature)
-    assert status(state).startswith('|a| at rest is -')
+    assert status(state).startswith('|a| at rest has differed by -')
     assert 'for 3 rests' in status(state)
     assert status(state).endswith(words)
 
@@ -199,8 +199,8 @@ def test_calibration_without_uncertainty_is_not_judged() -> None:
     calibration = replace(calibration, covariance=np.nan * calibration.covariance)
     state = rested(monitor(calibration), calibration, truth, [UP] * 5, rng, shift=0.02 * UP)
     assert state.change is None
-    assert 'states no uncertainty' in status(state)
-    assert status(monitor(calibration)) == 'no rest since the calibration yet'
+    assert 'has no uncertainty' in status(state)
+    assert status(monitor(calibration)) == 'no rest since the calibration'
 
 
 def test_readings_in_counts_are_monitored_like_others() -> None:
@@ -219,7 +219,7 @@ def test_readings_in_counts_are_monitored_like_others() -> None:
 
 @pytest.mark.parametrize(('name', 'unit'), [
     ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
-def test_real_rests_are_no_change_until_they_are_shifted(name: str, unit: Any) -> None:
+def test_real_rests_are_not_a_change_unless_shifted(name: str, unit: Any) -> None:
     units = units_of(unit)
     poses = capture(read_recording(data(f'{name}.csv')), units).poses
     others = np.arange(0, len(poses), 2)

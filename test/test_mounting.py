@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Mounting from a flat pose: every frame, every attitude, the singular ones too."""
+"""Mounting from a flat pose, for all frames and orientations, including singular ones."""
 
 from accel_calib.calibrate.mounting import (
     flat_direction,
@@ -30,7 +30,7 @@ def test_flat_pose_is_levelled_by_a_proper_rotation(frame, rpy):
 
 
 @pytest.mark.parametrize('frame', FRAMES)
-def test_a_sensor_mounted_straight_is_left_alone(frame):
+def test_a_level_mounting_is_the_identity(frame):
     np.testing.assert_allclose(mounting(flat_direction(frame), frame), np.eye(3), atol=1e-15)
 
 
@@ -68,7 +68,7 @@ def test_a_pose_with_the_nose_down_fixes_the_heading(rpy, frame, nose_down):
     np.testing.assert_allclose(found, truth, atol=1e-12)
 
 
-def test_a_levelled_mounting_keeps_its_heading():
+def test_levelling_again_keeps_the_heading():
     before = rotation_from_rpy(*np.radians((10.0, -20.0, 130.0)))
     tilt = rotation_from_rpy(*np.radians((3.0, 2.0, 0.0)))
     level = mounting(tilt @ before[:, 2])
@@ -81,7 +81,7 @@ def test_a_levelled_mounting_keeps_its_heading():
 
 
 def test_a_second_pose_that_is_the_first_is_refused():
-    with pytest.raises(InputError, match='within 10° of the flat one'):
+    with pytest.raises(InputError, match='within 10° of the flat pose'):
         with_heading(np.eye(3), np.array([0, 0.05, 1.0]))
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One reading in floats is corrected as many are in arrays, for every effect of the catalogue."""
+"""The correction of one reading equals that of arrays, for every effect of the catalogue."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
 
 
 def calibration_with(*names, unit='m/s2', seed=1, levelled=True):
-    """Give a calibration of a linear fit and these effects, with a covariance for all."""
+    """Return a calibration with a linear fit and these effects, and a covariance of all values."""
     rng = np.random.default_rng(seed)
     units = units_of(unit)
     poses = simulate_poses(sensor(rng), spread_directions(20), rng)
@@ -82,7 +82,7 @@ def test_models_of_several_effects_are_those_of_the_arrays(seed):
     check(calibration_with(*names, unit='g', seed=seed), 9.80665)
 
 
-def test_context_is_held_at_the_edge_of_what_was_seen():
+def test_context_of_one_reading_is_limited_to_the_ranges():
     calibration = calibration_with('offset_temperature')
     poses = calibration.poses.with_columns(temperature=np.linspace(20.0, 30.0, 20))
     calibration = replace(calibration, poses=poses)
@@ -96,7 +96,7 @@ def test_context_is_held_at_the_edge_of_what_was_seen():
                                                                context)[0], atol=1e-12)
 
 
-def test_effects_too_large_to_be_undone_are_refused():
+def test_effects_too_large_to_be_corrected_are_refused():
     calibration = calibration_with()
     model = Model({**calibration.model.values, 'cubic': np.full(3, -0.5)})
     large = replace(calibration, model=model,

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the package says of itself agrees, and what it ships is there."""
+"""The metadata of the package are consistent, and all files are shipped."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ def working_folder(path: Path) -> Iterator[None]:
 
 @pytest.fixture
 def setup_py(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Give what setup.py hands to setuptools."""
+    """Return the arguments of setup.py for setuptools."""
     setuptools = pytest.importorskip('setuptools')
     given: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, 'setup', lambda **keywords: given.update(keywords))
@@ -87,7 +87,7 @@ def test_each_requirement_has_its_rosdep_key(
     assert wanted == listed
 
 
-def test_what_the_nodes_import_is_in_package_xml(package_xml: ElementTree.Element) -> None:
+def test_package_xml_lists_all_imports_of_the_nodes(package_xml: ElementTree.Element) -> None:
     sources = [path.read_text(encoding='utf-8')
                for path in (ROOT / 'accel_calib' / 'ros').rglob('*.py')]
     pattern = re.compile(r'^\s*(?:from|import) (rclpy|\w+_(?:msgs|srvs|interfaces))\b', re.M)
@@ -95,7 +95,7 @@ def test_what_the_nodes_import_is_in_package_xml(package_xml: ElementTree.Elemen
     assert imported <= set(texts(package_xml, 'exec_depend'))
 
 
-def test_all_that_is_shipped_is_there(setup_py: dict[str, Any]) -> None:
+def test_all_shipped_files_exist(setup_py: dict[str, Any]) -> None:
     shipped = {path for _, paths in setup_py['data_files'] for path in paths}
     assert {'resource/accel_calib', 'package.xml', 'config/calibrator.yaml',
             'launch/calibrator.launch.py', 'scripts/calibrator', 'scripts/simulator'} <= shipped

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The documents' own numbers, and what the real recordings are known to give."""
+"""The numbers in the documents, and known results for real recordings."""
 
 import json
 

@@ -1,12 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hidden effects are found by name, and nothing is made up; sets of an independent generator."""
+"""Hidden effects are named and no others, on data of an independent generator."""
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture, CaptureSettings
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.files import format_calibration, parse_calibration, read_poses, read_samples
+from accel_calib.files import read_poses, read_samples
+from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
 from accel_calib.refine import refine
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, spread_directions
@@ -23,7 +24,7 @@ LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
 
 @pytest.fixture
 def taken(tmp_path):
-    """Give poses of a simulated sensor, through a file as a user's are."""
+    """Return poses of a simulated sensor that were written to a file and read again."""
     def take(seed, hidden=None, **setup):
         made = generator.simulate(np.random.default_rng(seed), hidden or {},
                                   generator.Setup(**setup))
@@ -45,7 +46,7 @@ def test_each_hidden_effect_is_named_or_named_as_a_rival(effect, taken):
     step = next(step for step in found.steps if step.effect == names(found)[0])
     assert effect in (step.effect, *step.rivals)
     assert found.verdict == 'explained'
-    if effect != 'quantisation':  # a grid cannot be taken out
+    if effect != 'quantisation':  # a grid cannot be corrected
         assert step.gap_after_mg < 0.6 * step.gap_before_mg
         assert step.held_out_after_mg < 0.7 * step.held_out_before_mg
         assert found.remaining_gap_mg < 1.5 * found.noise_floor_mg
@@ -81,7 +82,7 @@ def test_two_hidden_effects_are_both_named(taken):
 
 
 @pytest.mark.parametrize('effect', generator.OUTSIDE)
-def test_what_no_effect_explains_is_said_to_be_unexplained(effect, taken):
+def test_a_gap_that_no_effect_explains_is_unexplained(effect, taken):
     found = refine(taken(3, {effect: 6.0}, poses=60)[0], MPS2, base='10')
     assert names(found) in ([], ['offset_wander'])
     if not names(found):
@@ -121,7 +122,7 @@ def test_a_refined_calibration_is_an_ordinary_one(taken):
         stored.correct(columns['reading'])
 
 
-def test_the_ladder_is_climbed_from_an_ideal_sensor(taken):
+def test_the_effects_of_the_ladder_are_added_to_an_ideal_sensor(taken):
     found = refine(taken(6, poses=60)[0], MPS2, base='ideal')
     steps = [step.effect for step in found.steps]
     assert sorted(steps) == sorted(LADDER)
@@ -154,7 +155,7 @@ def test_shared_orientation_shows_temperature_across_gravity():
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4], atol=3e-5)
 
 
-def test_what_was_looked_for_and_not_found_is_not_called_untestable(taken):
+def test_an_effect_that_was_tested_is_not_listed_as_untestable(taken):
     listed = [effect for effect, _ in refine(taken(13, poses=60)[0], MPS2).not_testable]
     assert listed == ['misalignment']
     bare = refine(taken(13, poses=60, dropped=('temperature', 'time'))[0], MPS2).not_testable
@@ -164,7 +165,7 @@ def test_what_was_looked_for_and_not_found_is_not_called_untestable(taken):
 
 def test_too_few_poses_are_refused():
     poses = simulate_poses(model_with({}), spread_directions(3), np.random.default_rng(1))
-    with pytest.raises(RefusedFitError, match='3 poses are too few'):
+    with pytest.raises(RefusedFitError, match='found 3 sound poses, expected at least 4'):
         refine(poses, G)
 
 
@@ -177,7 +178,7 @@ def test_base_may_be_a_stored_calibration(taken):
 
 
 @pytest.mark.parametrize('name', ['mpu9150_imu0', 'mpu9150_imu1'])
-def test_mpu9150_hides_nothing(name):
+def test_mpu9150_has_no_hidden_effect(name):
     poses = capture(read_samples(data(f'{name}.csv')), MPS2).poses
     assert names(refine(poses, MPS2, base='10')) == []
     climbed = refine(poses, MPS2, base='ideal')

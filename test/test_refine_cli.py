@@ -56,12 +56,12 @@ def test_result_has_the_names_of_the_interface(hidden, capsys):
     assert 'offset_temperature' in {item['effect'] for item in result['not_testable']}
 
 
-def test_terminal_tells_the_story(hidden, capsys):
+def test_terminal_shows_the_steps_and_the_verdict(hidden, capsys):
     assert run('refine', hidden) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'noise floor',
-                  'only noise is left', 'these data cannot show'):
-        assert words in said
+                  'only noise remains', 'these data cannot show'):
+        assert words in printed
 
 
 def test_refined_calibration_is_an_ordinary_one(hidden, tmp_path, capsys):
@@ -85,10 +85,10 @@ def test_stored_calibration_is_the_base(hidden, tmp_path, capsys):
     assert status == 0
     assert (result['verdict'], result['steps']) == ('no_gap', [])
     assert run('refine', hidden, '-c', fitted, '--sensor', 'b') == 2
-    assert "is of sensor 'a'" in capsys.readouterr().err
+    assert "belongs to sensor 'a'" in capsys.readouterr().err
 
 
-def test_several_tables_give_a_list_in_their_order(hidden, tmp_path, capsys):
+def test_several_tables_return_a_list_in_their_order(hidden, tmp_path, capsys):
     clean = simulated(tmp_path / 'clean.csv', '--poses', 30)
     bad = tmp_path / 'bad.csv'
     bad.write_text('ax,ay\n1,2\n')
@@ -103,7 +103,7 @@ def test_several_tables_give_a_list_in_their_order(hidden, tmp_path, capsys):
     assert sorted(path.name for path in folder.iterdir()) == ['clean.yaml', 'hidden.yaml']
 
 
-def test_disturbed_row_is_named(hidden, capsys):
+def test_outlier_is_reported_with_its_row(hidden, capsys):
     table = read_poses(hidden)
     reading = table.reading.copy()
     reading[6] *= 1.05
@@ -123,7 +123,7 @@ def test_table_of_samples_is_captured_first(tmp_path, capsys):
 @pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [
     (0.01, 20, False, True), (20.0, 60, False, False), (0.1, 60, True, False),
     (10.0, 6000, False, True)])
-def test_samples_are_told_from_poses(step, rows, count, samples):
+def test_samples_are_distinguished_from_poses(step, rows, count, samples):
     columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3))}
     if count:
         columns['count'] = np.ones(rows)
@@ -167,7 +167,8 @@ def test_page_and_figures_are_written(hidden, tmp_path, capsys):
     assert again.exists()
 
 
-def test_without_matplotlib_one_line_says_what_to_install(hidden, tmp_path, capsys, monkeypatch):
+def test_without_matplotlib_one_line_advises_what_to_install(hidden, tmp_path, capsys,
+                                                             monkeypatch):
     monkeypatch.setattr('accel_calib.report.style.find_spec', lambda name: None)
     page = tmp_path / 'r.html'
     assert run('refine', hidden, '--report', page) == 2
@@ -178,7 +179,7 @@ def test_without_matplotlib_one_line_says_what_to_install(hidden, tmp_path, caps
     assert run('refine', hidden) == 0
 
 
-def test_dwell_that_cannot_be_is_refused(tmp_path, capsys):
+def test_impossible_dwell_is_refused(tmp_path, capsys):
     path = simulated(tmp_path / 'r.csv', '--recording', '--poses', 3)
     capsys.readouterr()
     assert run('refine', path, '--max-dwell', 0.1) == 2

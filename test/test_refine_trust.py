@@ -3,10 +3,13 @@
 
 """A refinement is stored only if the poses determine it, and a stored base is used as stored."""
 
+from dataclasses import replace
 import json
 
 from accel_calib.calibrate import fit_poses, verify
 from accel_calib.cli.main import main
+from accel_calib.errors import StoredCalibrationError
+from accel_calib.files import write_calibration, write_table
 from accel_calib.model import Model
 from accel_calib.refine import refine
 from accel_calib.simulate import model_with, simulate_poses
@@ -87,13 +90,13 @@ def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsy
     result = json.loads(printed.out)
     assert {'offset_temperature', 'offset_drift'} & {
         name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
-    assert 'do not determine' in result['refusal']
+    assert 'spread over the sphere' in result['refusal']
     assert 'is not written' in printed.err.splitlines()[-1]
     assert not stored.exists()
 
 
 @pytest.mark.parametrize('arguments', [[], ['--base', 'ideal'], ['--base', '4']])
-def test_six_faces_say_what_they_cannot_show(arguments, tmp_path, capsys):
+def test_six_faces_report_what_they_cannot_show(arguments, tmp_path, capsys):
     table, page = tmp_path / 'faces.csv', tmp_path / 'page.html'
     faces = np.vstack([np.eye(3), -np.eye(3)]) * 9.81 + [0.1, 0.2, -0.1]
     faces += np.random.default_rng(3).normal(size=(6, 3)) * 0.003
@@ -136,7 +139,7 @@ def test_a_dead_zone_ends_in_a_result(seed):
 
 
 @pytest.mark.parametrize(('poses', 'repeats'), [(24, 5), (12, 5)])
-def test_rows_of_one_orientation_in_a_row_show_no_hysteresis(poses, repeats):
+def test_successive_rows_of_one_orientation_show_no_hysteresis(poses, repeats):
     for seed in range(8):
         rng = np.random.default_rng((seed, poses))
         directions = np.repeat(random_directions(poses, rng), repeats, axis=0)
@@ -145,7 +148,7 @@ def test_rows_of_one_orientation_in_a_row_show_no_hysteresis(poses, repeats):
         assert found.verdict == 'no_gap'
 
 
-def test_of_rivals_a_plausible_one_is_named():
+def test_among_rivals_a_plausible_one_is_named():
     rng = np.random.default_rng(4)
     time = np.arange(24) * 4.0
     model = with_effects(rng, **TCO)
@@ -216,3 +219,46 @@ def test_another_sensor_is_named_as_such(stored):
     found = refine(poses_of(other, rng, random_directions(20, rng),
                             temperature=np.full(20, 20.0)), G, base=base)
     assert found.advice[0].startswith('this is probably another sensor')
+
+
+def test_a_stored_calibration_with_an_effect_of_time_is_compared_as_stored():
+    rng = np.random.default_rng(26)
+    time = np.arange(60) * 60.0
+    truth = with_effects(rng, warm_up=np.array([0.02, -0.02, 0.02, 0.0, 900.0]))
+    old = poses_of(truth, rng, random_directions(60, rng), time=time)
+    base = refine(old, G, base='10', date='2026-11-02').calibration
+    assert 'warm_up' in base.model.values
+    shift = np.array([0.02, 0.0, 0.0])
+    later = poses_of(truth, rng, random_directions(20, rng), time=time[-20:] + 4000.0)
+    assert refine(later, G, base=base).verdict == 'no_gap'
+    moved = refine(later.with_columns(reading=later.reading + shift), G, base=base)
+    assert moved.gap_mg > 5.0
+    assert [step.effect for step in moved.steps] == ['offset']
+    assert moved.steps[0].parameters['x'] == pytest.approx(0.02, abs=2e-3)
+
+
+def test_a_file_that_was_edited_is_compared_with_its_own_poses(stored, tmp_path, capsys):
+    _, base = stored
+    path, table = tmp_path / 'calibration.yaml', tmp_path / 'poses.csv'
+    write_calibration(path, base)
+    write_table(table, base.poses)
+    offset = next(line for line in path.read_text().splitlines() if 'offset: {what' in line)
+    x = float(offset.split('x: ')[1].split(',')[0])
+    path.write_text(path.read_text().replace(f'x: {x!r}', f'x: {x + 0.05!r}', 1))
+    assert main(['refine', str(table), '-c', str(path), '--units', 'g', '--json', '-']) == 0
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert 'edited by hand' in printed.err
+    assert result['gap_mg'] > 20.0
+    assert [step['effect'] for step in result['steps']] == ['offset']
+    assert result['steps'][0]['parameters']['x'] == pytest.approx(-0.05, abs=2e-3)
+
+
+def test_poses_of_another_sensor_are_refused(stored):
+    _, base = stored
+    base = replace(base, sensor='left')
+    rng = np.random.default_rng(27)
+    poses = replace(poses_of(with_effects(rng), rng, random_directions(16, rng)), sensor='right')
+    for call in (lambda: refine(poses, G, base=base), lambda: verify(base, poses)):
+        with pytest.raises(StoredCalibrationError, match="'left', but the readings come from"):
+            call()

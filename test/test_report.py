@@ -1,14 +1,15 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Maps keep areas; the page is complete and loads nothing from outside."""
+"""Maps keep areas; the report is complete and self-contained."""
 
 from html.parser import HTMLParser
 import re
 
 from accel_calib.refine import refine
-from accel_calib.report import all_drawings, page
 from accel_calib.report.against import recorded, variables_of
+from accel_calib.report.drawings import all_drawings
+from accel_calib.report.page import page
 from accel_calib.report.sphere_map import equal_area
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
@@ -65,13 +66,13 @@ def test_map_keeps_areas():
     place = equal_area(directions)
     radius = np.linalg.norm(place, axis=1)
     assert np.max(radius) <= 1.0
-    # Evenly on the sphere is evenly on the disc: a share r² lies within radius r.
+    # Uniform on the sphere is uniform on the disc: a share r² is within the radius r.
     for r in (0.3, 0.6, 0.9):
         assert np.mean(radius < r) == pytest.approx(r ** 2, abs=0.005)
     np.testing.assert_allclose(equal_area(np.array([[0, 0, 1.0], [3.0, 0, 0]])), [[0, 0], [1, 0]])
 
 
-def test_page_is_whole_and_needs_nothing_from_outside(warm):
+def test_page_is_complete_and_self_contained(warm):
     text = page(warm, 'poses.csv')
     balance = Balance()
     balance.feed(text)
@@ -88,13 +89,13 @@ def test_page_describes_each_step(warm):
     text = page(warm, 'poses.csv')
     assert [step.effect for step in warm.steps] == ['offset_temperature']
     for words in ('offset_temperature', 'Offset that changes with temperature', 'mg/°C',
-                  'zero-g offset temperature coefficient TCO', 'rows 9', 'noise floor',
+                  'zero-g offset temperature coefficient TCO', 'row 9', 'noise floor',
                   'temperature [°C]', 'What these data cannot show', 'What remains',
-                  '<h2>Outliers</h2>'):
+                  '<h2>Poses left out</h2>'):
         assert words in text
 
 
-def test_what_comes_from_outside_is_escaped(warm):
+def test_text_from_the_input_is_escaped(warm):
     text = page(warm, '<b onload="x">&.csv')
     assert '<b onload' not in text
     assert '&lt;b onload=&quot;x&quot;&gt;&amp;.csv' in text
@@ -111,19 +112,19 @@ def test_before_and_after_have_one_scale(warm):
     assert maps[0].get_clim() == maps[1].get_clim()
 
 
-def test_no_gap_has_a_page_too():
+def test_no_gap_has_a_report_too():
     clean = refined()
     assert clean.verdict == 'no_gap'
     assert [drawing.name for drawing in all_drawings(clean)] == [
         'ladder', 'remaining_sphere', 'remaining_variables']
-    assert 'Nothing beyond the noise' in page(clean, 'poses.csv')
+    assert 'No gap beyond the noise' in page(clean, 'poses.csv')
 
 
-def test_ladder_from_an_ideal_sensor_has_one_rung_per_step():
+def test_figure_of_the_ladder_has_one_level_per_step():
     result = refined(base='ideal')
     ladder = next(iter(all_drawings(result)))
-    said = {text.get_text() for text in ladder.figure.axes[0].texts}
-    assert {'ideal sensor', *(f'+ {step.effect}' for step in result.steps)} <= said
+    texts = {text.get_text() for text in ladder.figure.axes[0].texts}
+    assert {'ideal sensor', *(f'+ {step.effect}' for step in result.steps)} <= texts
 
 
 def test_variables_are_those_of_the_effect(warm):

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The main job over DDS: simulator, calibrator and user in processes of their own."""
+"""A calibration over DDS: simulator, calibrator and user in separate processes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ CAPTURE = {'still_window': 0.25, 'min_dwell': 0.6}
 
 
 def vectors(messages: list[Any]) -> Any:
-    """Give the accelerations as an (n, 3) array, in g."""
+    """Return the accelerations as an (n, 3) array [g]."""
     return np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
                      for m in messages]) / GRAVITY
 
 
 def count(markers: list[Any]) -> int:
-    """Give the number of poses drawn last."""
+    """Return the number of poses in the last markers."""
     return sum(m.ns == 'poses' for m in markers[-1].markers) if markers else 0
 
 
@@ -44,14 +44,14 @@ def rms_mg(forces: Any) -> float:
     return float(np.sqrt(np.mean((np.linalg.norm(forces, axis=1) - 1.0) ** 2))) * 1e3
 
 
-def test_turned_sensor_is_calibrated_levelled_and_still_so_after_being_killed(bench: Any) -> None:
+def test_calibration_and_level_survive_a_kill(bench: Any) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     raw = bench.listen(Imu, 'imu/data_raw')
     truth = bench.listen(Vector3Stamped, 'simulator/truth')
     corrected = bench.listen(Imu, 'imu/data_calibrated')
     node = bench.calibrator(**CAPTURE)
     simulator = bench.start('simulator', **SIMULATED)
-    # Flat at first, 12 poses, flat again and held.
+    # First flat, then 12 poses, then flat until the end.
     bench.spin(lambda: count(markers) == POSES + 1 and is_level(truth[-FLAT_FOR:]), 60.0)
 
     assert not corrected
@@ -77,7 +77,7 @@ def test_turned_sensor_is_calibrated_levelled_and_still_so_after_being_killed(be
 
 
 def check_restarted(bench: Any, messages: list[Any], poses: int) -> None:
-    """See that a new process has the calibration and the poses of the one that was killed."""
+    """Check that a new process has the calibration and the poses of the killed process."""
     bench.join_anew()
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     corrected = bench.listen(Imu, 'imu/data_calibrated')

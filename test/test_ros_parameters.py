@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One table of parameters: in the code, in the node and in config/calibrator.yaml."""
+"""The parameters are the same in the code, in the node and in config/calibrator.yaml."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SETTINGS = [CalibratorSettings, SimulatorSettings]
 
 
 def test_parameter_file_is_the_table() -> None:
-    """Write it again with: python test/test_ros_parameters.py."""
+    """Check the file; write it with: python test/test_ros_parameters.py."""
     assert CONFIG.read_text(encoding='utf-8').splitlines() == list(yaml_lines(CalibratorSettings))
 
 
@@ -38,7 +38,7 @@ def test_defaults_are_accepted_by_their_parameters(settings: Any) -> None:
     assert changed(settings(), values) == settings()
 
 
-def test_numbers_may_be_written_as_they_come() -> None:
+def test_parameters_accept_numbers_of_other_types() -> None:
     settings = changed(CalibratorSettings(), {'model': 10, 'min_dwell': 2, 'sensor': 7,
                                               'use_sim_time': True})
     assert (settings.model, settings.min_dwell, settings.sensor) == ('10', 2.0, '7')
@@ -62,7 +62,7 @@ def test_lists_are_checked() -> None:
         changed(SimulatorSettings(), {'mounting': [1.0]})
 
 
-def test_capture_has_the_defaults_of_the_library_but_for_parked_robots() -> None:
+def test_capture_has_the_defaults_of_the_library_except_for_parked_robots() -> None:
     assert capture_settings(CalibratorSettings()) == CaptureSettings(repeated='merge')
 
 
@@ -71,7 +71,7 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
         capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
 
 
-def test_node_declares_them_all_and_refuses_bad_values_while_it_runs(bench: Any) -> None:
+def test_node_declares_all_parameters_and_refuses_invalid_values_while_it_runs(bench: Any) -> None:
     from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
     from rclpy.parameter import Parameter
     bench.calibrator()

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node finds what its calibration lacks, and corrects with it."""
+"""The node finds an effect that its calibration lacks, and corrects it."""
 
 from collections.abc import Callable
 import time
@@ -21,7 +21,7 @@ MOVES = np.array([0.002, -0.0015, 0.001])
 
 
 def warmed(bench: Any, readings: Readings, publisher: Any) -> None:
-    """Feed poses, each at another temperature."""
+    """Publish poses, each at another temperature."""
     for k, direction in enumerate(spread_directions(POSES)):
         temperature = 25.0 + 12.0 * np.sin(2.1 * k)
         published(bench, publisher, temperature, 0.05 if k else 1.0)  # until both have met
@@ -71,4 +71,4 @@ def test_refinement_of_too_few_poses_is_refused(bench: Any, readings: Readings) 
     bench.spin(lambda: markers and sum(m.ns == 'poses' for m in markers[-1].markers) >= 2)
     answer = bench.call('refine')
     assert not answer.success
-    assert 'too few' in answer.message
+    assert 'expected at least 4' in answer.message

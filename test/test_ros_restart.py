@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ending the nodes, the polite way and the other."""
+"""Shutdown of the nodes by signals and by a kill, and restart."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_signals_end_the_nodes_with_status_0(bench: Any, name: str, number: int)
     assert 'Traceback' not in printed
 
 
-def test_killed_at_any_moment_it_has_its_files_whole(
+def test_files_are_complete_after_a_kill_at_any_moment(
         bench: Any, readings: Callable[..., Any]) -> None:
     turned = readings(spread_directions(12))
     pauses = np.random.default_rng(5).uniform(0.1, 0.9, KILLS)

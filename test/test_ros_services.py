@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the services of the calibrator do, and what they answer where they cannot."""
+"""The services of the calibrator, and their answers if they fail."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 from accel_calib.files import read_calibration, read_poses
 from accel_calib.model import Model
 from accel_calib.ros.markers import pose_markers
-from accel_calib.session.work import asked_for, then
+from accel_calib.session.work import asked_for, next_action
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
@@ -33,17 +33,16 @@ def count(markers: list[Any], namespace: str = 'poses') -> int:
 
 def test_services_report_what_is_missing(bench: Any) -> None:
     bench.calibrator()
-    for name, words in (('fit', 'no Imu message has come'), ('set_level', 'no calibration yet'),
-                        ('capture_pose', 'no Imu message has come'), ('undo_pose', 'no poses'),
-                        ('save', 'no Imu message has come'), ('load', 'start the driver')):
+    for name, words in (('fit', 'no Imu message yet'), ('set_level', 'there is no calibration'),
+                        ('capture_pose', 'no Imu message yet'), ('undo_pose', 'no poses'),
+                        ('save', 'no Imu message yet'), ('load', 'start the driver')):
         answer = bench.call(name)
         assert not answer.success, name
         assert words in answer.message, answer.message
         assert '\n' not in answer.message
 
 
-def test_fit_of_too_few_or_flat_poses_says_which_way_to_turn(bench: Any, readings: Readings
-                                                             ) -> None:
+def test_refused_fit_advises_how_to_turn_the_sensor(bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     bench.calibrator(sensor='arm', passthrough=True)
     bench.spin(lambda: count(markers, 'next') == 2)
@@ -61,18 +60,18 @@ def test_fit_of_too_few_or_flat_poses_says_which_way_to_turn(bench: Any, reading
     assert not list(bench.home.glob('accel_calib/*.yaml'))
 
 
-def test_log_and_markers_say_that_more_poses_no_longer_help() -> None:
+def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
     asked = asked_for(poses, units_of('g'), 'auto')
-    assert re.fullmatch(r'more poses no longer help: 24 poses determine \|a\| to 0\.18 mg; call '
-                        '~/fit', then(asked))
+    assert re.fullmatch(r'more poses no longer help: 24 poses determine \|a\| to within 0\.18 mg; '
+                        'call ~/fit', next_action(asked))
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
     assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
     few = asked_for(poses.take(slice(0, 8)), units_of('g'), 'auto')
     arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers
                    if m.ns == 'next']
     np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
-    assert then(few) == text.text == few.words
+    assert next_action(few) == text.text == few.words
 
 
 def test_set_level_warns_of_a_flat_pose_on_another_face(bench: Any, readings: Readings,
@@ -83,7 +82,7 @@ def test_set_level_warns_of_a_flat_pose_on_another_face(bench: Any, readings: Re
     bench.spin(lambda: still and still[-1].data)
     answer = bench.call_while('set_level', lambda: bench.imu([0, 0, -9.6]))
     assert answer.success, answer.message
-    assert 'this pose is flat now' in answer.message
+    assert 'the mounting is levelled by this pose' in answer.message
     assert 'the flat pose reads -1.00 g on z' in answer.message
     assert 'mounted upside down, or z (or every axis) has the wrong sign' in answer.message
 
@@ -143,7 +142,7 @@ def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -
     bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
     other = stored('other.yaml', sensor='another').read_text()
     for text, words in ((good.replace('version: 2', 'version: 999'), 'version 999'),
-                        (other, "of sensor 'another'"), ('', 'not a calibration'),
+                        (other, "belongs to sensor 'another'"), ('', 'not a calibration'),
                         (good.replace('readings: m/s2', 'readings: g'), 'in g')):
         path.write_text(text)
         answer = bench.call('load')
@@ -172,7 +171,8 @@ def test_calibration_of_another_sensor_is_discarded_at_the_first_message(
     assert path.read_bytes() == before
 
 
-def test_reset_forgets_and_keeps_what_was_stored(bench: Any, readings: Readings) -> None:
+def test_reset_removes_poses_and_calibration_but_keeps_the_files(
+        bench: Any, readings: Readings) -> None:
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     bench.calibrator(sensor='arm', passthrough=True)
     bench.feed(readings(spread_directions(11)))
@@ -201,7 +201,7 @@ def test_calibration_that_cannot_be_stored_is_used_and_reported(
     bench.spin(lambda: count(markers) == 11)
     answer = bench.call('fit')
     assert not answer.success
-    assert 'cannot be stored' in answer.message
+    assert 'could not be stored' in answer.message
     got = bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
     assert abs(got.linear_acceleration.x) > 0.1
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What becomes of a message between imu/data_raw and imu/data_calibrated."""
+"""Processing of messages between imu/data_raw and imu/data_calibrated."""
 
 from __future__ import annotations
 
@@ -94,7 +94,8 @@ def test_covariances_that_mean_absent_or_unknown_are_kept(bench: Any, stored: St
     assert got.header.frame_id == 'imu_link'
 
 
-def test_readings_in_g_come_out_in_metres_per_second_squared(bench: Any, stored: Stored) -> None:
+def test_readings_in_g_are_published_in_metres_per_second_squared(
+        bench: Any, stored: Stored) -> None:
     path = stored(unit='g')
     heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(calibration_file=path, units='g')
@@ -119,7 +120,7 @@ def test_readings_that_are_not_finite_are_dropped_and_reported(bench: Any, store
     bench.send(last)
     bench.spin(lambda: any(message.header.stamp == last.header.stamp for message in heard))
     assert all(np.all(np.isfinite(force_of(message))) for message in heard)
-    bench.spin(lambda: any('2 readings were NaN' in array.status[0].message
+    bench.spin(lambda: any('dropped 2 messages with NaN' in array.status[0].message
                            for array in diagnostics))
     assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
 
@@ -127,13 +128,13 @@ def test_readings_that_are_not_finite_are_dropped_and_reported(bench: Any, store
 def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
     heard = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(use_sim_time=True)  # and nobody gives /clock
+    bench.calibrator(use_sim_time=True)  # and nobody publishes /clock
 
-    def told() -> bool:
+    def reported() -> bool:
         bench.send(bench.imu(READING))
         return any('no calibration yet' in array.status[0].message for array in diagnostics)
 
-    bench.spin(told)
+    bench.spin(reported)
     assert not heard
 
 
@@ -187,12 +188,12 @@ def test_interruptions_of_the_stamps_are_reported(bench: Any) -> None:
     bench.stamp -= 500.0
     bench.feed(level)
 
-    def told() -> bool:
+    def reported() -> bool:
         values = {value.key: value.value for value in diagnostics[-1].status[0].values}
         return values['interruptions of the clock'] == '1' and 'jump_back' in values[
             'last interruption']
 
-    bench.spin(lambda: diagnostics and told())
+    bench.spin(lambda: diagnostics and reported())
 
 
 def swapped(data: bytes) -> bytes:
@@ -205,7 +206,7 @@ def swapped(data: bytes) -> bytes:
             + doubles.astype('>f8').tobytes())
 
 
-def test_messages_in_another_encoding_go_the_same_way_and_broken_ones_are_dropped(
+def test_messages_in_another_encoding_are_corrected_and_damaged_ones_dropped(
         bench: Any, stored: Stored) -> None:
     calibration = read_calibration(path := stored(flat=FLAT))
     heard = bench.listen(Imu, 'imu/data_calibrated')
@@ -227,7 +228,8 @@ def test_messages_in_another_encoding_go_the_same_way_and_broken_ones_are_droppe
     bench.send(last)
     bench.spin(lambda: heard)
     assert stamps(heard) == [last.header.stamp]
-    bench.spin(lambda: any('3 readings' in array.status[0].message for array in diagnostics))
+    bench.spin(lambda: any('dropped 3 messages' in array.status[0].message
+                           for array in diagnostics))
 
 
 def test_messages_reach_the_session_even_if_nobody_listens(bench: Any, stored: Stored) -> None:
@@ -275,7 +277,7 @@ def test_messages_of_another_sensor_are_never_corrected(bench: Any, stored: Stor
     bench.send(last)
     bench.spin(lambda: heard and heard[-1].header.stamp == last.header.stamp)
     assert {message.header.frame_id for message in heard} == {'imu_link'}
-    bench.spin(lambda: any('20 messages were of another sensor' in array.status[0].message
+    bench.spin(lambda: any('dropped 20 messages of another sensor' in array.status[0].message
                            for array in diagnostics))
 
 
@@ -290,5 +292,5 @@ def test_corrected_messages_beyond_100_g_are_dropped_and_counted(
     bench.send(last)
     bench.spin(lambda: last.header.stamp in stamps(heard))
     assert wild.header.stamp not in stamps(heard)
-    bench.spin(lambda: any('1 corrected messages were not plausible' in array.status[0].message
-                           for array in diagnostics))
+    words = 'dropped 1 corrected message with implausible values'
+    bench.spin(lambda: any(words in array.status[0].message for array in diagnostics))

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services that answer later, in every executor the nodes may run in, and computing apart."""
+"""Services that answer later, in every executor, and the worker process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def single_threaded_executor(context: Any) -> Any:
 
 
 @pytest.mark.parametrize('make_executor', [single_threaded_executor, events_executor])
-def test_callbacks_go_on_while_a_service_works(bench: Any, make_executor: Any) -> None:
+def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any) -> None:
     context = bench.node.context
     node = Node('calibrator', context=context)
     events, ticks, threads = [0], [0], set()
@@ -111,7 +111,7 @@ def test_worker_process_computes_what_this_process_computes(
     assert process.call(os.sched_getscheduler, 0) == os.SCHED_IDLE
 
 
-def test_process_that_waits_too_long_for_the_processor_gets_its_share(
+def test_process_that_waits_too_long_is_restarted_with_normal_priority(
         process: WorkerProcess, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('accel_calib.session.worker_process._PATIENCE', 0.5)
     process.call(time.sleep, 0.7)
@@ -133,7 +133,7 @@ def test_errors_in_the_worker_process_are_raised_here(
     assert process.call(math.sqrt, 4.0) == 2.0
 
 
-def test_what_a_killed_worker_process_cannot_compute_is_computed_here(
+def test_the_node_computes_if_the_worker_process_was_killed(
         process: WorkerProcess) -> None:
     os.kill(process.call(os.getpid), signal.SIGKILL)
     assert process.call(math.sqrt, 4.0) == 2.0
@@ -144,13 +144,13 @@ def test_a_node_that_ends_does_not_wait_for_a_computation(process: WorkerProcess
     process.call(os.getpid)
     threading.Timer(WORK, process.close).start()
     began = time.monotonic()
-    with pytest.raises(InputError, match='ending'):
+    with pytest.raises(InputError, match='shutting down'):
         process.call(time.sleep, 60.0)
     assert time.monotonic() - began < 10.0
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process started."""
+    """Return the ids of the processes that a process started."""
     tasks = Path(f'/proc/{pid}/task').glob('*/children')
     return [int(child) for task in tasks for child in task.read_text().split()]
 

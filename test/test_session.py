@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibrator without ROS: whose files, which messages, and what it refuses."""
+"""The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import Any
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.files import read_calibration, read_poses, write_calibration, write_table
 from accel_calib.model import Model
-from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from accel_calib.session import CalibratorSettings, findings, Job, Log, Session
+from accel_calib.session.health import Level
 from accel_calib.session.store import Identity, load, Lock, Store, store_of, StoreInUseError
 from accel_calib.sphere import rotation_from_rpy, spread_directions
 import numpy as np
@@ -27,7 +28,7 @@ Stored = Callable[..., Path]
 
 
 class Driver:
-    """A session with its jobs done at once, a clock of its own, and the log kept."""
+    """A session whose jobs are done at once, with its own clock and a stored log."""
 
     def __init__(self, topic: str = '/imu/data_raw', **parameters: Any) -> None:
         self.now = 0.0
@@ -53,7 +54,7 @@ class Driver:
         return job
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
-        """Push readings in m/s², and return how many messages were accepted."""
+        """Push readings [m/s²], and return the number of accepted messages."""
         accepted = 0
         for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
             self.now += len(block) / RATE
@@ -67,7 +68,7 @@ class Driver:
             self.handle()
         return accepted
 
-    def said(self, severity: str = 'error') -> str:
+    def logged(self, severity: str = 'error') -> str:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
@@ -119,7 +120,7 @@ def test_files_of_version_1_are_taken_over_once(home: Path, readings: Readings, 
         driver.feed(readings([[0, 0, 1]])[:10])
     assert left.session.active.calibration is not None
     assert len(left.session.live.book.poses()) == 1
-    assert 'imu_link.yaml is now' in left.said()
+    assert 'imu_link.yaml is now' in left.logged()
     assert right.session.active.calibration is None
     assert len(right.session.live.book.poses()) == 0
     assert {path.name for path in home.iterdir()} == {
@@ -162,9 +163,9 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert first.session.publishes
     assert not second.session.publishes
     assert second.finding('calibration').level == Level.ERROR
-    assert 'is in use by the node of process' in second.finding('calibration').words
+    assert 'is used by the node with process id' in second.finding('calibration').words
     for command in (second.session.fit, second.session.save, second.session.load):
-        with pytest.raises(AccelCalibError, match='in use by the node of process'):
+        with pytest.raises(AccelCalibError, match='is used by the node with process id'):
             command()
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
@@ -190,7 +191,7 @@ def test_lock_ends_with_its_release(tmp_path: Path) -> None:
     lambda text: text[:len(text) // 2],
     lambda text: text.replace('axis_gain:', 'axis_gain: -1 #'),
     lambda text: text.replace('covariance:', 'covariances:')])
-def test_damaged_calibration_is_set_aside_and_the_poses_are_used(
+def test_damaged_calibration_is_renamed_and_the_poses_are_used(
         spoil: Callable[[str], str], stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
     driver = Driver(calibration_file=str(path))
@@ -225,7 +226,7 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
 
 
 @pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
-def test_poses_of_another_sensor_or_unit_are_set_aside(tmp_path: Path, changes: Any) -> None:
+def test_poses_of_another_sensor_or_unit_are_renamed(tmp_path: Path, changes: Any) -> None:
     store = Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
     store.save_poses(read_poses(_table(tmp_path / 'poses.csv')))
     assert len(load(store).poses) == 1
@@ -240,7 +241,7 @@ def _table(path: Path) -> Path:
     return path
 
 
-def test_nothing_stored_is_no_problem(tmp_path: Path) -> None:
+def test_an_empty_store_is_no_problem(tmp_path: Path) -> None:
     loaded = load(Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2'))
     assert (loaded.calibration, loaded.poses, loaded.problem, loaded.notes) == (None, None, '', ())
 
@@ -258,13 +259,13 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert driver.session.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
     assert not driver.session.live.detector.still
-    assert "frame_id 'another', those before it 'imu_link'" in driver.said()
+    assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.foreign == 1
-    assert '1 messages were of another sensor' in driver.finding('values').words
+    assert 'dropped 1 message of another sensor' in driver.finding('values').words
 
 
-def test_silent_sensor_may_be_replaced_by_another_with_its_own_files(
+def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
         home: Path, readings: Readings) -> None:
     driver = Driver()
     turned = readings(spread_directions(12))
@@ -275,7 +276,7 @@ def test_silent_sensor_may_be_replaced_by_another_with_its_own_files(
     assert driver.session.sensor == 'another'
     assert driver.session.active.calibration is None
     assert len(driver.session.live.book.poses()) < 2
-    assert "now have frame_id 'another'" in driver.said('warning')
+    assert "now have frame_id 'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
     assert driver.session.active.calibration is not None
@@ -287,19 +288,19 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     driver = Driver(calibration_file=str(stored()))
     rest = readings([[0, 0, 1]], dwell=6.0)
     for name in ('capture_pose', 'set_level'):
-        with pytest.raises(AccelCalibError, match='no Imu message has come'):
+        with pytest.raises(AccelCalibError, match='no Imu message yet'):
             getattr(driver.session, name)()
     driver.feed(rest[:150])
     driver.now += 6.0
     for name in ('capture_pose', 'set_level'):
-        with pytest.raises(AccelCalibError, match=r'came 6\.0 s ago, expected one in the last'):
+        with pytest.raises(AccelCalibError, match=r'arrived 6\.0 s ago, expected one within'):
             getattr(driver.session, name)()
     driver.feed(rest[150:160])
     assert driver.done(driver.session.capture_pose()).startswith('1 pose:')
-    assert 'flat now' in driver.done(driver.session.set_level())
+    assert 'levelled by this pose' in driver.done(driver.session.set_level())
 
 
-def test_the_heading_is_found_with_the_nose_down_and_kept(
+def test_the_heading_is_set_with_the_nose_down_and_kept(
         stored: Stored, readings: Readings) -> None:
     path = stored()
     found = read_calibration(path)
@@ -318,17 +319,17 @@ def test_the_heading_is_found_with_the_nose_down_and_kept(
     driver.feed(readings([flat], dwell=6.0)[:200])
     driver.done(driver.session.set_level())
     assert yaw() > 50.0
-    with pytest.raises(InputError, match=r'within 10° of the flat one'):
+    with pytest.raises(InputError, match=r'within 10° of the flat pose'):
         driver.session.set_heading()
     driver.feed(readings([nose_down], dwell=6.0)[:200])
-    assert 'the nose is down' in driver.done(driver.session.set_heading())
+    assert 'the heading is set by this pose' in driver.done(driver.session.set_heading())
     assert yaw() < 1.0
     driver.feed(readings([flat], dwell=6.0)[:200])
     driver.done(driver.session.set_level())
     assert yaw() < 1.0
 
 
-def test_effects_are_held_at_the_edge_of_what_was_seen_and_warned_of(
+def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
     found = read_calibration(path)
@@ -345,7 +346,7 @@ def test_effects_are_held_at_the_edge_of_what_was_seen_and_warned_of(
         driver.session.set_temperature(temperature)
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
         assert driver.finding('calibration').level == level
-    assert 'temperature is 40, the calibration has seen 20 to 30' in driver.finding(
+    assert 'temperature is 40, but the range of the calibration is 20 to 30' in driver.finding(
         'calibration').words
     calibration = read_calibration(path)
     at = [calibration.apply([0.0, 0.0, GRAVITY], temperature=each) for each in (30.0, 40.0, 25.0)]

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Still or not: sensors of all kinds, hands, slow turning, broken stamps."""
+"""The stillness detector: many sensors, tremor, slow turning, interrupted stamps."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def captured(time, reading, settings=CaptureSettings(), units=G, **columns) -> C
 
 
 def pushed(time, reading, settings=CaptureSettings(), rate=None) -> StillDetector:
-    """Return a detector that got the samples in blocks of 1 to 60."""
+    """Return a detector that received the samples in blocks of 1 to 60."""
     detector = StillDetector(settings, G)
     table = rows(time, reading, rate)
     ends = np.cumsum(np.random.default_rng(len(time)).integers(1, 60, len(time)))
@@ -93,7 +93,7 @@ def assert_all_found(result: Captured, truth, missed=0):
     {'rate': 25.0, 'dwell': (2.0, 8.0)}, {'rate': 100.0, 'correlation': 0.9, 'dwell': (3.0, 8.0)},
     {'noise': 5e-5, 'step': 1e-3}, {'noise': 3e-4, 'step': 4e-3}, {'dwell': (1.5, 1.6)}],
     ids=lambda sensor: ' '.join(f'{key} {value}' for key, value in sensor.items()) or 'usual')
-def test_every_pose_of_a_sensor_is_found_and_none_in_between(sensor, seed):
+def test_all_poses_are_found_and_no_others(sensor, seed):
     time, reading, truth = turned(seed, **sensor)
     assert_all_found(captured(time, reading), truth)
 
@@ -107,7 +107,7 @@ def test_counts_and_volts_work_like_g(seed):
     assert_all_found(captured(time, reading, units=units_of('m/s2')), truth)
 
 
-def test_a_sensor_sampled_each_ten_seconds_is_captured():
+def test_a_sensor_sampled_every_ten_seconds_is_captured():
     time, reading = still(3, 4000.0, rate=0.1, noise=7e-5)
     reading[200:] += [0.3, -0.2, -0.05]
     assert len(captured(time, reading).poses) == 2
@@ -115,7 +115,7 @@ def test_a_sensor_sampled_each_ten_seconds_is_captured():
 
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('blocks', [1, 7, 1000])
-def test_streaming_and_blocks_give_the_dwells_of_the_whole(seed, blocks):
+def test_dwells_do_not_depend_on_streaming_or_blocks(seed, blocks):
     time, reading, _ = turned(seed, poses=6)
     rate = np.random.default_rng(seed).normal(0.02, 2e-3, reading.shape)
     one = pushed(time, reading, rate=rate).dwells()
@@ -175,7 +175,7 @@ def test_a_slow_turn_there_and_back_within_a_dwell_of_a_noisy_sensor_is_found():
 
 
 def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
-    """Give a sensor put down again and again; one rest is turned at 1 °/s. Its gyro tells."""
+    """Return readings and rates of rests; one rest is turned at 1 °/s."""
     rng = np.random.default_rng(3)
     readings, rates = [], []
     for index in range(count):
@@ -190,14 +190,14 @@ def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
     return np.arange(len(reading)) / 100.0, reading, np.concatenate(rates)
 
 
-def test_a_dwell_too_short_to_show_slow_turning_in_its_noise_is_no_pose():
+def test_a_dwell_too_short_to_exclude_slow_turning_is_not_a_pose():
     time, reading, _ = rests_with_a_gyro(None)
     assert len(captured(time, reading).poses) < 4
     time, reading, _ = rests_with_a_gyro(None, noise=0.005)
     assert len(captured(time, reading).poses) == 8
 
 
-def test_a_gyro_tells_rests_from_slow_turning_once_its_bias_is_known():
+def test_a_gyro_distinguishes_rests_from_slow_turning_once_its_bias_is_known():
     time, reading, rate = rests_with_a_gyro(None)
     assert len(captured(time, reading, rate=rate).poses) == 8
     time, reading, rate = rests_with_a_gyro(5)
@@ -218,7 +218,7 @@ def test_turning_about_the_vertical_counts_as_still():
 
 
 @pytest.mark.parametrize('amplitude', [0.01, 0.03])
-def test_a_hand_held_tremor_is_no_pose_once_the_sensor_was_put_down(amplitude):
+def test_a_hand_held_tremor_is_not_a_pose_after_a_quiet_rest(amplitude):
     time, reading, _ = turned(2, noise=2e-3, poses=4)
     first, held = still(8, 5.0)
     held = held + amplitude * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
@@ -227,7 +227,7 @@ def test_a_hand_held_tremor_is_no_pose_once_the_sensor_was_put_down(amplitude):
     assert result.poses['time'].min() > 5.0
 
 
-def test_a_knock_does_not_cut_a_dwell_in_two():
+def test_a_knock_does_not_divide_a_dwell():
     time, reading = still(4, 8.0)
     reading[400:406] += 0.4
     result = captured(time, reading)
@@ -235,7 +235,7 @@ def test_a_knock_does_not_cut_a_dwell_in_two():
     assert result.samples > 700
 
 
-def test_a_stretch_shorter_than_min_dwell_is_no_dwell():
+def test_a_stretch_shorter_than_min_dwell_is_not_a_dwell():
     time, reading, _ = turned(1, dwell=(1.5, 1.6))
     assert len(captured(time, reading, CaptureSettings(min_dwell=2.0)).poses) == 0
 
@@ -256,7 +256,7 @@ def test_limits_of_the_user_override_the_adaptive_ones():
     assert len(captured(time, reading, CaptureSettings(still_gyro_max=0.04), rate=rate).poses) == 1
 
 
-def test_the_running_dwell_is_there_before_it_ends():
+def test_the_ongoing_dwell_is_available_before_it_ends():
     time, reading = still(6, 4.0)
     detector = StillDetector(CaptureSettings(), G)
     detector.push(rows(time[:80], reading[:80]))
@@ -276,7 +276,7 @@ def test_the_running_dwell_is_there_before_it_ends():
 
 
 @pytest.mark.parametrize('correlation', [0.0, 0.6, 0.9])
-def test_the_stated_noise_of_a_mean_is_its_real_one(correlation):
+def test_the_stated_noise_of_a_mean_is_correct(correlation):
     scores = []
     for seed in range(40):
         time, reading, truth = turned(seed, correlation=correlation, poses=6)
@@ -287,7 +287,7 @@ def test_the_stated_noise_of_a_mean_is_its_real_one(correlation):
     assert 0.85 < np.std(scores) < 1.15
 
 
-def test_a_long_dwell_takes_bounded_memory_and_keeps_its_mean():
+def test_a_long_dwell_needs_bounded_memory_and_keeps_its_mean():
     time, reading = still(1, 300.0, rate=50.0)
     result = captured(time, reading)
     assert len(result.poses) == 1
@@ -295,7 +295,7 @@ def test_a_long_dwell_takes_bounded_memory_and_keeps_its_mean():
     assert result.poses['count'][0] > 0.6 * len(time)
 
 
-def test_a_detector_keeps_only_the_last_dwells_and_those_are_as_they_would_be():
+def test_a_detector_that_keeps_only_the_last_dwells_returns_the_same_dwells():
     time, reading, _ = turned(3, poses=8)
     detector = StillDetector(CaptureSettings(), G, keep=3)
     detector.push(rows(time, reading))
@@ -304,7 +304,7 @@ def test_a_detector_keeps_only_the_last_dwells_and_those_are_as_they_would_be():
         each.start for each in pushed(time, reading).dwells()[-3:]]
 
 
-def test_a_dwell_that_later_ones_show_not_to_be_still_is_doubtful():
+def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     reading = turned(2, noise=2e-3, poses=4)[1]
     first, held = still(8, 5.0)
     held = held + 0.01 * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rules of the project that no linter knows: which part may import which."""
+"""Rules of the project that linters do not check: imports between parts."""
 
 import ast
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ LAYERS = (
     ('ros',),
     ('cli',),
 )
-"""Parts of the package, lowest first; each imports from those below it and from itself."""
+"""Parts of the package, lowest first. Each part imports only from lower parts and itself."""
 
 RANKS = {part: rank for rank, layer in enumerate(LAYERS) for part in layer}
 ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|srvs|interfaces)')
@@ -41,7 +41,7 @@ def name_of(path: Path) -> str:
 
 
 def imports_of(path: Path) -> Iterator[str]:
-    """Yield the full names that a module imports, those for types too."""
+    """Yield the full names that a module imports, including those for types."""
     package = path.parent.relative_to(ROOT).parts
     for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
@@ -63,8 +63,8 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 def test_imports_point_one_way(path: Path) -> None:
     part = part_of(path)
     if part == '__init__':
-        return  # which imports the public names for types alone
-    assert part in RANKS, f'say in LAYERS where {part} belongs'
+        return  # imports the public names only for types
+    assert part in RANKS, f'add {part} to LAYERS'
     inside = [name for name in imports_of(path) if name.startswith('accel_calib.')]
     others = {name.split('.')[1] for name in inside} - {part, '__version__'}
     wrong = {other for other in others if RANKS.get(other, len(LAYERS)) >= RANKS[part]}

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stated variances hold 95 % whatever the noise is beside what it is said to be."""
+"""Intervals by the stated variance contain 95 %, also if the stated noise is wrong."""
 
 from accel_calib.estimate.noise import variance_factor
 import numpy as np
@@ -11,7 +11,7 @@ SETS = 4000
 
 
 def share_held(ratio, dof, noise_known):
-    """Give the share of values within 1.96 standard deviations, of noise of this variance."""
+    """Return the share of values within 1.96 standard deviations, for noise of this variance."""
     rng = np.random.default_rng(dof)
     chi2 = ratio * rng.chisquare(dof, SETS)
     value = np.sqrt(ratio) * rng.normal(size=SETS)
@@ -21,17 +21,17 @@ def share_held(ratio, dof, noise_known):
 
 @pytest.mark.parametrize('ratio', [1.0, 9.0])
 @pytest.mark.parametrize('dof', [27, 91])
-def test_intervals_hold_where_residuals_can_tell_the_noise(ratio, dof):
+def test_intervals_contain_the_truth_if_residuals_determine_the_noise(ratio, dof):
     assert share_held(ratio, dof, noise_known=True) == pytest.approx(0.95, abs=0.02)
 
 
-def test_right_noise_holds_even_with_few_residuals():
+def test_intervals_with_correct_noise_contain_the_truth_with_few_residuals():
     assert share_held(1.0, 3, noise_known=True) == pytest.approx(0.95, abs=0.02)
 
 
 @pytest.mark.parametrize('ratio', [0.04, 1.0, 25.0])
 @pytest.mark.parametrize('dof', [3, 27])
-def test_unknown_noise_comes_from_the_residuals_alone(ratio, dof):
+def test_unknown_noise_is_estimated_from_the_residuals_alone(ratio, dof):
     assert share_held(ratio, dof, noise_known=False) == pytest.approx(0.95, abs=0.01)
 
 
@@ -40,6 +40,6 @@ def test_poses_that_repeat_better_than_stated_are_believed():
     assert share_held(0.04, 91, noise_known=True) > 0.93
 
 
-def test_without_residuals_measured_noise_is_believed_and_usual_noise_is_doubted():
+def test_without_residuals_measured_noise_is_used_and_assumed_noise_is_increased():
     assert variance_factor(0.0, 0, True) == 1.0
     assert variance_factor(0.0, 0, False) > 2.0

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the wiring and wrong units are said in words."""
+"""Wiring faults and wrong units are reported."""
 
 from itertools import permutations, product
 import json
@@ -26,7 +26,7 @@ ALL = [np.diag(signs) @ np.eye(3)[list(order)]
 
 
 def wired(mat_p, seed=1, count=16, units=G):
-    """Give poses of known orientation whose axes are wired by mat_p."""
+    """Return poses of known orientation whose axes are permuted by mat_p."""
     rng = np.random.default_rng(seed)
     directions = spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
     poses = simulate_poses(sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment'),
@@ -43,50 +43,50 @@ def wired(mat_p, seed=1, count=16, units=G):
     (SWAP_XY, 'x and y are swapped'),
     (np.eye(3)[[0, 2, 1]], 'y and z are swapped'),
     (np.diag([-1.0, -1, 1]) @ SWAP_XY,
-     'the axes are mixed up: x reads -y, y reads -x, a mirror image'),
+     'the axes are permuted to a mirror image: x reads -y, y reads -x'),
     (np.diag([1.0, -1, 1]) @ SWAP_XY,
-     'the sensor is turned by 90° about z (x reads +y, y reads -x): a rotation'),
-    (np.diag([-1.0, 1, 1]) @ SWAP_XY, 'the sensor is turned by -90° about z'),
-    (np.diag([-1.0, -1, 1]), 'the sensor is turned by 180° about z (x reads -x, y reads -y)'),
-    (rotation_from_rpy(0.0, 0.0, np.radians(45.0)).T, 'the sensor is turned by 45° about z'),
+     'the sensor is rotated by 90° about z (x reads +y, y reads -x)'),
+    (np.diag([-1.0, 1, 1]) @ SWAP_XY, 'the sensor is rotated by -90° about z'),
+    (np.diag([-1.0, -1, 1]), 'the sensor is rotated by 180° about z (x reads -x, y reads -y)'),
+    (rotation_from_rpy(0.0, 0.0, np.radians(45.0)).T, 'the sensor is rotated by 45° about z'),
     (rotation_from_rpy(0.0, 0.0, np.radians(45.0)) @ np.diag([1.0, 1, -1]),
      'the readings are a mirror image: an axis has the wrong sign')])
-def test_a_fault_is_named_and_model_12_corrects_for_it(mat_p, words):
+def test_a_wiring_fault_is_named_and_model_12_corrects_it(mat_p, words):
     poses = wired(mat_p)
     calibration = fit_poses(poses, G)
     assert calibration.name == '12'
-    assert f'against the known orientations {words}' in calibration.warnings[0]
-    assert 'model 12 corrects for it' in calibration.warnings[0]
+    assert f'according to the known orientations, {words}' in calibration.warnings[0]
+    assert 'model 12 corrects it' in calibration.warnings[0]
     np.testing.assert_allclose(calibration.correct(poses.reading), poses['reference'], atol=3e-3)
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_right_wiring_is_left_alone(seed):
+def test_correct_wiring_causes_no_warning(seed):
     assert not fit_poses(wired(np.eye(3), seed), G).warnings
     tilted = wired(rotation_from_rpy(*np.radians((8.0, -5.0, 10.0))), seed)
     assert fault_of(axes_of(tilted.reading, tilted['reference'])) is None
 
 
 def test_each_of_the_48_ways_is_told_apart_under_common_errors():
-    told = set()
+    faults = set()
     for number, mat_p in enumerate(ALL):
         poses = wired(mat_p, seed=number, count=8)
-        told.add(fault_of(axes_of(poses.reading, poses['reference'])))
-    assert len(told) == 48
-    assert None in told
+        faults.add(fault_of(axes_of(poses.reading, poses['reference'])))
+    assert len(faults) == 48
+    assert None in faults
 
 
 @pytest.mark.parametrize('units', [units_of('m/s2'), Units('native', 4060.0)])
-def test_a_fault_is_named_in_other_units(units):
+def test_a_wiring_fault_is_named_in_other_units(units):
     poses = wired(SWAP_XY, units=units)
     poses = poses.with_columns(reading=poses.reading + (5000.0 if units.name == 'native' else 0))
     calibration = fit_poses(poses, units_of(units.name))
     assert 'x and y are swapped' in calibration.warnings[0]
 
 
-def test_the_norm_model_does_not_correct_for_it_and_says_so():
+def test_model_10_does_not_correct_a_wiring_fault_and_warns():
     calibration = fit_poses(wired(SWAP_XY), G, model='10')
-    assert 'x and y are swapped; model 10 does not correct for it' in calibration.warnings[0]
+    assert 'x and y are swapped; model 10 does not correct it' in calibration.warnings[0]
 
 
 def test_a_knocked_pose_does_not_hide_the_fault():
@@ -97,7 +97,7 @@ def test_a_knocked_pose_does_not_hide_the_fault():
     assert 'the y axis has the wrong sign' in calibration.warnings[0]
 
 
-def test_without_known_orientations_that_tell_the_axes_nothing_is_said():
+def test_without_sufficient_known_orientations_there_is_no_wiring_warning():
     poses = wired(SWAP_XY)
     columns = {key: value for key, value in poses.columns.items() if key != 'reference'}
     assert not fit_poses(Poses(columns, poses.row), G).warnings
@@ -119,7 +119,7 @@ def levelled(up, frame='ros'):
     ((0, 0.1, 1), 'win8', 'reads +1.00 g on z, where a sensor that lies flat reads 1 g on -z'),
     ((0, 1, 0.1), 'ros', 'mounted with +y up, or y and z are swapped'),
     ((-1, 0, 0), 'ned', 'mounted with -x up, or x and z are swapped')])
-def test_a_flat_pose_on_another_face_is_told(up, frame, words):
+def test_a_flat_pose_on_another_face_causes_a_warning(up, frame, words):
     calibration = levelled(up, frame)
     assert len(calibration.warnings) == 1
     assert calibration.warnings[0].startswith('the flat pose ')
@@ -128,38 +128,39 @@ def test_a_flat_pose_on_another_face_is_told(up, frame, words):
 
 @pytest.mark.parametrize(('up', 'frame'), [((0, 0, 1), 'ros'), ((0.5, -0.3, 1), 'ned'),
                                            ((0.1, 0, -1), 'win8')])
-def test_a_flat_pose_as_expected_is_left_alone(up, frame):
+def test_an_expected_flat_pose_causes_no_warning(up, frame):
     assert not levelled(up, frame).warnings
 
 
-def test_levelling_again_takes_the_warning_back():
+def test_levelling_again_removes_the_warning():
     turned = levelled((0, 0, -1))
     flat = turned.model.rotation.T @ np.array([0.0, 0.0, 1.0])
     assert not level(turned, turned.predict(flat[np.newaxis])[0], 'ros').warnings
     assert len(level(turned, turned.predict(np.array([[0, 0, 1.0]]))[0], 'ros').warnings) == 1
 
 
-@pytest.mark.parametrize(('said', 'per_g', 'advice'), [
-    ('m/s2', 1.0, 'give the units of the readings: g'),
-    ('g', 9.8, 'give the units of the readings: m/s2'),
+@pytest.mark.parametrize(('units', 'per_g', 'advice'), [
+    ('m/s2', 1.0, 'set the units of the readings to g'),
+    ('g', 9.8, 'set the units of the readings to m/s2'),
     ('m/s2', 1000.0, 'they look like cm/s2 or mg'),
     ('g', 1000.0, 'they look like cm/s2 or mg'),
     ('m/s2', 32.17, 'they look like ft/s2'),
-    ('g', 4060.0, 'give the units of the readings: native'),
-    ('m/s2', 16384.0, 'give the units of the readings: native')])
-def test_readings_in_another_unit_are_refused(said, per_g, advice):
+    ('g', 4060.0, 'set the units of the readings to native'),
+    ('m/s2', 16384.0, 'set the units of the readings to native')])
+def test_readings_in_another_unit_are_refused(units, per_g, advice):
     poses = wired(np.eye(3), units=Units('native', per_g))
     for table in (poses, Poses({'reading': poses.reading}, poses.row)):
-        with pytest.raises(InputError, match='the readings are about') as refused:
-            fit_poses(table, units_of(said))
+        with pytest.raises(InputError, match='length of the readings is about') as refused:
+            fit_poses(table, units_of(units))
         assert advice in refused.value.advice
 
 
 @pytest.mark.parametrize(('units', 'factor', 'message'), [
-    (units_of('m/s2'), 1.0 / 9.80665, r'about 1 long, expected about 9.807 in m/s2'),
-    (G, 9.80665, 'about 9.807 long, expected about 1 in g'),
-    (Units('native', 4060.0), 9.80665, 'about 9.807 long, expected about 1 in g, as'),
-    (G, 0.0, 'about 0 long')])
+    (units_of('m/s2'), 1.0 / 9.80665, 'about 1, expected about 9.807 in m/s2'),
+    (G, 9.80665, 'about 9.807, expected about 1 in g'),
+    (Units('native', 4060.0), 9.80665,
+     'about 9.807, expected about 1 in g, the unit of known forces'),
+    (G, 0.0, 'is about 0, expected')])
 def test_known_forces_in_another_unit_are_refused(units, factor, message):
     poses = wired(np.eye(3), units=units)
     poses = poses.with_columns(reference=poses['reference'] * factor)
@@ -171,11 +172,11 @@ def test_native_readings_may_be_in_any_unit():
     assert fit_poses(wired(np.eye(3), units=Units('native', 9.8)), units_of('native')).units.per_g
 
 
-def test_the_command_tells_of_the_fault(tmp_path, capsys):
+def test_the_command_reports_the_wiring_fault(tmp_path, capsys):
     poses, path = wired(np.diag([1.0, 1, -1])), tmp_path / 'poses.csv'
     write_table(path, poses)
     assert main(['fit', str(path), '--units', 'g', '--json', '-']) == 0
     warnings = json.loads(capsys.readouterr().out)['warnings']
     assert 'the z axis has the wrong sign' in warnings[0]
     assert main(['fit', str(path), '--units', 'm/s2']) == 2
-    assert 'give the units of the readings: g' in capsys.readouterr().err
+    assert 'set the units of the readings to g' in capsys.readouterr().err

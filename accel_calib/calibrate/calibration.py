@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The Calibration: a fitted model with its units, its sensor and what is known of its quality."""
+"""The Calibration: a fitted model with its units, its sensor and its quality."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ from numpy.typing import ArrayLike
 from .checks import FLAT, flat_warnings
 from .mounting import FrameName, mounting, with_heading, with_heading_of
 from ..effects import AXES, Context
+from ..errors import StoredCalibrationError
 from ..html_table import table
 from ..model import correct, force_slope, Model, parameter_names, predict, sensor_force
 from ..table import Floats, Poses, Table
 from ..units import Units
 
+EDITED = 'the file was edited by hand since it was stored'
+"""Warning of a calibration whose file does not match its checksum."""
+
 HELD = ('time', 'temperature', 'supply_voltage')
-"""Quantities at whose range the effects end: beyond what the poses saw they are held."""
+"""Context that is limited to the range of the poses; effects are not extrapolated."""
 
 _Known = TypeVar('_Known', bound=Table)
 
@@ -31,7 +35,7 @@ _Known = TypeVar('_Known', bound=Table)
 @dataclass(frozen=True)
 class Quality:
     """
-    How well a calibration does on the poses it was fitted to.
+    Residuals and other figures of a calibration, over the poses it was fitted to.
 
     Parameters
     ----------
@@ -40,13 +44,15 @@ class Quality:
     max_before_percent, max_after_percent : float
         Largest error without and with the calibration [% of 1 g].
     held_out_rms_mg : float or None
-        Residual of each pose when the others are fitted [mg]; None if a pose cannot be left out.
+        Residual if each pose is predicted from a fit of the others [mg]; None if the others do not
+        determine the model.
     noise_floor_mg : float or None
-        What the residual would be if the model were right [mg]; None if the noise is not known.
+        Expected residual of a correct model [mg]; None if the noise is not known.
     chi2_per_dof : float or None
-        Squared residuals over their noise; None without noise or redundancy.
+        Squared residuals in units of the noise, per degree of freedom; None if the noise is not
+        known or there are no degrees of freedom.
     coverage : float
-        Share of the sphere that lies within 45° of a pose.
+        Share of the sphere within 45° of a pose.
 
     """
 
@@ -62,7 +68,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class Rejected:
-    """A pose that was left out: its row, from 1, and why."""
+    """A pose that the fit does not use: its row, 1-based, and the reason."""
 
     row: int
     reason: str
@@ -71,12 +77,12 @@ class Rejected:
 @dataclass(frozen=True, repr=False)
 class Calibration:
     """
-    A fitted model, ready to correct.
+    A fitted model that corrects readings.
 
     Parameters
     ----------
     name : str
-        Model that was fitted: 4, 7, 9, 10 or 12, or ``ideal``.
+        Name of the fitted model: 4, 7, 9, 10, 12 or ``ideal``.
     method : str
         ``ml`` or ``algebraic``.
     model : Model
@@ -84,25 +90,25 @@ class Calibration:
     units : Units
         Unit of the readings.
     sensor : str
-        Name of the sensor, frame_id of its messages; empty if it was not given.
+        Name of the sensor, or frame_id of its messages; empty if not known.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
     date : str
-        When it was made, ISO 8601.
+        Date of the fit, ISO 8601.
     covariance : (p, p) array
-        Of ``model.vector`` [g].
+        Covariance of ``model.vector`` [g²].
     quality : Quality
-        Figures over the poses used.
+        Residuals and other figures over the poses used.
     poses : Poses
-        All poses given, in the unit of the readings.
+        All poses, in the unit of the readings.
     rejected : tuple of Rejected
-        Those that were left out.
+        Poses that the fit does not use.
     reason : str
-        Why this model.
+        Reason for the choice of the model.
     warnings : tuple of str
-        What a user should know.
+        Warnings for the user.
     stream : str
-        Topic of its messages, with namespace; empty for recordings.
+        Topic of the messages, with namespace; empty for recordings.
 
     """
 
@@ -145,12 +151,12 @@ class Calibration:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the values, in the order of the covariance."""
+        """Names of the values, in the order of `covariance`."""
         return parameter_names(self.model.effects)
 
     @property
     def force_per_g(self) -> float:
-        """Units of corrected force per g: 1 for native readings, whose force is in g."""
+        """Corrected force per g: 1 for native readings, whose corrected force is in g."""
         return 1.0 if self.units.name == 'native' else self.units.per_g
 
     @property
@@ -168,20 +174,20 @@ class Calibration:
         """
         W⁻¹, (3, 3), in units of the reading.
 
-        Corrected force is ``rotation.T @ matrix @ (reading - offset)``, as long as the calibration
-        has offset and gains alone; `correct` knows the other effects too.
+        The corrected force is ``rotation.T @ matrix @ (reading - offset)`` if the calibration has
+        only offset and gains. `correct` includes the other effects.
 
         """
         return np.linalg.inv(self.gain)
 
     @property
     def rotation(self) -> Floats:
-        """ΔR, (3, 3): takes a vector in the levelled frame to the sensor frame."""
+        """ΔR, (3, 3): transforms from the levelled frame to the sensor frame."""
         return self.model.rotation
 
     @property
     def is_levelled(self) -> bool:
-        """Return whether ΔR is known."""
+        """Whether ΔR is known."""
         return not np.array_equal(self.rotation, np.eye(3))
 
     @property
@@ -205,13 +211,13 @@ class Calibration:
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Least and largest time, temperature and supply at which its effects were seen."""
+        """Range of time, temperature and supply over the poses, for the context of the effects."""
         used = self.used_poses
         return {key: (float(np.min(used[key])), float(np.max(used[key])))
                 for key in HELD if key in self.model.needs and key in used and len(used)}
 
     def held(self, known: _Known) -> _Known:
-        """Return a table whose context is held at the edge of `ranges`."""
+        """Return a table with its context limited to `ranges`."""
         if not any(key in known for key in self.ranges):
             return known
         return known.with_columns(**_held(known.columns, self.ranges))
@@ -223,9 +229,9 @@ class Calibration:
         Parameters
         ----------
         reading : (n, 3) array
-            In the unit of the readings.
+            Readings, in the unit of the calibration.
         context : mapping of str to array, optional
-            What the effects need; held at the edge of `ranges`.
+            Columns that the effects need; limited to `ranges`.
 
         Returns
         -------
@@ -235,7 +241,7 @@ class Calibration:
         Raises
         ------
         InputError
-            If the effects need a column that is not given, or cannot be undone.
+            If a column is missing, or the effects cannot be corrected.
 
         """
         known = self._context(context)
@@ -248,10 +254,10 @@ class Calibration:
         Parameters
         ----------
         readings : (n, 3) or (3,) array
-            In the unit of the readings.
+            Samples, in the unit of the calibration.
         **known : float or (n,) array, (n, 3) array for ``rate``
-            What the effects need beside a sample: ``time`` [s], ``temperature`` [°C],
-            ``supply_voltage`` [V], ``rate`` [rad/s].
+            Context that the effects need: ``time`` [s], ``temperature`` [°C], ``supply_voltage``
+            [V], ``rate`` [rad/s].
 
         Returns
         -------
@@ -261,7 +267,7 @@ class Calibration:
         Raises
         ------
         InputError
-            If the effects need a quantity that is not given, or cannot be undone.
+            If context is missing, or the effects cannot be corrected.
 
         """
         given = np.asarray(readings, float)
@@ -272,25 +278,25 @@ class Calibration:
         return self.correct(rows, of_samples(context, len(rows))).reshape(given.shape)
 
     def predict(self, force: Floats, context: Context | None = None) -> Floats:
-        """Return what the sensor reads under this (n, 3) force; the inverse of `correct`."""
+        """Return the (n, 3) readings for an (n, 3) force; the inverse of `correct`."""
         known = self._context(context)
         return self.units.from_g(predict(self.model, force / self.force_per_g, known))
 
     def force_covariance(self, force: Floats, context: Context | None = None) -> Floats:
         """
-        Return how uncertain the calibration leaves a corrected force.
+        Return the covariance of corrected forces that the calibration causes.
 
         Parameters
         ----------
         force : (n, 3) array
             Corrected forces, in the levelled frame, as `correct` returns them.
         context : mapping of str to array, optional
-            What the effects need, n rows each.
+            Columns that the effects need, n rows each.
 
         Returns
         -------
         (n, 3, 3) array
-            Covariances in the squared unit of force.
+            Covariances, in the squared unit of the force.
 
         """
         model, known = self.model, self._context(context)
@@ -306,17 +312,33 @@ class Calibration:
         return {**context, **_held(context, self.ranges)}
 
 
+def check_sensor(calibration: Calibration, sensor: str) -> None:
+    """
+    Check that a calibration belongs to this sensor; an empty name matches any sensor.
+
+    Raises
+    ------
+    StoredCalibrationError
+        If the calibration belongs to another sensor.
+
+    """
+    if calibration.sensor and sensor and calibration.sensor != sensor:
+        raise StoredCalibrationError(f'the calibration belongs to sensor {calibration.sensor!r}, '
+                                     f'but the readings come from {sensor!r}',
+                                     'use the calibration of this sensor, or fit one')
+
+
 def of_samples(known: Context, count: int) -> Context:
     """
     Return the context of single samples.
 
-    How strongly the sensor vibrates and which pose it came from cannot be known from one sample;
-    both are taken as none, and so is a rate that is NaN.
+    A single sample does not show the vibration or the previous pose. Both are set to zero, and so
+    is a rate that is NaN.
 
     Parameters
     ----------
     known : mapping of str to array
-        What is known beside the samples.
+        Known context of the samples.
     count : int
         Number of samples.
 
@@ -332,7 +354,7 @@ def _held(context: Context, ranges: Mapping[str, tuple[float, float]]) -> dict[s
 
 
 def _linear_rows(model: Model, u: Floats) -> Floats:
-    """Return the (n, 3, p) part of each value in V + W u; 0 for values outside V and W."""
+    """Return the (n, 3, p) derivative of V + W u by each value; 0 for values outside V and W."""
     linear = Model({name: values for (name, values), effect in
                     zip(model.values.items(), model.terms.effects, strict=True) if effect.linear})
     rows = np.zeros((len(u), 3, len(model.vector)))
@@ -350,23 +372,23 @@ def _deviation(rows: Floats, covariance: Floats) -> Floats:
 def level(calibration: Calibration, reading: Floats, frame: FrameName,
           context: Context | None = None) -> Calibration:
     """
-    Level the mounting from one flat pose.
+    Return a calibration with the mounting from one flat pose.
 
     Parameters
     ----------
     calibration : Calibration
-        With any ΔR; the heading of a mounting that is levelled already is kept.
+        The calibration, with any ΔR. The heading of an existing mounting is kept.
     reading : (3,) array
         Mean reading of the flat pose, in the unit of the readings.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
     context : mapping of str to array, optional
-        What the effects need, one row.
+        Columns that the effects need, one row.
 
     Returns
     -------
     Calibration
-        The same with ΔR of that pose, and a warning if it looks like a fault of the wiring.
+        The calibration with ΔR of this pose, and a warning if the wiring may be wrong.
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
@@ -380,26 +402,26 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
 def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
                 ) -> Calibration:
     """
-    Find the heading of the mounting from one pose with the nose of the robot down.
+    Return a calibration with the heading from one pose with the nose of the robot down.
 
     Parameters
     ----------
     calibration : Calibration
-        Levelled.
+        The calibration, already levelled.
     reading : (3,) array
-        Mean reading of that pose, in the unit of the readings.
+        Mean reading of the pose, in the unit of the readings.
     context : mapping of str to array, optional
-        What the effects need, one row.
+        Columns that the effects need, one row.
 
     Returns
     -------
     Calibration
-        The same with that heading.
+        The calibration with this heading.
 
     Raises
     ------
     InputError
-        If the nose is down by less than 10°.
+        If the nose is tilted down by less than 10°.
 
     """
     nose_down = _in_sensor_axes(calibration, reading, context)

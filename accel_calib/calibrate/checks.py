@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Checks of what poses are given as: wrong units, and faults of the wiring.
+Checks of the input: wrong units, and wiring faults.
 
-|force| = 1 g cannot see a wrong sign, swapped axes or a turned sensor: the sphere of poses is the
-same. Known orientations can. A least squares fit reading = X force + y needs no small errors, and
-the orthogonal part Q of X = S Q (polar decomposition) gives the axes: near the identity if each
-reads its own force, otherwise near one of the 24 rotations and 24 mirror images that permute the
-axes, or a turn by any angle. A rotation may be intended, a mirror image never is.
+|force| = 1 g does not reveal a wrong sign, swapped axes or a rotated sensor, because the sphere of
+poses is the same. Known orientations reveal them. A least squares fit reading = X force + y is
+valid for large errors, too, and the orthogonal part Q of X = S Q (polar decomposition) contains
+the axes. Q is near the identity if each axis reads its own force. Otherwise it is near one of the
+24 rotations and 24 mirror images that permute the axes, or it is a rotation by another angle. A
+rotation can be intended, a mirror image cannot.
 
-One flat pose gives the direction of up and no more: an upside-down sensor and a wrong sign look
-the same.
+One flat pose determines only the direction of up: an upside-down sensor and a wrong sign have the
+same reading.
 
 """
 
@@ -32,24 +33,26 @@ if TYPE_CHECKING:
     from .calibration import Calibration
 
 _LIKELY_G = (0.5, 2.0)
+"""Range of the median |reading| at rest [g]."""
+
 _ABOUT = 1.3
-"""Factor within which a unit is named."""
+"""Factor within which a unit is suggested."""
 
 _OTHERS = {'g': 1.0, 'm/s2': STANDARD_GRAVITY, 'ft/s2': 32.174, 'cm/s2': 100.0 * STANDARD_GRAVITY,
            'mg': 1e3, 'µg': 1e6}
-"""1 g in units that sensors give."""
+"""1 g in common units of sensors."""
 
-_TAKEN = ('g', 'm/s2')
+_SUPPORTED = ('g', 'm/s2')
 
 
 def check_units(poses: Table, units: Units) -> None:
     """
-    Check that still readings are about 1 g long, and known forces in the right unit.
+    Check that readings at rest and known forces have a length of about 1 g.
 
     Raises
     ------
     InputError
-        If they are not; names the unit that they look like.
+        If they have another length; the advice names the likely unit.
 
     """
     if len(poses) == 0:
@@ -69,28 +72,28 @@ def _check_readings(length: float, units: Units) -> None:
     if _is_likely(length, units.per_g):
         return
     likely = _likely(length)
-    taken = next((name for name in likely if name in _TAKEN), None)
-    if taken:
-        advice = f'give the units of the readings: {taken}'
+    supported = next((name for name in likely if name in _SUPPORTED), None)
+    if supported:
+        advice = f'set the units of the readings to {supported}'
     else:
         look = f'they look like {" or ".join(likely)}: ' if likely else ''
-        advice = f'{look}give the units of the readings: native, and the fit finds their scale'
-    raise InputError(f'the readings are about {length:.4g} long, expected about '
+        advice = f'{look}set the units of the readings to native; the fit estimates their scale'
+    raise InputError(f'the length of the readings is about {length:.4g}, expected about '
                      f'{units.per_g:.4g} at rest in {units.name}', advice)
 
 
 def _check_reference(length: float, units: Units) -> None:
-    per_g, words = ((1.0, 'in g, as known forces beside native readings are')
+    per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
                     if units.name == 'native' else
                     (units.per_g, f'in {units.name}, the unit of the readings'))
     if _is_likely(length, per_g):
         return
     likely = _likely(length)
     look = f'they look like {" or ".join(likely)}: ' if likely else ''
-    raise InputError(f'the known forces ref_x,ref_y,ref_z are about {length:.4g} long, expected '
-                     f'about {per_g:.4g} {words}',
+    raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about {length:.4g}, '
+                     f'expected about {per_g:.4g} {words}',
                      f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
-                     if length > 0.0 else 'fill the columns, or leave them out')
+                     if length > 0.0 else 'fill the columns, or remove them')
 
 
 def _is_likely(length: float, per_g: float) -> bool:
@@ -98,7 +101,7 @@ def _is_likely(length: float, per_g: float) -> bool:
 
 
 def _likely(length: float) -> list[str]:
-    """Return the units in which that is about 1 g: those that fit well, or else the nearest."""
+    """Return the units in which this length is about 1 g, or else the nearest unit."""
     fits = {name: max(length / per_g, per_g / max(length, 1e-300))
             for name, per_g in _OTHERS.items()}
     well = [name for name, factor in fits.items() if factor <= _ABOUT]
@@ -107,34 +110,34 @@ def _likely(length: float) -> list[str]:
 
 
 FLAT = 'the flat pose'
-"""First words of the warning about a flat pose."""
+"""Start of the warning about a flat pose."""
 
 _AXES = 'xyz'
 _NEAR = 25.0
-"""Axes within this of a permutation are called that; within it of their own they are right [°]."""
+"""Largest angle between axes and a permutation that they match [°]."""
 
 _ON_ITS_SIDE = 45.0
-"""A flat pose further from the expected axis than this is worth a warning [°]."""
+"""Angle between a flat pose and the expected axis above which there is a warning [°]."""
 
 _LEAST_SPREAD = 0.1
-"""Least singular value of the centred known forces over the largest, to determine the axes."""
+"""Smallest ratio of the singular values of the centred known forces to determine the axes."""
 
 _ADVICE = 'check the wiring, the driver and the signs of ref_x,ref_y,ref_z'
 
 
 def wiring_warnings(calibration: Calibration) -> tuple[str, ...]:
     """
-    Return a warning about the wiring, from known orientations.
+    Return a warning if known orientations reveal a wiring fault.
 
     Parameters
     ----------
     calibration : Calibration
-        With its poses.
+        The calibration, with its poses.
 
     Returns
     -------
     tuple of str
-        One warning, or none; none if the orientations are not known.
+        One warning, or none.
 
     """
     poses, name = calibration.poses, calibration.name
@@ -146,31 +149,31 @@ def wiring_warnings(calibration: Calibration) -> tuple[str, ...]:
         return ()
     mirrored = np.linalg.det(mat_q) < 0.0
     if name == '12':
-        effect = 'model 12 corrects for it'
+        effect = 'model 12 corrects it'
     elif mirrored:
-        effect = f'model {name} does not correct for it: |force| = 1 g cannot see it'
+        effect = f'model {name} does not correct it, because |force| = 1 g does not reveal it'
     elif np.array_equal(calibration.model.rotation, np.eye(3)):
-        effect = f'model {name} leaves it as it is'
+        effect = f'model {name} does not correct it'
     else:
-        effect = 'the mounting takes it out'
-    advice = _ADVICE if mirrored else f'if that is not how it is mounted, {_ADVICE}'
-    return (f'against the known orientations {found}; {effect}; {advice}',)
+        effect = 'the mounting corrects it'
+    advice = _ADVICE if mirrored else f'if it is not mounted this way, {_ADVICE}'
+    return (f'according to the known orientations, {found}; {effect}; {advice}',)
 
 
 def axes_of(reading: Floats, reference: Floats) -> Floats | None:
     """
-    Return how the axes of the readings lie in those of the known forces.
+    Return the orientation of the axes of the readings relative to those of the known forces.
 
     Parameters
     ----------
     reading, reference : (n, 3) array
-        In any units.
+        Readings and known forces, in any units.
 
     Returns
     -------
     (3, 3) array or None
-        The orthogonal matrix from the known forces to the axes of the readings, det ±1; None
-        if the known forces do not determine it.
+        Orthogonal matrix from the known forces to the axes of the readings, with determinant ±1;
+        None if the known forces do not determine it.
 
     """
     scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)
@@ -186,17 +189,17 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
 
 def fault_of(mat_q: Floats) -> str | None:
     """
-    Return what is wrong with axes that lie like this.
+    Return a description of the wiring fault, if there is one.
 
     Parameters
     ----------
     mat_q : (3, 3) array
-        Orthogonal, det ±1, from true forces to the axes of the readings.
+        Orthogonal matrix from true forces to the axes of the readings, with determinant ±1.
 
     Returns
     -------
     str or None
-        None if each axis reads its own force.
+        The fault; None if each axis reads its own force.
 
     """
     if _angle(mat_q) <= _NEAR:
@@ -205,9 +208,9 @@ def fault_of(mat_q: Floats) -> str | None:
     if _angle(mat_q @ nearest.T) <= _NEAR:
         return _words(nearest)
     if np.linalg.det(mat_q) > 0.0:
-        return f'the sensor is turned by {_turn(mat_q.T)}: a rotation'
-    return ('the readings are a mirror image: an axis has the wrong sign, or two are swapped, and '
-            'the sensor is turned besides')
+        return f'the sensor is rotated by {_turn(mat_q.T)}'
+    return ('the readings are a mirror image: an axis has the wrong sign or two axes are swapped, '
+            'and the sensor is also rotated')
 
 
 def _signed_permutations() -> list[Floats]:
@@ -216,7 +219,7 @@ def _signed_permutations() -> list[Floats]:
 
 
 _PERMUTATIONS = _signed_permutations()
-"""The 48 ways to permute the axes, mirror images included."""
+"""The 48 signed permutations of the axes, including mirror images."""
 
 
 def _angle(mat_q: Floats) -> float:
@@ -227,24 +230,24 @@ def _angle(mat_q: Floats) -> float:
 
 
 def _words(permutation: Floats) -> str:
-    """Return the words for a signed permutation that is not the identity."""
+    """Return a description of a signed permutation that is not the identity."""
     reads = _mapping(permutation)
     if np.linalg.det(permutation) > 0.0:
-        return (f'the sensor is turned by {_turn(permutation.T)} ({reads}): a rotation')
+        return f'the sensor is rotated by {_turn(permutation.T)} ({reads})'
     diagonal = np.diag(permutation)
     if np.all(diagonal == -1.0):
-        return ('all three axes have the wrong sign: the sensor reports gravity, which '
-                'points down, and not the force that holds it up')
+        return ('all three axes have the wrong sign: the sensor reports gravity, which points '
+                'down, instead of specific force, which points up')
     if np.count_nonzero(diagonal) == 3:
         return f'the {_AXES[int(np.argmin(diagonal))]} axis has the wrong sign ({reads})'
     if np.all(permutation >= 0.0):
         swapped = [axis for axis, own in zip(_AXES, diagonal, strict=True) if own == 0.0]
         return f'{" and ".join(swapped)} are swapped'
-    return f'the axes are mixed up: {reads}, a mirror image'
+    return f'the axes are permuted to a mirror image: {reads}'
 
 
 def _mapping(permutation: Floats) -> str:
-    """Return what each axis reads, where that is not its own force."""
+    """Return the force that each axis reads, for axes that do not read their own force."""
     parts = []
     for axis, row in zip(_AXES, permutation, strict=True):
         other = int(np.argmax(np.abs(row)))
@@ -271,12 +274,12 @@ def _turn(rotation: Floats) -> str:
 
 def flat_warnings(rotation: Floats, frame: str) -> tuple[str, ...]:
     """
-    Return a warning about the wiring, from a flat pose.
+    Return a warning if a flat pose indicates a wiring fault.
 
     Parameters
     ----------
     rotation : (3, 3) array
-        ΔR of that pose.
+        ΔR of the flat pose.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
 
@@ -297,8 +300,8 @@ def flat_warnings(rotation: Floats, frame: str) -> tuple[str, ...]:
     begin = (f'{FLAT} reads {force[face]:+.2f} g on {_AXES[face]}, where a sensor that lies flat '
              f'reads 1 g on {own}: ')
     if face == 2:
-        return (f'{begin}it is mounted upside down, or z (or every axis) has the wrong sign: '
-                'one flat pose cannot tell which; if it is not upside down, correct the sign: '
-                'a rotation cannot',)
-    return (f'{begin}it is mounted with {seen} up, or {_AXES[face]} and z are swapped, which one '
-            'flat pose cannot tell apart; if it lies flat, correct the wiring or the driver',)
+        return (f'{begin}it is mounted upside down, or z (or every axis) has the wrong sign; one '
+                'flat pose cannot distinguish them; if it is not upside down, correct the sign, '
+                'because a rotation does not',)
+    return (f'{begin}it is mounted with {seen} up, or {_AXES[face]} and z are swapped; one flat '
+            'pose cannot distinguish them; if it lies flat, correct the wiring or the driver',)

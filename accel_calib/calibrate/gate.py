@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The gate before every calibration that is stored, loaded or used, whoever made it.
+Checks of every calibration before it is stored, loaded or used.
 
-A fit reaches it only if it converged (`accel_calib.estimate.solve`) and its poses determine the
-model (`.refusal`). The gate checks what a calibration says of itself: shapes, finite values, a
-proper rotation, a covariance, sizes that an accelerometer can have, and an uncertainty that leaves
-the result a meaning. The limits are far beyond what working sensors show; they keep out nonsense.
+A fit has already converged (`accel_calib.estimate.solve`), and its poses determine the model
+(`.refusal`). The gate checks the calibration itself: finite values, a proper rotation, a valid
+covariance, plausible offset, gain and effects, and a useful uncertainty. The limits are far beyond
+the values of working sensors; only useless calibrations exceed them.
 
 """
 
@@ -20,54 +20,54 @@ import numpy as np
 from .calibration import Calibration, Rejected
 from ..effects import LADDER
 from ..errors import RefusedFitError
-from ..model import Model
+from ..model import Model, times
 from ..sphere import spread_directions, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
 LARGEST_OFFSET_G = 1.0
-"""Zero-g offset of a working accelerometer [g]; native readings may have any."""
+"""Largest zero-g offset of a working accelerometer [g]; not checked for native units."""
 
 GAINS = (0.5, 2.0)
-"""Gains of a working accelerometer, over the scale of its units."""
+"""Smallest and largest gain of a working accelerometer, relative to the scale of its units."""
 
 LARGEST_RESIDUAL_G = 0.05
-"""Residual of poses that lie on one ellipsoid [g]."""
+"""Largest residual of poses on one ellipsoid [g]."""
 
 LARGEST_UNCERTAINTY_G = 0.1
-"""Uncertainty of |force| beyond which a calibration says nothing [g]."""
+"""Largest uncertainty of |force| of a useful calibration [g]."""
 
-_WORTH_A_WARNING_G = 0.005
+_WARN_UNCERTAINTY_G = 0.005
 _ROTATION_TOLERANCE = 1e-6
 _COVARIANCE_TOLERANCE = 1e-6
 
 _LARGEST_REST_G = 3.0
 _NATIVE_SPREADS = 20.0
-"""Readings further out are no rest of an accelerometer: |reading| [g], and for native units the
-distance from the median over the median of these distances."""
+"""Largest reading of an accelerometer at rest: |reading| [g]; for native units the distance from
+the median, relative to the median of these distances."""
 
-_UNCERTAIN = 'the calibration leaves |a| uncertain by up to'
-_CHECK_POSES = 'check the poses for mistakes, take others, and fit again'
+_UNCERTAIN = 'the uncertainty of |a| is up to'
+_CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
 
 
 def gated(calibration: Calibration) -> Calibration:
     """
-    Check a calibration before it is stored or used.
+    Check a calibration, and return it with a warning if its uncertainty is large.
 
     Parameters
     ----------
     calibration : Calibration
-        Any.
+        The calibration to check.
 
     Returns
     -------
     Calibration
-        The same, with a warning added if its uncertainty is large.
+        The same calibration, with the warning.
 
     Raises
     ------
     RefusedFitError
-        If it is not one that an accelerometer can have.
+        If the calibration is not plausible.
 
     """
     _check_numbers(calibration)
@@ -78,8 +78,8 @@ def gated(calibration: Calibration) -> Calibration:
     residual = calibration.quality.rms_after_mg / MG
     if residual > LARGEST_RESIDUAL_G:
         raise RefusedFitError(
-            f'|a| is {residual * MG:.3g} mg (RMS) off 1 g after the fit, expected less than '
-            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses lie on no ellipsoid', _CHECK_POSES)
+            f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
+            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
     return _with_warning(calibration)
 
 
@@ -88,20 +88,20 @@ def _check_numbers(calibration: Calibration) -> None:
     for what, values in (('value', model.vector), ('rotation', model.rotation),
                          ('covariance', calibration.covariance)):
         if not np.all(np.isfinite(values)):
-            raise RefusedFitError(f'the calibration has a {what} that is not a finite number',
-                                  _CHECK_POSES)
+            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
+                                  'finite numbers', _CHECK_POSES)
 
 
 def _check_rotation(rotation: Floats) -> None:
     proper = (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
               and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE))
     if not proper:
-        raise RefusedFitError('the mounting ΔR is not a rotation: its rows are not orthonormal, '
-                              'or it is a mirror image', 'level the mounting again')
+        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
+                              'expected a rotation', 'level the mounting again')
 
 
 def _check_covariance(covariance: Floats) -> None:
-    """Refuse what is not symmetric and positive semidefinite, each value in its own unit."""
+    """Refuse a covariance that is not symmetric and positive semidefinite."""
     root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over='ignore', invalid='ignore'):
         scaled = covariance / root / root[:, np.newaxis]
@@ -110,8 +110,8 @@ def _check_covariance(covariance: Floats) -> None:
              and (not len(root)
                   or np.min(np.linalg.eigvalsh(scaled)) >= -_COVARIANCE_TOLERANCE * len(root)))
     if not sound:
-        raise RefusedFitError('the covariance is not symmetric and positive semidefinite',
-                              'fit again')
+        raise RefusedFitError('the covariance is not valid, expected a symmetric and positive '
+                              'semidefinite matrix', 'fit again')
 
 
 def _check_gain(calibration: Calibration) -> None:
@@ -121,8 +121,8 @@ def _check_gain(calibration: Calibration) -> None:
         raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
                               _CHECK_POSES)
     if gains[-1] < GAINS[0] or gains[0] > GAINS[1]:
-        raise RefusedFitError('the poses lie on no ellipsoid of an accelerometer: its gains are '
-                              f'{gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
+        raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
+                              f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     offset = float(np.linalg.norm(vec_v))
     if calibration.units.name != 'native' and offset > LARGEST_OFFSET_G:
@@ -131,7 +131,7 @@ def _check_gain(calibration: Calibration) -> None:
 
 
 def _check_effects(calibration: Calibration) -> None:
-    """Refuse effects that add more to a pose of the calibration than is plausible."""
+    """Refuse effects whose contribution to a pose of the calibration is not plausible."""
     used = calibration.used_poses
     for name, values in calibration.model.values.items():
         model = Model({name: values})
@@ -147,7 +147,7 @@ def _check_effects(calibration: Calibration) -> None:
 
 
 def _contribution(model: Model, used: Poses, units: Units) -> float:
-    """Return the largest reading that an effect adds at poses [g]."""
+    """Return the largest contribution of an effect at poses [g]."""
     context = {**used.columns}
     if 'std' in used:
         context['std'] = units.to_g(used['std'])
@@ -159,26 +159,27 @@ def _contribution(model: Model, used: Poses, units: Units) -> float:
 
 def uncertainty_g(calibration: Calibration) -> float:
     """Return the largest standard deviation of |force| over the sphere [g]."""
-    up, per_g = spread_directions(300), calibration.force_per_g
+    up, model = spread_directions(300), calibration.model
     context = {key: np.full(len(up), sum(limits) / 2.0)
                for key, limits in calibration.ranges.items()}
     none = np.zeros((len(up), 3))
     known = {'std': none, 'previous': none, 'rate': none, **context}
-    if any(key not in known for key in calibration.model.needs):
+    if any(key not in known for key in model.needs):
         return 0.0
-    covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
-    return float(np.sqrt(np.max(np.einsum('ni,nij,nj->n', up, covariance, up))))
+    across = times(model.at(known).inverse_slope(up).swapaxes(-1, -2), up)
+    rows = model.basis(up, known).along(across)
+    return float(np.sqrt(np.max(np.sum(rows @ calibration.covariance * rows, axis=1))))
 
 
 def _with_warning(calibration: Calibration) -> Calibration:
     uncertain = uncertainty_g(calibration)
     if uncertain > LARGEST_UNCERTAINTY_G:
         raise RefusedFitError(
-            f'the poses do not determine the calibration: |a| stays uncertain by up to '
+            f'the poses do not determine the calibration: the uncertainty of |a| is up to '
             f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
             'take poses with each side of the sensor up and down')
     others = tuple(line for line in calibration.warnings if not line.startswith(_UNCERTAIN))
-    if uncertain < _WORTH_A_WARNING_G:
+    if uncertain < _WARN_UNCERTAINTY_G:
         return replace(calibration, warnings=others)
     return replace(calibration, warnings=(*others, f'{_UNCERTAIN} {uncertain * MG:.2g} mg: take '
                                           'more poses, spread over the sphere'))
@@ -186,19 +187,19 @@ def _with_warning(calibration: Calibration) -> Calibration:
 
 def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
     """
-    Separate poses from rows that no accelerometer at rest can give.
+    Separate plausible poses from rows that are no readings of an accelerometer at rest.
 
     Parameters
     ----------
     poses : Poses
-        In the unit of the readings.
+        Poses, in the unit of the readings.
     units : Units
-        That unit.
+        Unit of the readings.
 
     Returns
     -------
     Poses, tuple of Rejected
-        The poses, and the other rows.
+        The plausible poses, and the other rows with the reason.
 
     """
     if not len(poses):
@@ -221,7 +222,7 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
 
 
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
-    """Separate poses from those in which the sensor may have moved, as the capture marked them."""
+    """Separate poses from those that the capture marked as doubtful."""
     if 'doubtful' not in poses or not np.any(poses['doubtful']):
         return poses, ()
     doubtful = poses['doubtful'] > 0.0
@@ -232,6 +233,6 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
 def _why(poses: Poses, index: int, wild: bool) -> str:
     if wild:
         reading = ', '.join(f'{value:.4g}' for value in poses.reading[index])
-        return f'the reading ({reading}) is not one of an accelerometer at rest'
+        return f'the reading ({reading}) is not plausible for an accelerometer at rest'
     noise = float(np.max(poses.noise[index])) if poses.noise is not None else np.nan
-    return f'the mean is uncertain by {noise:.3g}, so the sensor was not at rest'
+    return f'the uncertainty of the mean is {noise:.3g}, so the sensor was not at rest'

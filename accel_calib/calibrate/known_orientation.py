@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Poses of known orientation: model 12, unless |force| = 1 g shows that they were placed badly.
+Fit of poses of known orientation: model 12, or model 10 if the sensor was placed badly.
 
-An orientation is known only as well as the sensor was placed. A placement error of 2° turns the
-force by 35 mg but does not change its length, so the norm alone is not affected by it. If the
-poses determine model 10, its forces are turned onto the known ones (orthogonal Procrustes problem,
-Schönemann 1966, with Huber's weights, so that one misplaced pose does not turn the others). What
-is left is tangential. If an F test shows that it is more than the noise and the uncertainty of the
-fit explain, the fit uses |force| = 1 g alone, and the known orientations give only the rotation of
-the axes, ΔR.
+An orientation is known only as accurately as the sensor was placed. A placement error of 2° turns
+the force by 35 mg but does not change its length, so a fit by |force| = 1 g is not affected. If
+the poses determine model 10, its forces are rotated onto the known forces (orthogonal Procrustes
+problem, Schönemann 1966, with Huber's weights so that one misplaced pose has little influence).
+The remaining differences are tangential. If an F test shows that they are larger than the noise
+and the uncertainty of the fit explain, the fit uses only |force| = 1 g. The known orientations
+then determine only the rotation of the axes, ΔR.
 
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from .calibration import Calibration, Rejected
 from .quality import fit_warnings, in_g, quality_of
-from .refusal import carries, refuse_if_unfit
+from .refusal import determines, refuse_if_unfit
 from .unknown_orientation import (
     calibration_of,
     directions_of,
@@ -40,19 +40,21 @@ from ..table import Floats, Poses
 from ..units import MG, Units
 
 _LEVEL = 1e-4
-_LEAST_RATIO = 4.0
-"""Placement errors must be about as large as the noise to matter."""
+"""Level of the F test for placement errors."""
 
-_PLAIN_DEGREES = 0.2
-_PLAIN_CHI2 = 4.0
-"""Residuals of known orientations that are worth a warning."""
+_LEAST_RATIO = 4.0
+"""Smallest ratio of variances that counts: placement errors about as large as the noise."""
+
+_WARN_DEGREES = 0.2
+_WARN_CHI2 = 4.0
+"""Residuals above both limits cause a warning about the placement."""
 
 _ROUNDS = 20
 _SMALL_ANGLE = 1e-6
 
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
-    """Fit poses of known orientation; arguments and errors as `fit_poses`."""
+    """Fit poses of known orientation; parameters and errors as in `fit_poses`."""
     poses, reason = _with_reference(poses, units)
     if method == 'ml':
         by_norm = _unless_placed_well(poses, units)
@@ -70,7 +72,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
 
 
 def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
-    """Fit model 12, without outliers as long as the other poses determine it."""
+    """Fit model 12, without outliers if the other poses determine the model."""
     kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
     poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
     start = with_vector(MODELS['12'], np.zeros(12))
@@ -79,74 +81,73 @@ def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
     while method == 'ml':
         out = outliers(fit, len(poses_g)).poses
         left = fit.poses_g.take(np.delete(np.arange(len(fit.poses_g)), out))
-        if not len(out) or not carries('12', unit(left['reference'])):
+        if not len(out) or not determines('12', unit(left['reference'])):
             break
         off = fit.equations.of_poses(fit.residual)[out] * MG
         rejected = (*rejected, *(
-            Rejected(int(row), f'outlier: the reading is {error:.2f} mg off what the other '
-                     'orientations say')
+            Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of '
+                     'the other poses')
             for row, error in zip(fit.poses_g.row[out], off, strict=True)))
         fit = estimate(fit.model, left)
     return fit, rejected
 
 
 def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
-    """Return the poses with their known forces, and where these come from."""
+    """Return the poses with their known forces, and a text about the source of the forces."""
     if 'reference' in poses:
-        return poses, 'the orientations are given'
+        return poses, 'the orientations are known'
     faces_up = faces(poses.reading)
     if faces_up is None:
-        raise RefusedFitError('model 12 needs known orientations, the poses have no '
-                              'ref_x,ref_y,ref_z and are not the six faces',
-                              'add the columns, give the six faces alone (--rows), or use '
-                              'model 10')
+        raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
+                              'but model 12 needs known orientations', 'add these columns, use '
+                              'only the six faces (--rows), or use model 10')
     force = faces_up * (1.0 if units.name == 'native' else units.per_g)
     return poses.with_columns(reference=force), 'the poses are the six faces'
 
 
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
-    """Fit by |force| = 1 g alone, if that shows that the poses were not placed as they say."""
+    """Fit by |force| = 1 g alone if it contradicts the known orientations; otherwise None."""
     units, directions = own_scale(poses, units), directions_of(poses, units)
-    if not carries('10', directions):
+    if not determines('10', directions):
         return None
     poses_g = in_g(poses, units)
     try:
         found = solve_unknown(poses_g, directions, '10', 'ml')
-    except RefusedFitError:  # without the outliers the poses do not carry it
+    except RefusedFitError:  # without the outliers the poses do not determine the model
         return None
     seen = poses_g.take(found.kept)
     u, known = sensor_force(found.fit.model, seen.reading, {}), unit(seen['reference'])
-    rotation = _turned_onto(unit(u), known)
-    if np.linalg.det(rotation) < 0.0:  # mirrored axes: W alone can tell
+    rotation = _rotation_onto(unit(u), known)
+    if np.linalg.det(rotation) < 0.0:  # mirrored axes: only W can show them
         return None
     away = unit(u) - known @ rotation.T
     if not _is_placement(away, _tangential_variance(found.fit, u), found.fit.variance_dof):
         return None
     angle = np.degrees(np.linalg.norm(away, axis=1))
-    words = (f'the given orientations are {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) off what '
-             f'|force| = 1 g shows, the most in row {seen.row[np.argmax(angle)]} '
-             f'({np.max(angle):.2g}°): the fit uses |force| = 1 g alone, and the orientations '
-             'give only the rotation of the axes')
+    words = (f'the known orientations differ by {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) from a '
+             f'fit by |force| = 1 g, most in row {seen.row[np.argmax(angle)]} '
+             f'({np.max(angle):.2g}°): the fit uses only |force| = 1 g, and the orientations '
+             'determine only the rotation of the axes')
     by_norm = calibration_of(found, poses, units, 'ml')
     return replace(by_norm, model=replace(by_norm.model, rotation=rotation), reason=words,
                    warnings=(words, *by_norm.warnings))
 
 
 def _placement_warning(fit: Fit) -> tuple[str, ...]:
-    """Warn of placement errors that the norm of these poses cannot tell from noise."""
+    """Return a warning about placement errors that |force| = 1 g cannot detect in these poses."""
     if fit.dof == 0:
         return ()
     off = fit.equations.of_poses(fit.residual)
     angle = np.degrees(np.sqrt(3.0 * np.sum(off ** 2) / fit.dof))
-    if angle < _PLAIN_DEGREES or fit.chi2 < _PLAIN_CHI2 * fit.dof:
+    if angle < _WARN_DEGREES or fit.chi2 < _WARN_CHI2 * fit.dof:
         return ()
-    return (f'the readings are {angle:.2g}° off the given orientations: if the sensor was not '
-            'placed that well, this error is in the result; take 12 or more poses in other '
-            'orientations too, and |force| = 1 g corrects without a jig',)
+    return (f'the readings differ by {angle:.2g}° from the known orientations: if the placement '
+            'of the sensor is not more accurate, the result has this error; take 12 or more '
+            'poses in other orientations, too, and fit model 10',)
 
 
-def _turned_onto(directions: Floats, known: Floats) -> Floats:
-    """Return the orthogonal (3, 3) matrix R with directions = R known, for most of the rows."""
+def _rotation_onto(directions: Floats, known: Floats) -> Floats:
+    """Return the orthogonal (3, 3) matrix R with directions = R known; robust to outliers."""
     weight = np.ones(len(directions))
     for _ in range(_ROUNDS):
         left, _, right = np.linalg.svd((directions * weight[:, np.newaxis]).T @ known)
@@ -157,7 +158,7 @@ def _turned_onto(directions: Floats, known: Floats) -> Floats:
 
 
 def _tangential_variance(fit: Fit, u: Floats) -> Floats:
-    """Return the (n,) variance across the force u that noise and the fit itself leave [g²]."""
+    """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
     moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
     spread = moved @ fit.covariance @ np.swapaxes(moved, 1, 2)
     along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
@@ -166,7 +167,7 @@ def _tangential_variance(fit: Fit, u: Floats) -> Floats:
 
 
 def _is_placement(away: Floats, variance: Floats, variance_dof: float) -> bool:
-    """Return whether the poses are further away than noise leaves them."""
+    """Return whether the differences are larger than the noise explains."""
     from scipy.special import fdtrc
 
     dof = 2.0 * len(away) - 3.0

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Mounting: the rotation ΔR from one flat pose (NXP AN5286, section 7).
+The mounting ΔR of a sensor from one flat pose (NXP AN5286, section 7).
 
-ΔR takes a vector in the levelled frame to the axes of the sensor. Lying flat, the sensor's
-calibrated reading G is ΔR times up:
+ΔR transforms a vector from the levelled frame to the axes of the sensor. In a flat pose, the
+calibrated reading G of the sensor is ΔR times up:
 
 =========  =====================================  ============  ======================
 frame      axes                                   flat reading  third column of ΔR
@@ -16,15 +16,16 @@ frame      axes                                   flat reading  third column of 
 `win8`     as android                             -1 g on z     -G over its size
 =========  =====================================  ============  ======================
 
-(NED as AN5286 has it: the reading is positive along gravity, so that flat again reads +1 g on z.)
-One flat pose leaves the heading open. It is set to zero in the sense of the frame's own angles:
-for `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
+(NED follows AN5286: the reading is positive along gravity, so that a flat pose reads +1 g on z.)
+One flat pose does not determine the heading. The heading is zero by the convention of the angles
+of each frame. For `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
 
     x column = (√(y²+z²), -xy/√(y²+z²), -xz/√(y²+z²)) / |G|
 
-singular where x is vertical (90° pitch); for `win8` in the sensor's x-z plane, singular where y is
-vertical (90° roll). There the limit of level y, or level x, is taken. A second pose, with
-the nose of the robot tilted straight down, fixes the heading (TRIAD, Black 1964).
+which is singular if x is vertical (90° pitch). For `win8` the x column is in the x-z plane of the
+sensor, which is singular if y is vertical (90° roll). At these singularities the limit of a level
+y axis, or a level x axis, is used. A second pose, with the nose of the robot tilted straight down,
+determines the heading (TRIAD, Black 1964).
 
 """
 
@@ -42,7 +43,7 @@ FRAMES: tuple[str, ...] = get_args(FrameName)
 
 _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]),
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
-"""Reading of a sensor whose nose points straight down in each frame [g]."""
+"""Reading of a sensor whose nose points straight down, for each frame [g]."""
 
 _VERTICAL = 1e-9
 _LEAST_HEADING_ANGLE = np.radians(10.0)
@@ -55,7 +56,7 @@ def flat_direction(frame: str) -> Floats:
 
 def mounting(flat: Floats, frame: str = 'ros') -> Floats:
     """
-    Find ΔR from one flat pose.
+    Compute ΔR from one flat pose.
 
     Parameters
     ----------
@@ -77,15 +78,15 @@ def mounting(flat: Floats, frame: str = 'ros') -> Floats:
     """
     length = np.linalg.norm(flat)
     if not (np.isfinite(length) and length > 0.0):
-        raise InputError(f'the flat pose has a force of {flat}, expected about 1 g',
-                         'take it again with the sensor at rest')
+        raise InputError(f'the flat pose has the force {flat}, expected about 1 g',
+                         'repeat the flat pose with the sensor at rest')
     column_z = flat / length * flat_direction(frame)[2]
     column_x = _x_of_win8(column_z) if frame == 'win8' else _x_without_yaw(column_z)
     return np.column_stack([column_x, np.cross(column_z, column_x), column_z])
 
 
 def _x_without_yaw(up: Floats) -> Floats:
-    """Return the x column of ned, android and ros: yaw zero, y level."""
+    """Return the x column for ned, android and ros: zero yaw, level y axis."""
     x, y, z = up
     root = np.hypot(y, z)
     if root < _VERTICAL:
@@ -94,7 +95,7 @@ def _x_without_yaw(up: Floats) -> Floats:
 
 
 def _x_of_win8(up: Floats) -> Floats:
-    """Return the x column of win8: no y component, and x never turned back."""
+    """Return the x column for win8: no y component, and x component not negative."""
     x, _, z = up
     root = np.hypot(x, z)
     if root < _VERTICAL:
@@ -105,27 +106,27 @@ def _x_of_win8(up: Floats) -> Floats:
 
 def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Floats:
     """
-    Find the heading of a levelled mounting from a pose with the nose of the robot down.
+    Return a levelled mounting with the heading from a pose with the nose of the robot down.
 
     Parameters
     ----------
     rotation : (3, 3) array
-        ΔR of any heading, such as `mounting` returns it.
+        ΔR with any heading, as `mounting` returns it.
     nose_down : (3,) array
-        Calibrated reading with the nose (forward; the top of a screen) tilted straight down, by
-        10° to 170°, in the axes of the sensor; any length.
+        Calibrated reading with the nose (front of the robot, top of a screen) tilted straight
+        down, by 10° to 170°; in the axes of the sensor, any length.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
 
     Returns
     -------
     (3, 3) array
-        ΔR, a proper rotation: the flat pose is met exactly, the second in heading.
+        ΔR, a proper rotation. It matches the flat pose exactly, and the second pose in heading.
 
     Raises
     ------
     InputError
-        If the second pose is nearly the flat one, or its opposite.
+        If the second pose is nearly the flat pose, or its opposite.
 
     """
     flat = flat_direction(frame)
@@ -134,20 +135,20 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
 
 def with_heading_of(before: Floats, rotation: Floats) -> Floats:
     """
-    Return a levelled mounting with the heading that it had before.
+    Return a levelled mounting with the heading of an earlier mounting.
 
     Parameters
     ----------
     before : (3, 3) array
-        ΔR as it was.
+        Earlier ΔR.
     rotation : (3, 3) array
-        ΔR of a new flat pose, of any heading.
+        ΔR of a new flat pose, with any heading.
 
     Returns
     -------
     (3, 3) array
-        ΔR whose x axis is the earlier one, turned into the new level; `rotation` itself if the
-        earlier x axis is within 10° of vertical now.
+        ΔR with the earlier x axis, rotated into the new horizontal plane; `rotation` itself if the
+        earlier x axis is now within 10° of the vertical.
 
     """
     up, x = rotation[:, 2], before[:, 0]
@@ -160,11 +161,12 @@ def with_heading_of(before: Floats, rotation: Floats) -> Floats:
 
 
 def _triad(first: Floats, second: Floats) -> Floats:
-    """Return the (3, 3) matrix whose columns are the axes spanned by two directions."""
+    """Return the (3, 3) matrix of orthonormal axes defined by two directions."""
     unit = first / np.linalg.norm(first)
     normal = np.cross(unit, second / np.linalg.norm(second))
     if not np.linalg.norm(normal) >= np.sin(_LEAST_HEADING_ANGLE):
-        raise InputError('the second pose is within 10° of the flat one or of its opposite',
+        raise InputError('the pose with the nose down is within 10° of the flat pose or of its '
+                         'opposite, expected a tilt of 10° to 170°',
                          'tilt the nose of the robot further down')
     normal = normal / np.linalg.norm(normal)
     return np.column_stack([np.cross(normal, unit), normal, unit])

@@ -4,15 +4,16 @@
 """
 Which pose to take next, and when more poses no longer help.
 
-The next pose is one of the 26 attitudes that a person can find by eye: the 6 faces, 12 edges and
-8 corners of the sensor. It is the one that adds most to det M (D-optimal design, Fedorov 1972),
-with M the information of the poses so far (see `accel_calib.estimate.geometry`) plus that of one
-pose spread over the whole sphere, which stands for the poses to come: without it the first poses
-would be chosen as if they were the last. `benchmarks/next_pose.py` compares it with other orders.
+The next pose is one of the 26 orientations that a person can set by eye: the 6 faces, 12 edges and
+8 corners of the sensor. It is the orientation that increases det M most (D-optimal design, Fedorov
+1972). M is the information of the poses so far (see `accel_calib.estimate.geometry`) plus that of
+one pose spread over the whole sphere, which represents the poses to come. Without this term the
+first poses would be chosen as if they were the last. `benchmarks/next_pose.py` compares this order
+with others.
 
-n poses spread well leave |force| uncertain by the noise of a pose times √(p / n), RMS over the
-sphere. Another pose lowers that by 1 / 2n: more poses no longer help when the next one would lower
-it by less than `_LEAST_GAIN`, and the dilution is below `_GOOD_DILUTION`.
+With n well spread poses, the error of |force| is the noise of a pose times √(p / n), RMS over the
+sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose
+reduces the error by less than `_LEAST_GAIN` and the dilution is below `_GOOD_DILUTION`.
 
 """
 
@@ -39,13 +40,13 @@ from ..table import Floats
 from ..units import MG
 
 _LEAST_GAIN = 0.03
-"""Part of the expected error that a pose must remove to pay: 17 poses spread well."""
+"""Smallest useful reduction of the error by a pose; 17 well spread poses reach it."""
 
 _GOOD_DILUTION = 3.0
-"""Poses are asked for until the dilution has come down to this."""
+"""More poses are requested while the dilution is larger."""
 
 _TAKEN = np.cos(np.radians(17.0))
-"""An attitude this near to a pose has been taken: the next one is 35° away."""
+"""An orientation within 17° of a pose counts as taken; its neighbours are 35° away."""
 
 _SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
 
@@ -53,17 +54,17 @@ _SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
 @dataclass(frozen=True)
 class NextPose:
     """
-    The pose that would help the fit most, or none.
+    The pose that improves the fit most, or none.
 
     Parameters
     ----------
     direction : (3,) array or None
         Direction to point up, a unit vector in the sensor axes; None: more poses no longer help.
     words : str
-        The same for a person.
+        The same as a sentence.
     error : float
-        Expected error of |force| after a fit to the poses so far, RMS over the sphere, over the
-        noise of a pose; infinite if they leave a parameter open.
+        Expected error of |force| after a fit to the poses so far, RMS over the sphere, relative
+        to the noise of a pose; infinite if the poses do not determine a parameter.
 
     """
 
@@ -74,7 +75,7 @@ class NextPose:
 
 @lru_cache(maxsize=8)
 def _mean_information(name: str) -> Floats:
-    """Return the information of one pose spread over the sphere, (p, p)."""
+    """Return the (p, p) information of one pose spread over the sphere."""
     rows = over_the_sphere(name)
     mean: Floats = np.einsum('nip,niq->pq', rows, rows) / len(rows)
     return mean
@@ -82,7 +83,7 @@ def _mean_information(name: str) -> Floats:
 
 @lru_cache(maxsize=1)
 def _attitudes() -> Floats:
-    """Return the signs of the axes that point up, (26, 3), the faces first."""
+    """Return the (26, 3) signs of the axes that point up; the faces are first."""
     signs = np.array([s for s in product((0, 1, -1), repeat=3) if any(s)], float)
     return signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')]
 
@@ -90,23 +91,23 @@ def _attitudes() -> Floats:
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
               noise_g: float | None = None) -> NextPose:
     """
-    Return the pose that would help the fit most.
+    Return the pose that improves the fit most.
 
     Parameters
     ----------
     directions : (n, 3) array
-        Unit vectors of force so far, in the axes of the sensor; n may be 0.
+        Unit vectors of force so far, in the sensor axes; n can be 0.
     name : {'4', '7', '9', '10', '12'}
-        The model to fit; for 12 the poses are the six faces.
+        The model to fit; for model 12 the poses are the six faces.
     noise : (n,) array, optional
-        Noise of each pose in any unit; equal if it is not given.
+        Noise of each pose in any unit; by default equal for all poses.
     noise_g : float, optional
-        Median noise of the poses [g], for the words.
+        Median noise of the poses [g], for the sentence.
 
     Returns
     -------
     NextPose
-        One of the 6 faces, 12 edges and 8 corners of the sensor, each only once; or none.
+        One of the 6 faces, 12 edges and 8 corners of the sensor that is not taken yet, or none.
 
     """
     information = information_of(name, directions, relative_weights(noise, len(directions)))
@@ -117,7 +118,7 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     signs = _attitudes()[best]
     up = unit(signs[np.newaxis])
     after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
-    if after > (1.0 - _LEAST_GAIN) * error and not _stretched(name, information):
+    if after > (1.0 - _LEAST_GAIN) * error and not _is_poor(name, information):
         return NextPose(None, _enough(len(directions), error, noise_g), error)
     return NextPose(up[0], f'turn the sensor so that {words_of(signs)} points up '
                     f'({_axes(signs)})', error)
@@ -125,22 +126,22 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
     """
-    Return the poses to add, in order, so that they determine a model well.
+    Return the poses to add until they determine a model well.
 
     Parameters
     ----------
     name, directions, noise
-        As `next_pose`.
+        As in `next_pose`.
 
     Returns
     -------
     list of str
-        Sides, edges and corners to point up, such as ``the left side (+y)``.
+        Sides, edges and corners to point up in this order, such as ``the left side (+y)``.
 
     """
     weights = relative_weights(noise, len(directions))
     named = []
-    while len(directions) < poses_needed(name) or _stretched(
+    while len(directions) < poses_needed(name) or _is_poor(
             name, information_of(name, directions, weights)):
         best = _best(name, directions, information_of(name, directions, weights))
         if best is None:
@@ -152,8 +153,8 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
     return named
 
 
-def _stretched(name: str, information: Floats) -> bool:
-    """Return whether a fit of poses with this information would be poor somewhere."""
+def _is_poor(name: str, information: Floats) -> bool:
+    """Return whether a fit with this information has a large error in some direction."""
     if np.linalg.matrix_rank(information, hermitian=True) < len(information):
         return True
     rows = over_the_sphere(name)
@@ -162,7 +163,7 @@ def _stretched(name: str, information: Floats) -> bool:
 
 
 def _best(name: str, directions: Floats, information: Floats) -> int | None:
-    """Return the attitude that adds most to det M, among those that have not been taken."""
+    """Return the index of the untaken orientation that increases det M most; None if all are."""
     attitudes = _attitudes()[:6] if name == '12' else _attitudes()
     up = unit(attitudes)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
@@ -171,11 +172,11 @@ def _best(name: str, directions: Floats, information: Floats) -> int | None:
     rows = rows_of(name, up)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
-    return int(np.argmax(np.where(free, np.round(gains, 6), -1.0)))  # the first of equals
+    return int(np.argmax(np.where(free, np.round(gains, 6), -1.0)))  # the first of equal gains
 
 
 def _error(name: str, information: Floats, count: int) -> float:
-    """Return the RMS over the sphere of the error of |force|, over the noise of a pose."""
+    """Return the error of |force|, RMS over the sphere, relative to the noise of a pose."""
     if count < poses_needed(name) or (
             np.linalg.matrix_rank(information, hermitian=True) < len(information)):
         return np.inf
@@ -183,17 +184,16 @@ def _error(name: str, information: Floats, count: int) -> float:
 
 
 def _enough(count: int, error: float, noise_g: float | None) -> str:
-    """Return the words for no further pose."""
+    """Return the sentence for the case that more poses no longer help."""
     certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
                else f'{error:.2g} times the noise of a pose')
-    return f'more poses no longer help: {count} poses determine |a| to {certain}'
+    return f'more poses no longer help: {count} poses determine |a| to within {certain}'
 
 
 def words_of(signs: Floats) -> str:
-    """Return the words for the side, edge or corner with these signs of the axes."""
+    """Return the name of the side, edge or corner with these signs of the axes."""
     sides = [pair[0 if sign > 0 else 1] for pair, sign in zip(_SIDES, signs, strict=True) if sign]
-    what = {1: 'the {} side', 2: 'the edge between {} and {}',
-            3: 'the corner of {}, {} and {}'}[len(sides)]
+    what = {1: 'the {} side', 2: 'the {} {} edge', 3: 'the {} {} {} corner'}[len(sides)]
     return what.format(*sides)
 
 
@@ -206,17 +206,17 @@ def _axes(signs: Floats) -> str:
 @dataclass(frozen=True)
 class Outlook:
     """
-    What the poses of a calibration determine, and which pose would improve it most.
+    What the poses of a calibration determine, and the pose that improves it most.
 
     Parameters
     ----------
     identifiability : Identifiability
-        Of the model that was asked for; of the largest if the choice was free.
+        For the requested model; for the largest model if the choice was ``auto``.
     next_pose : NextPose
-        Planned for that model.
+        The next pose for the same model.
     uncertainty_mg : float or None
-        Stated error of a corrected |force| (model 12: of the force), RMS over the sphere [mg];
-        None if the poses leave nothing to judge it by.
+        Stated uncertainty of the corrected |force| (model 12: of the force), RMS over the sphere
+        [mg]; None if it is not known.
 
     """
 
@@ -227,14 +227,14 @@ class Outlook:
 
 def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     """
-    Return what the poses of a calibration determine, from its result.
+    Return what the poses of a calibration determine, and the next pose.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the linear models, as `accel_calib.calibrate.fit_poses` returns it.
+        A calibration with a linear model, as `accel_calib.calibrate.fit_poses` returns it.
     asked : {'auto', '4', '7', '9', '10', '12'}
-        The model that was asked for.
+        The requested model.
 
     """
     poses = calibration.used_poses
@@ -244,7 +244,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     noise = pose_noise(poses.noise, directions)
     uncertainty = _uncertainty(calibration)
     planned = asked
-    if asked in ('auto', '12'):  # with wrong orientations 12 became a norm model
+    if asked in ('auto', '12'):  # with wrong orientations model 12 became 10
         planned = '12' if calibration.name == '12' else '10'
     fitted = identifiability(calibration.name, directions, noise).mean_dilution
     known = np.isfinite(uncertainty)
@@ -255,7 +255,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
 
 
 def _uncertainty(calibration: Calibration) -> float:
-    """Return the stated error of a corrected force, RMS over the sphere [g]."""
+    """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
     up: Floats = spread_directions(300)
     per_g = calibration.force_per_g
     covariance = calibration.force_covariance(up * per_g) / per_g ** 2

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pose before each pose: what hysteresis needs beside the reading."""
+"""The previous pose of each pose: the context of the effect `hysteresis`."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from ..sphere import unit
 from ..table import Poses
 
 _MOVED = np.radians(3.0)
-"""Change of direction from which the sensor was moved [rad]; less may be noise or settling."""
+"""Smallest change of direction of a move [rad]; less may be noise or settling."""
 
 
 def with_previous(poses_g: Poses, model: Model) -> Poses:
     """
-    Add the unit vector towards the previous pose, in the order of time or else of the rows.
+    Return poses with the unit vector towards the previous pose, in order of time, or of rows.
 
-    A pose in the orientation of the one before it was reached by the same motion.
+    If successive poses have the same orientation, the last motion counts for all of them.
 
     Parameters
     ----------
     poses_g : Poses
-        In g; poses that have the column are returned as they are.
+        Poses in g. A table that has the column already is returned unchanged.
     model : Model
-        Its gain and offset give the directions.
+        Model whose gain and offset are used to compute the directions.
 
     Returns
     -------
     Poses
-        With the column ``previous``: zero for the first pose and those that did not move from it.
+        The poses with the column ``previous``; it is zero before the first motion.
 
     """
     if 'previous' in poses_g:

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How well a calibration does: on the poses it was fitted to, and on poses it has not seen.
+Residuals of a calibration, on the poses it was fitted to and on other poses.
 
-The error of a pose is |force| - 1 g. For a pose of known orientation under model 12, which knows
-the axes, it is the length of the vector error. The residual of a calibration is the RMS of the
-errors over the poses.
+The error of a pose is |force| - 1 g. For model 12 and poses of known orientation it is the length
+of the vector error. The residual of a calibration is the RMS of the errors over the poses.
 
 """
 
@@ -16,12 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .calibration import Calibration, Quality
+from .calibration import Calibration, check_sensor, Quality
 from .previous_pose import with_previous
 from ..estimate.equations import noise_of
 from ..estimate.fit import Fit, judge
 from ..estimate.geometry import coverage, WEAK_DILUTION
-from ..estimate.outliers import by_pose
 from ..model import correct, Model, sensor_force
 from ..table import Floats, Poses
 from ..units import MG, Units
@@ -33,7 +31,7 @@ _LEAST_OWN = 1e-9
 @dataclass(frozen=True)
 class Verification:
     """
-    How well a calibration does on poses it has not seen; fields as `Quality`.
+    Residuals of a calibration on poses that it was not fitted to.
 
     Parameters
     ----------
@@ -42,7 +40,7 @@ class Verification:
     max_before_percent, max_after_percent : float
         Largest error without and with the calibration [% of 1 g].
     noise_floor_mg : float or None
-        Residual that the noise of the pose means alone would leave [mg]; None if it is not known.
+        Residual that the noise of the pose means alone causes [mg]; None if it is not known.
 
     """
 
@@ -54,7 +52,7 @@ class Verification:
 
 
 def in_g(poses: Poses, units: Units) -> Poses:
-    """Return the poses with readings, std and reference in g (native references are)."""
+    """Return the poses with readings, std and reference in g; native references are in g."""
     scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
     if 'reference' in poses and units.name != 'native':
         scaled['reference'] = units.to_g(poses['reference'])
@@ -63,22 +61,28 @@ def in_g(poses: Poses, units: Units) -> Poses:
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
-    Check a calibration against poses.
+    Compute the residuals of a calibration on poses.
 
     Parameters
     ----------
     calibration : Calibration
         The calibration.
     poses : Poses
-        In the unit of its readings.
+        The poses, in the unit of the calibration.
 
     Returns
     -------
     Verification
-        Residuals before and after.
+        Residuals without and with the calibration, and noise floor.
+
+    Raises
+    ------
+    StoredCalibrationError
+        If the calibration belongs to another sensor.
 
     """
     model, units = calibration.model, calibration.units
+    check_sensor(calibration, poses.sensor)
     poses_g = calibration.held(with_previous(in_g(poses, units), model))
     vectors = calibration.name == '12' and 'reference' in poses
     before = _before(poses_g, units, vectors=vectors)
@@ -93,14 +97,14 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
 
 
 def _without_orientation(poses_g: Poses) -> Poses:
-    """Return the poses without what is known of their orientation."""
+    """Return the poses without columns about their orientation."""
     return Poses({key: values for key, values in poses_g.columns.items()
                   if key not in ('reference', 'orientation')}, poses_g.row)
 
 
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """
-    Return how well a fit does.
+    Return residuals and other figures of a fit.
 
     Parameters
     ----------
@@ -109,7 +113,7 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     units : Units
         Unit of the sensor's readings.
     directions : (n, 3) array
-        Where up is in each pose, unit vectors.
+        Direction of up in each pose, unit vectors.
 
     """
     vectors = 'reference' in fit.poses_g
@@ -124,17 +128,17 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
 
 
 def noise_floor_mg(fit: Fit) -> float:
-    """Return the residual that the noise of the poses leaves, given what the fit absorbs [mg]."""
-    data, scale = by_pose(fit), fit.equations.scale
+    """Return the residual that noise causes after the fit absorbs a part of it [mg]."""
+    data, scale = fit.by_pose, fit.equations.scale
     own = np.trace(data.own(data.spread), axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
     return _rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
 
 
 def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
     """
-    Return the errors without a calibration, (n,) [g].
+    Return the (n,) errors without a calibration [g].
 
-    Native readings mean nothing without one; they are taken from the middle of their range.
+    Native readings have no known zero; they are measured from the middle of their range.
 
     """
     reading = poses_g.reading
@@ -146,7 +150,7 @@ def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
 
 
 def _errors(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
-    """Return the errors of corrected poses, (n,) [g]."""
+    """Return the (n,) errors of corrected poses [g]."""
     if vectors:
         force = correct(model, poses_g.reading, poses_g.columns)
         return np.linalg.norm(force - poses_g['reference'], axis=1)
@@ -155,18 +159,18 @@ def _errors(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
 
 def _held_out(fit: Fit) -> Floats | None:
     """
-    Return the error of each pose when it is left out of the fit, (n,) [g].
+    Return the (n,) errors of each pose under a fit of the other poses [g].
 
-    With H the hat matrix, the residual of a pose is then (I - H_ii)⁻¹ times its residual (PRESS,
-    Allen 1974); None if a pose alone determines a parameter.
+    With H the hat matrix, this error is (I - H_ii)⁻¹ times the residual of the pose (PRESS, Allen
+    1974). The result is None if a pose alone determines a parameter.
 
     """
-    data = by_pose(fit)
+    data = fit.by_pose
     own = data.own(data.spread)
     if np.any(np.linalg.svd(own, compute_uv=False) < _LEAST_OWN):
         return None
     left_out = np.linalg.solve(own, data.residual[:, :, np.newaxis])[:, :, 0]
-    if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ makes them forces
+    if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
         noise = noise_of(fit.poses_g)
         scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
         left_out = scaled @ np.linalg.inv(fit.model.linear_part[0]).T
@@ -182,35 +186,35 @@ def _largest_percent(errors_g: Floats) -> float:
     return float(np.max(np.abs(errors_g))) * 100.0
 
 
-_NO_DOF = 'there are just as many poses as free parameters'
-_UNCOVERED = 'the poses leave a part of the sphere uncovered'
-_NO_NOISE = 'std and count of the poses are not given'
+_NO_DOF = 'there are only as many poses as free parameters'
+_UNCOVERED = 'the poses leave a region of the sphere uncovered'
+_NO_NOISE = 'the poses have no std and count'
 _TOO_LARGE = 'the residuals are'
 
 _LARGE_CHI2 = 4.0
-"""Squared residuals over their noise that are warned of."""
+"""chi² per degree of freedom above which a fit warns."""
 
 
-def fit_warnings(fit: Fit, stretched: float) -> tuple[str, ...]:
-    """Return what a user should know of a fit; `stretched` is its dilution."""
+def fit_warnings(fit: Fit, dilution: float) -> tuple[str, ...]:
+    """Return warnings about a fit with this dilution."""
     warnings = []
     if fit.dof == 0:
-        warnings.append(f'{_NO_DOF}: nothing is left to check the fit with; take more poses')
-    if stretched > WEAK_DILUTION:
-        warnings.append(f'{_UNCOVERED}: there the error is up to {stretched:.0f} times that of a '
-                        'pose; take the next pose asked for')
+        warnings.append(f'{_NO_DOF}: the fit cannot be checked; take more poses')
+    if dilution > WEAK_DILUTION:
+        warnings.append(f'{_UNCOVERED}: there the error is up to {dilution:.0f} times that of a '
+                        'pose; take the next pose that is suggested')
     if not fit.noise_known:
         known = ('the residuals alone' if fit.dof > 0 else
                  'the noise of a common sensor, 0.5 mg, which may be wrong for this one')
         warnings.append(f'{_NO_NOISE}: the uncertainty comes from {known}')
     elif fit.dof > 0 and fit.chi2 / fit.dof > _LARGE_CHI2:
         warnings.append(f'{_TOO_LARGE} {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of the '
-                        'pose means: poses repeat worse than their samples say, or the model '
-                        'lacks an effect')
+                        'pose means: poses repeat worse than the noise of their samples predicts, '
+                        'or the model lacks an effect')
     return tuple(warnings)
 
 
 def other_warnings(warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the warnings that are not of `fit_warnings`."""
+    """Return the warnings that do not come from `fit_warnings`."""
     return tuple(line for line in warnings
                  if not line.startswith((_NO_DOF, _UNCOVERED, _NO_NOISE, _TOO_LARGE)))

@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Poses of unknown orientation: model 4, 7, 9 or 10 by |force| = 1 g.
+Fit of poses of unknown orientation: model 4, 7, 9 or 10 by |force| = 1 g.
 
-``ml``, the default, weighs poses by their noise and leaves outliers out; ``algebraic`` is the cost
-functions of AN5286 and the ESGI'95 report, unweighted, with every row.
+The method ``ml``, the default, weights poses by their noise and leaves out outliers. The method
+``algebraic`` minimises the cost functions of AN5286 and the ESGI'95 report, unweighted and with
+every row.
 
-``auto`` goes from the smallest model to larger ones and takes each that an F test at `_LEVEL`,
-with the moderated variance of `accel_calib.estimate.fit.Fit`, shows to explain more than noise
-would.
+``auto`` goes from the smallest model to larger models. It selects each model that explains
+significantly more than noise, by an F test at `_LEVEL` with the moderated variance of
+`accel_calib.estimate.fit.Fit`.
 
 """
 
@@ -24,11 +25,19 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, Rejected
 from .quality import fit_warnings, in_g, quality_of
-from .refusal import carries, refuse_if_unfit, unseen
+from .refusal import refuse_if_unfit, unseen
 from ..errors import RefusedFitError
 from ..estimate.closed_form import closed_form, fit_4
 from ..estimate.fit import estimate, Fit, judge
-from ..estimate.geometry import dilution, free_parameters, NORM_MODELS, pose_noise, WEAK_DILUTION
+from ..estimate.geometry import (
+    dilution,
+    free_parameters,
+    LARGEST_DILUTION,
+    NORM_MODELS,
+    pose_noise,
+    poses_needed,
+    WEAK_DILUTION,
+)
 from ..estimate.robust import fit_norm, start_of
 from ..estimate.sensing_axes import lower_triangular, TIES
 from ..estimate.solve import NotConvergedError, Point, solve
@@ -45,19 +54,19 @@ _LEVEL = 0.03
 
 def directions_of(poses: Poses, units: Units) -> Floats:
     """
-    Return where up is in each pose, as far as it is known before a fit.
+    Return the approximate direction of up in each pose, before a fit.
 
     Parameters
     ----------
     poses : Poses
-        In the unit of the readings.
+        Poses, in the unit of the readings.
     units : Units
-        That unit; native readings have a meaning only from the centre of their sphere.
+        Unit of the readings. Native readings are measured from the centre of their sphere.
 
     Returns
     -------
     (n, 3) array
-        Unit vectors in the sensor axes, from the centre of the readings if that is clear.
+        Unit vectors in the sensor axes, from the centre of the readings if the poses determine it.
 
     """
     raw = unit(poses.reading)
@@ -74,15 +83,17 @@ class NormFit:
     Parameters
     ----------
     name : str
-        The model.
+        Name of the model.
     reason : str
-        Why this one.
+        Reason for the choice of the model.
     fit : Fit
-        To the poses that are kept.
+        Fit to the poses kept.
     kept : (k,) array of int
-        Indices of these poses.
+        Indices of the poses kept.
+    directions : (k, 3) array
+        Their approximate directions of up.
     warnings : tuple of str
-        What a user should know.
+        Warnings for the user.
 
     """
 
@@ -90,27 +101,28 @@ class NormFit:
     reason: str
     fit: Fit
     kept: NDArray[np.intp]
+    directions: Floats
     warnings: tuple[str, ...]
 
 
 def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
-    """Fit poses of which only |force| = 1 g is known; arguments and errors as `fit_poses`."""
+    """Fit poses of unknown orientation; parameters and errors as in `fit_poses`."""
     units = own_scale(poses, units)
     found = solve_unknown(in_g(poses, units), directions_of(poses, units), model, method)
     return calibration_of(found, poses, units, method)
 
 
 def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -> Calibration:
-    """Return the record of a fit to these poses."""
+    """Return a fit to these poses as a Calibration."""
     rejected = _rejections(in_g(poses, units), found)
-    quality = quality_of(found.fit, units, directions_of(poses, units)[found.kept])
+    quality = quality_of(found.fit, units, found.directions)
     return Calibration(found.name, method, found.fit.model, units, '', 'ros', '',
                        found.fit.covariance, quality, poses, rejected, found.reason,
                        found.warnings)
 
 
 def own_scale(poses: Poses, units: Units) -> Units:
-    """Return native units with the scale that the poses show, and others as they are."""
+    """Return native units with the scale estimated from the poses; other units unchanged."""
     if units.name != 'native':
         return units
     if len(poses) < free_parameters('4'):
@@ -125,45 +137,45 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
     Parameters
     ----------
     poses_g : Poses
-        In g.
+        Poses in g.
     directions : (n, 3) array
-        Approximate direction of up in each, unit vectors.
+        Approximate direction of up in each pose, unit vectors.
     model : {'auto', '4', '7', '9', '10'}
-        The model, or the smallest that the poses call for.
+        The model, or the smallest that the data support.
     method : {'ml', 'algebraic'}
-        As `fit_poses`.
+        As in `fit_poses`.
 
     Returns
     -------
     NormFit
-        The fit, and to which poses.
+        The fit and the poses used.
 
     Raises
     ------
     RefusedFitError
-        If the poses cannot determine the model.
+        If the poses do not determine the model.
 
     """
     poses_g = _only_norm(poses_g)
     noise = pose_noise(poses_g.noise, directions)
-    carried = _carried(model, directions, noise)
+    dilutions = _dilutions(model, directions, noise)
     kept = np.arange(len(poses_g))
     fits: dict[str, Fit] = {}
     if method == 'ml':
-        largest = list(carried)[-1]
+        largest = list(dilutions)[-1]
         fit, kept = _fit_norm(largest, poses_g)
         fits[largest] = fit
     left, directions = poses_g.take(kept), directions[kept]
     if len(kept) < len(poses_g):
         noise = pose_noise(left.noise, directions)
-        carried = _carried(model, directions, noise)
-    fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in carried}
-    name, reason = ((model, f'model {model} was asked for') if model != 'auto'
+        dilutions = _dilutions(model, directions, noise)
+    fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
+    name, reason = ((model, f'model {model} was requested') if model != 'auto'
                     else _choose(fits))
-    warnings = fit_warnings(fits[name], carried[name])
+    warnings = fit_warnings(fits[name], dilutions[name])
     if model == 'auto':
-        warnings = (*warnings, *unseen(list(carried)[-1], directions, noise))
-    return NormFit(name, reason, fits[name], kept, warnings)
+        warnings = (*warnings, *unseen(list(dilutions)[-1], directions, noise))
+    return NormFit(name, reason, fits[name], kept, directions, warnings)
 
 
 def _only_norm(poses_g: Poses) -> Poses:
@@ -172,24 +184,24 @@ def _only_norm(poses_g: Poses) -> Poses:
     return Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
 
 
-def _carried(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
-    """Return the dilution of each model to look at that the poses carry, the smallest first."""
-    first, *others = NORM_MODELS if model == 'auto' else (model,)
-    found = {first: dilution(first, directions, noise)}
-    refuse_if_unfit(first, directions, noise)
-    for name in others:
-        if carries(name, directions, noise):
-            found[name] = dilution(name, directions, noise)
-    return found
+def _dilutions(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
+    """Return the dilution of each candidate model that the poses determine, smallest first."""
+    names = NORM_MODELS if model == 'auto' else (model,)
+    dilutions = {name: dilution(name, directions, noise) for name in names
+                 if len(directions) >= poses_needed(name)}
+    determined = {name: each for name, each in dilutions.items() if each <= LARGEST_DILUTION}
+    if names[0] not in determined:
+        refuse_if_unfit(names[0], directions, noise)
+    return determined
 
 
 def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
-    """Fit a model without the outliers, model 9 in its own axes."""
+    """Fit a model without the outliers; model 9 in its own axes."""
     try:
         fit, kept = fit_norm('10' if name == '9' else name, poses_g)
     except NotConvergedError:
         raise RefusedFitError(
-            f'the {len(poses_g)} poses lie on no ellipsoid of model {name}',
+            f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
             'take poses with each side of the sensor up and down, and some edges, and hold it '
             'still in each') from None
     return (_in_sensing_axes(fit.model.linear_part, poses_g.take(kept)) if name == '9' else fit,
@@ -197,7 +209,7 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
 
 
 def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
-    """Return model 9 with this W, in any axes, and V."""
+    """Return model 9 at these poses, from W in any axes, and V."""
     mat_w, vec_v = linear_part
     turned = with_linear_part(lower_triangular(mat_w), vec_v).values
     model = Model({name: turned.get(name, np.zeros(3)) for name in MODELS['9']})
@@ -205,13 +217,14 @@ def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
-    """Fit a model to all of these poses."""
+    """Fit a model to all these poses."""
     if method == 'ml':
         return estimate(start_of(name, poses_g.reading), poses_g)
     mat_w, vec_v = closed_form(name, poses_g.reading)
     if not np.all(np.isfinite(mat_w)):
-        raise RefusedFitError('the poses lie on no ellipsoid', 'take poses with each side of the '
-                              'sensor up and down, and some edges')
+        raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
+                              'take poses with each side of the sensor up and down, and some '
+                              'edges')
     if name == '9':
         return _in_sensing_axes(_of_the_report(mat_w, vec_v, poses_g), poses_g)
     return judge(start_of(name, poses_g.reading), poses_g)
@@ -236,20 +249,20 @@ def _of_the_report(mat_w: Floats, vec_v: Floats, poses_g: Poses) -> tuple[Floats
 
 
 def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
-    """Return the smallest model that the poses call for, and why."""
+    """Return the smallest model that the data support, and the reason."""
     chosen, *larger = fits
     reasons: list[str] = []
     for name in larger:
         chance = _by_chance(fits[chosen], fits[name])
         change = f'{_rms_mg(fits[chosen]):.3g} to {_rms_mg(fits[name]):.3g} mg'
         if chance < _LEVEL:
-            reasons.append(f'model {name} lowers the residual of model {chosen} from {change} '
+            reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
                            f'(by chance: p = {chance:.1g})')
             chosen = name
         else:
-            reasons.append(f'model {name} would change it from {change}, no more than noise would '
+            reasons.append(f'model {name} would change it from {change}, which noise explains '
                            f'(p = {chance:.2g})')
-    return chosen, '; '.join(reasons) or f'the poses carry no model but {chosen}'
+    return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
 
 
 def _rms_mg(fit: Fit) -> float:
@@ -257,7 +270,7 @@ def _rms_mg(fit: Fit) -> float:
 
 
 def _by_chance(small: Fit, large: Fit) -> float:
-    """Return the probability that noise alone makes the larger model fit that much better."""
+    """Return the probability that noise alone explains the improvement by the larger model."""
     from scipy.special import fdtrc
 
     if large.variance_dof <= 0:
@@ -268,11 +281,12 @@ def _by_chance(small: Fit, large: Fit) -> float:
 
 
 def _rejections(poses_g: Poses, found: NormFit) -> tuple[Rejected, ...]:
-    """Say of each outlier how far it is from 1 g in the fit of the others."""
+    """Return the outliers, with their distance from 1 g in the fit of the other poses."""
     out = np.setdiff1d(np.arange(len(poses_g)), found.kept)
     if len(out) == 0:
         return ()
     left = poses_g.take(out)
     away = np.linalg.norm(sensor_force(found.fit.model, left.reading, {}), axis=1) - 1.0
-    return tuple(Rejected(int(row), f'outlier: |force| is {error * MG:+.2f} mg off what the other '
-                          'poses say') for row, error in zip(left.row, away, strict=True))
+    return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
+                          'in the fit of the others')
+                 for row, error in zip(left.row, away, strict=True))

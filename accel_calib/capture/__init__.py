@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples to still poses: streaming for the node, the same rule over arrays for recordings.
+From samples to still poses. The node and recordings use the same rule.
 
-`detector` is the way in. `chunks` sums the samples over short stretches of header time, `rule`
-judges whether the sensor is still in each, `tracker` joins still chunks to dwells, `ongoing` sums
-one, `average` computes its figures, `dwell` judges it, and `poses` makes the pose table. `sums`,
-`window`, `sliding` and `noise` are the arithmetic below.
+`detector` is the entry point. `chunks` sums the samples over short intervals of header time, and
+`rule` decides whether the sensor is still in each chunk. `tracker` joins still chunks to dwells:
+`ongoing` accumulates the sums of a dwell, `average` computes its figures, and `dwell` accepts or
+rejects it. `poses` makes the pose table. `sums`, `window`, `sliding` and `noise` contain the
+arithmetic.
 
 """
 
-from .chunks import Interruption
 from .detector import StillDetector
 from .dwell import Dwell
 from .poses import capture, Captured, poses_from, select
 from .settings import CaptureSettings, REPEATED, Repeated, settings_from
 
-__all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Interruption', 'Repeated',
-           'StillDetector', 'capture', 'poses_from', 'select', 'settings_from']
+__all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated', 'StillDetector',
+           'capture', 'poses_from', 'select', 'settings_from']

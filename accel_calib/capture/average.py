@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Figures of finished dwells, one record each.
+Figures of finished dwells, one record per dwell.
 
-The noise of a mean is taken along the mean if that is known to be the vertical: a sensor that
-settles tilts, which changes its reading across. Its mean is right for its mean attitude, and the
-fit uses the noise along the force only.
+The noise of a mean is computed along the mean reading if that is known to be the vertical. A
+sensor that settles tilts slightly, which changes its reading across the vertical. Its mean is
+correct for its mean attitude, and the fit uses only the noise along the force.
 
 """
 
@@ -23,7 +23,7 @@ from .sums import chained, Records
 from ..table import Floats
 
 FIGURES = np.dtype([
-    ('lowest', float, 6),     # lower end of the mean variance of the windows
+    ('lowest', float, 6),     # lower confidence limit of the mean variance of the windows
     ('average', float, 6),    # mean variance of the windows
     ('mean', float, 6),       # reading and rate
     ('std', float, 3),        # of the samples
@@ -35,10 +35,10 @@ FIGURES = np.dtype([
     ('samples', float),
     ('excess', float),        # variance of the mean over that of independent samples
     ('along', float),         # the same along the mean reading, if that is the vertical
-    ('beside_slope', bool),   # the reading sloped just before or after
+    ('beside_slope', bool),   # the reading has a slope directly before or after
     ('orientation', np.intp),
     ('around', float, 2),     # temperature and supply voltage
-    ('part_slope', float, 3), ('part_strength', float, 3)])  # over three halves of the dwell
+    ('part_slope', float, 3), ('part_strength', float, 3)])  # first, middle and last half
 """Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
 
 
@@ -49,9 +49,9 @@ def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
     Parameters
     ----------
     dwells : sequence of OngoingDwell
-        As they are at their end.
+        The finished dwells.
     known_units : bool
-        Whether a reading of 0 is no force, apart from the offset.
+        Whether the unit is known, so that the mean reading is nearly vertical.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def trend_of(found: Records) -> Trend:
 
 def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
                known_units: bool) -> None:
-    """Set the figures that follow from the means of cells."""
+    """Set the figures that depend on the means of cells."""
     sizes = np.array([len(dwell.cells) for dwell in dwells], dtype=float)
     count = np.zeros((len(dwells), int(sizes.max())))
     sums = np.zeros((3, *count.shape))
@@ -121,9 +121,9 @@ def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats,
 def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
                ) -> None:
     """
-    Set the slopes over the first, the middle and the last half, and their strengths.
+    Set the slopes of the first, the middle and the last half, and their strengths.
 
-    They show a turn that begins or ends within a dwell better than the slope of the whole.
+    They reveal a turn that begins or ends within a dwell better than the slope of the whole dwell.
 
     """
     half = sizes // 2

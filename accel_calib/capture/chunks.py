@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples to chunks: sums over short stretches of header time.
+From samples to chunks: sums over short intervals of header time.
 
-Everything that follows works on chunks, a fifth of the still window each. So the work per sample
-is a few additions, whatever the window, and a recording of any length becomes a short table.
-Windows and dwells are sums of chunks. The first sample of the stream is subtracted before
-squaring, which keeps the digits of a small noise on a large offset.
+All later steps work on chunks of a fifth of the still window. The cost per sample is thus a few
+additions for any window length, and a recording of any length becomes a short table. Windows and
+dwells are sums of chunks. The first sample of the stream is subtracted before squaring, which
+preserves the digits of a small noise on a large offset.
 
-The sample period is learned from the first samples of a segment, never from later ones, so that
-a stream and a recording are cut in the same places. A segment is a stretch without an interruption
-of its stamps; after one the period is learned again.
+The sample period is estimated from the first samples of a segment and then kept, so that a stream
+and a recording are divided at the same places. A segment is a part of the stream without an
+interruption of the stamps. After an interruption the period is estimated again.
 
 """
 
@@ -28,30 +28,30 @@ from .settings import CaptureSettings
 from .sums import chained, CHUNKS_PER_WINDOW, Indices, Records, smallest_steps, sums_of
 from ..table import Floats
 
-_LEARN = 16          # intervals from which the period is learned
-_SAMPLES = 2         # samples of a chunk, at least
-_MISSING_SECONDS = 0.5   # samples are missing for longer than this and than _MISSING_PERIODS
+_LEARN = 16          # intervals from which the period is estimated
+_SAMPLES = 2         # smallest number of samples in a chunk
+_MISSING_SECONDS = 0.5   # a longer interval, also longer than _MISSING_PERIODS, is an interruption
 _MISSING_PERIODS = 5.0
-_BACK_SECONDS = 0.01  # stamps out of order by no more than this, or _BACK_PERIODS, are jitter
+_BACK_SECONDS = 0.01  # a step back by less, or by less than _BACK_PERIODS, is jitter
 _BACK_PERIODS = 2.0
 _INTERRUPTIONS_MAX = 10_000
 _NONE: Floats = np.empty((4, 0))
-_PENDING_MAX = 200_000  # samples of one chunk: more mean that the clock stands still
+_PENDING_MAX = 200_000  # largest number of samples in a chunk; with more, the clock has stopped
 
 
 class Interruption(NamedTuple):
     """
-    An interruption of the stamps, which ends a dwell.
+    An interruption of the stamps. It ends a dwell.
 
     Parameters
     ----------
     time : float
-        Last stamp before it [s].
+        Last stamp before the interruption [s].
     kind : {'gap', 'jump_back', 'stopped'}
-        Samples are missing; time went back (a bag played again, simulated time reset); stamps
-        did not change while samples came.
+        Samples are missing; time jumped back (a bag played again, simulated time reset); or the
+        stamps did not change while samples arrived.
     seconds : float
-        Difference of the next stamp to the last [s], negative for a jump back.
+        Next stamp minus last stamp [s], negative for a jump back.
 
     """
 
@@ -72,7 +72,7 @@ class Chunks:
     begin, end : (m,) array
         First and last stamp [s].
     step : (2, m) array
-        Smallest step between successive readings, and rates, that is not 0; infinite if none is
+        Smallest nonzero step between successive readings, and rates; infinite if no step is
         smaller than before.
     epoch : float
         Start of the segment [s].
@@ -83,7 +83,7 @@ class Chunks:
     period : float
         Sample period [s].
     fresh : bool
-        True for the first chunks of a segment.
+        Whether these are the first chunks of a segment.
 
     """
 
@@ -99,7 +99,7 @@ class Chunks:
 
 
 def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
-    """Join chunks of the same segment."""
+    """Yield the chunks with those of the same segment joined."""
     parts: list[Chunks] = []
     for each in found:
         if each.fresh and parts:
@@ -120,7 +120,7 @@ def _one(parts: Sequence[Chunks]) -> Chunks:
 
 
 class Chunker:
-    """Turn blocks of samples into chunks, which do not depend on the blocks."""
+    """Convert blocks of samples to chunks. The division into blocks does not affect the chunks."""
 
     def __init__(self, settings: CaptureSettings) -> None:
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
@@ -141,9 +141,9 @@ class Chunker:
         Parameters
         ----------
         samples : (k, n) array
-            Time [s] and reading (k = 4), and rate (7), and context (9).
+            Time [s] and reading (k = 4), with rate (7), with context (9).
         last : bool
-            True if no more samples follow: the period is then learned from those there are.
+            Whether no more samples follow. The period is then estimated from few samples, too.
 
         """
         pending = _joined(self._pending, samples)
@@ -167,7 +167,7 @@ class Chunker:
         return done
 
     def restart(self) -> None:
-        """Begin a new segment with the next sample."""
+        """Start a new segment with the next sample."""
         self._pending = _NONE
         self._period = -1.0
         self._fresh = True
@@ -185,7 +185,7 @@ class Chunker:
         return True
 
     def _first_break(self, time: Floats) -> tuple[int, bool]:
-        """Return the index of the first interruption, and whether all stamps are in order."""
+        """Return the index of the first interruption, and whether the stamps are in order."""
         missing = max(_MISSING_SECONDS, _MISSING_PERIODS * self._period)
         step: Floats = time[1:] - time[:-1]
         first = time[0] - self._latest
@@ -241,7 +241,7 @@ class Chunker:
 
 
 def _joined(one: Floats, other: Floats) -> Floats:
-    """Return the samples of both; what only one of them has is NaN in the other."""
+    """Concatenate samples; columns that one part lacks are NaN there."""
     if not one.size:
         return other
     if len(one) != len(other):

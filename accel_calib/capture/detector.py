@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stillness detector of one sensor: samples in, dwells out."""
+"""The stillness detector of one sensor: it converts samples to dwells."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ from .tracker import Tracker
 from ..table import Floats
 from ..units import Units
 
-_BESIDE = 100
-"""Earlier dwells with which a new one is judged."""
+_EARLIER = 100
+"""Number of earlier dwells that are used in the test of a new dwell."""
 
 
 class StillDetector:
     """
     Find the dwells of one sensor, block by block.
 
-    The dwells do not depend on where the blocks end; a stream and a recording give the same.
+    The dwells do not depend on the division into blocks; a stream and a recording have the same
+    dwells.
 
     Parameters
     ----------
     settings : CaptureSettings
-        What is still, and for how long.
+        Settings of the detector.
     units : Units
         Unit of the readings.
     keep : int or None
-        Number of finished dwells that are kept, the last ones; None: all.
+        Number of finished dwells to keep; None: all.
 
     """
 
@@ -60,33 +61,33 @@ class StillDetector:
         Parameters
         ----------
         samples : (n, 9) array
-            Columns time, reading (3), rate (3, NaN: none), temperature and supply voltage (NaN:
-            none); times and readings must be finite.
+            Columns time, reading (3), rate (3), temperature and supply voltage. Times and
+            readings must be finite; NaN marks other missing values.
 
         Returns
         -------
         list of Dwell
-            The dwells that ended and are still by what is known now.
+            The dwells that ended, and are still according to the noise known now.
 
         """
         return self._last(self.add([_columns(samples)]))
 
     def add(self, blocks: Iterable[Floats]) -> int:
         """
-        Add samples as (k, n) arrays, the columns of `push` as rows.
+        Add samples as (k, n) arrays, with the columns of `push` as rows.
 
-        Rows without any value may be left out at the end: k is 4, 7 or 9.
+        Rows without values can be omitted at the end: k is 4, 7 or 9.
 
         Returns
         -------
         int
-            Number of dwells that ended; `dwells` returns those that are still.
+            Number of dwells that ended; `dwells` returns the still ones.
 
         """
         return self._keep(self._feed(blocks, last=False))
 
     def close(self) -> list[Dwell]:
-        """End the ongoing dwell, because the next sample does not follow; return it if still."""
+        """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
         count = self._keep(self._feed([np.empty((4, 0))], last=True) + self._leave())
         self._chunker.restart()
         return self._last(count)
@@ -97,7 +98,7 @@ class StillDetector:
         return self._still
 
     def current(self) -> Dwell | None:
-        """Return the ongoing dwell so far; None if it is too short or not still."""
+        """Return the ongoing dwell so far, or None if it is too short or not still."""
         dwell = None if self._tracker is None else self._tracker.current()
         if dwell is None:
             return None
@@ -105,11 +106,11 @@ class StillDetector:
         return found[0] if found else None
 
     def dwells(self) -> list[Dwell]:
-        """Return the finished dwells, of those kept, that are still by what is known now."""
+        """Return the kept dwells that are still according to the noise known now."""
         return [each for each in self._judged() if each is not None]
 
     def doubtful(self) -> set[float]:
-        """Return the starts of the finished dwells that are not still by what is known now."""
+        """Return the starts of the kept dwells that are not still with the noise known now."""
         return {float(start) for start, each in zip(self._kept['begin'], self._judged())
                 if each is None}
 
@@ -118,8 +119,8 @@ class StillDetector:
         """
         Return the standard deviation below which a window is still now.
 
-        In the unit of the readings, of the axis where it is largest; infinite before anything
-        is known of a sensor in native units.
+        The value is the largest over the axes, in the unit of the readings. It is infinite before
+        the first samples of a sensor in native units.
 
         """
         mean = np.nan_to_num(self._mean)[:, np.newaxis]
@@ -128,7 +129,7 @@ class StillDetector:
 
     @property
     def interruptions(self) -> tuple[Interruption, ...]:
-        """Interruptions of the stamps so far, the last thousands of them."""
+        """Return the most recent interruptions of the stamps, at most 10,000."""
         return tuple(self._chunker.interruptions)
 
     def _feed(self, blocks: Iterable[Floats], last: bool) -> list[OngoingDwell]:
@@ -155,7 +156,7 @@ class StillDetector:
         return found
 
     def _keep(self, found: list[OngoingDwell]) -> int:
-        """Keep the figures of these dwells, and return their number."""
+        """Store the figures of these dwells, and return their number."""
         if found:
             new = figures(found, known_units=self._rule.known)
             every = chained(self._kept, new)
@@ -166,20 +167,20 @@ class StillDetector:
         return judged(self._kept, self._rule) if len(self._kept) else []
 
     def _last(self, count: int) -> list[Dwell]:
-        """Return the last dwells, judged beside the earlier ones."""
+        """Return the last dwells that are still, tested together with earlier dwells."""
         if not count:
             return []
         count = min(count, len(self._kept))
         return self._beside(self._kept[-count:], self._kept[:-count])
 
     def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
-        earlier = earlier[-_BESIDE:]
+        earlier = earlier[-_EARLIER:]
         table = chained(earlier, found)
         return [each for each in judged(table, self._rule, len(earlier)) if each is not None]
 
 
 def _columns(samples: Floats) -> Floats:
-    """Return (n, 9) samples as rows, without the last rows if they have no value."""
+    """Return (n, 9) samples as rows, without missing columns at the end."""
     known: NDArray[np.bool_] = np.any(~np.isnan(samples), axis=0)
     rows = WIDTH if known[7:].any() else 7 if known[4:7].any() else 4
     return np.ascontiguousarray(samples[:, :rows].T)

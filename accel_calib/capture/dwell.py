@@ -2,24 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A dwell: a still stretch, averaged and judged.
+Dwells: still stretches, averaged and tested.
 
 Mean and standard deviation are those of all samples. The number of samples is divided by the
-excess of the noise of the mean over that of independent samples (see `noise`), so that
-std/√count is the noise of the mean, along the force (see `average`). One short dwell shows the
-excess badly, and it is a property of the sensor: the median over its dwells is used, unless a
-dwell shows clearly more. Samples that are rounded to steps of height q leave an error in the mean
-that averaging does not remove if their own noise σ is less than a step: its variance is
-(q²/12) exp(-4π² σ²/q²) [1]_. The quietest stretch seen shows σ; samples that flip between two
-steps do not.
+excess of the noise of the mean (see `noise`), so that std/√count is the noise of the mean along
+the force (see `average`). A short dwell is not enough to estimate the excess, which is a property
+of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
+excess. Samples that are rounded to steps of height q cause an error of the mean. Averaging does
+not remove this error if the noise σ of the samples is less than a step: its variance is
+(q²/12) exp(-4π² σ²/q²) [1]_. σ is estimated from the quietest stretch so far; samples that
+alternate between two steps are not suitable.
 
-A dwell is refused if its windows vary on average more than `DWELL_RATIO` times the sensor's
-noise, by more than the uncertainty of that average: a tremor that stays below the threshold of a
-single window. The noise may become known after the dwell ended, so dwells are judged again when
-they are asked for. A dwell is also refused if the reading sloped through it or through half of
-it, or if its noise would hide that: it must exclude that it was turned (see `rule.TURN_G`), which
-takes longer for a noisier sensor. Once five dwells have shown the bias of the gyro, the gyro
-decides.
+A dwell is rejected in three cases:
+
+- Its windows vary on average more than `DWELL_RATIO` times the noise of the sensor, significantly.
+  This detects a tremor below the threshold of a single window.
+- The reading has a slope through the dwell or through half of it.
+- Its noise does not exclude a slow turn (see `rule.TURN_G`). A noisier sensor needs a longer
+  dwell. Once five dwells determine the bias of the gyro, the gyro decides instead.
+
+The noise may become known after the dwell ended, so each query tests the dwells again.
 
 References
 ----------
@@ -45,34 +47,34 @@ from .sums import CONTEXT, Records
 from ..table import Floats
 
 DWELL_RATIO = 3.2
-"""Largest mean variance of the windows of a dwell over the noise."""
+"""Largest ratio of the mean variance of the windows of a dwell to the noise."""
 
 DWELL_RATE_RATIO = 1600.0
-"""The same for the rate: shaking that the accelerometer does not show does no harm."""
+"""The same for the rate: shaking that the accelerometer does not measure is harmless."""
 
 PART_SLOPE_G = 5e-3
 """Largest slope through half of a dwell [g/s]."""
 
 PART_STRENGTH = 20.0
-"""It is significant if the sum of its squared scores is larger: p ≈ 2e-4."""
+"""This slope is significant if the sum of its squared scores is larger: p ≈ 2e-4."""
 
-_OWN_EXCESS = 1.5   # factor by which the estimate of one dwell is uncertain
-_BIAS_DWELLS = 5    # that show the bias of the gyro
+_OWN_EXCESS = 1.5   # factor of uncertainty of the excess of one dwell
+_BIAS_DWELLS = 5    # fewest dwells that determine the bias of the gyro
 _GYRO_RATE = np.radians(0.25)
-"""Mean rate beside the bias that shows turning [rad/s]."""
-_SPREADS = 3.0      # of the bias over the dwells, that are below this rate
-_MAD = 1.4826       # standard deviation over median absolute deviation
+"""Mean rate minus the bias that indicates turning [rad/s]."""
+_SPREADS = 3.0      # standard deviations of the bias over the dwells that must be below this rate
+_MAD = 1.4826       # ratio of standard deviation to median absolute deviation
 
 
 @dataclass(frozen=True)
 class Dwell:
     """
-    A still stretch, averaged.
+    An averaged still stretch.
 
     Parameters
     ----------
     start, end : float
-        First and last stamp that is averaged [s].
+        First and last stamp of the averaged samples [s].
     time : float
         Mean of the stamps [s].
     mean, std : (3,) array
@@ -80,13 +82,13 @@ class Dwell:
     count : float
         Independent samples: std/√count is the noise of the mean.
     samples : int
-        Samples averaged.
+        Number of samples averaged.
     context : mapping of str to float or (3,) array
-        Means of ``temperature``, ``supply_voltage`` and ``rate``, as far as they are known.
+        Means of ``temperature``, ``supply_voltage`` and ``rate``, if known.
     orientation : int
-        Dwells that share it are parts of one (see ``max_dwell``).
+        Dwells with the same number are parts of one dwell (see ``max_dwell``).
     doubtful : bool
-        Whether it turned out later that the sensor may have moved.
+        Whether the sensor may have moved, according to later dwells.
 
     """
 
@@ -104,14 +106,14 @@ class Dwell:
 
 def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
     """
-    Return each dwell, or None if it is not still by what is known now.
+    Return each dwell, or None if it is not still according to the noise known now.
 
     Parameters
     ----------
     table : (k,) array of `average.FIGURES`
-        The dwells; excess and bias of the gyro are estimated from all of them.
+        The dwells. Excess and bias of the gyro are estimated from all of them.
     rule : Rule
-        The rule with the noise so far.
+        The rule, with the noise known now.
     first : int
         Index of the first dwell to return.
 
@@ -128,13 +130,13 @@ def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
-    """Return the excess of the noise of each mean, from all of them."""
+    """Return the excess of the noise of each mean, estimated from all dwells."""
     common = float(np.median(own[quiet])) if quiet.any() else 1.0
     return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
 
 
 def _quiet(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
-    """Return which dwells are still by the noise known now, and did not move steadily."""
+    """Return which dwells are still according to the noise known now, and have no slope."""
     limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
     strength = np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
     moved = rule.moved(slopes, np.asarray(rule.scale), table['average'].T[:3], strength,
@@ -148,10 +150,11 @@ def _quiet(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
              ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
-    Return which dwells were turned by the gyro, and which certainly were not.
+    Return which dwells are turning according to the gyro, and which are certainly not.
 
-    Its bias is the median over the quiet dwells, and a rate about the vertical does not change a
-    pose. With native units the gyro may be in counts too, and is not used.
+    The bias of the gyro is the median over the quiet dwells. A rate about the vertical does not
+    change a pose and is ignored. With native units the gyro is not used, because it may be in
+    counts, too.
 
     """
     up, rates = table['mean'].T[:3], table['mean'].T[3:]
@@ -168,7 +171,7 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
 
 
 def _counts(table: Records, excess: Floats, rule: Rule) -> tuple[Floats, Floats]:
-    """Return (3, k) standard deviations and (k,) independent samples, with rounding."""
+    """Return (3, k) standard deviations and (k,) independent samples, including rounding."""
     resolution, left = rule.rounding(table['mean'].T[:3], table['std'].T)
     std = np.maximum(table['std'].T, resolution)
     variance = std**2 * excess / table['samples'] + left

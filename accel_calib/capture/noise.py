@@ -4,19 +4,19 @@
 """
 Noise of the mean of correlated samples, and significance of slopes.
 
-Both use the means of K consecutive cells of the same length (chunks, or joined chunks).
+Both use the means of K consecutive cells of equal length (chunks, or joined chunks).
 
-**Slope.** Least squares over the cells: slope = Σ t x / Σ t², t centred. If the samples were
-independent, a cell mean would have the variance w = (variance of the samples) / (samples of a
-cell), and the slope w / Σ t². The residuals r show the factor on it: their power over w, times
-(1 + ρ)/(1 - ρ) for a correlation ρ between neighbours (an AR(1) process has this sum of its
-correlations [1]_). Power and ρ are pooled over the axes, because K cells of one axis are too few,
-and are at least those of white noise.
+**Slope.** Least squares over the cells: slope = Σ t x / Σ t², with t centred. For independent
+samples, a cell mean has the variance w = (variance of the samples) / (samples per cell), and the
+slope has the variance w / Σ t². For correlated samples this is multiplied by a factor estimated
+from the residuals r: their power over w, times (1 + ρ)/(1 - ρ) for a correlation ρ between
+neighbours (the sum of the correlations of an AR(1) process [1]_). Power and ρ are pooled over the
+axes, because K cells of one axis are too few. They are at least those of white noise.
 
-**Mean.** The variance of the mean of a correlated series is the sum of its autocovariances
-over its length. Sample autocovariances at long lags are noise; the sum therefore ends where a
-pair Γ_j = γ_2j + γ_2j+1 is no longer positive, the initial positive sequence of Geyer [2]_.
-Subtracting the mean removes the variance of the mean from each; it is added again.
+**Mean.** The variance of the mean of a correlated series is the sum of its autocovariances divided
+by its length. Sample autocovariances at long lags are noise. The sum therefore ends where a pair
+Γ_j = γ_2j + γ_2j+1 is not positive (initial positive sequence, Geyer [2]_). Subtracting the mean
+removes the variance of the mean from each autocovariance; it is added again.
 
 References
 ----------
@@ -45,13 +45,13 @@ class Trend(NamedTuple):
     Parameters
     ----------
     slope : (3, ...) array
-        In the unit of the cells per second.
+        Slope in the unit of the cells per second.
     strength : (...) array
         Sum over the axes of (slope / its standard error)².
     excess : (...) array
-        Variance of a mean over that of white noise, at least 1.
+        Ratio of the variance of a mean to that of white noise, at least 1.
     error : (...) array
-        Standard error of the slope for independent samples, of the noisiest axis.
+        Standard error of the slope of the noisiest axis, for independent samples.
 
     """
 
@@ -95,16 +95,16 @@ def _over_axes(values: Floats) -> Floats:
 
 def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
-    Return the variance of the mean of each series of cells over that of white noise.
+    Return the excess of each series: the variance of its mean over that of white noise.
 
     Parameters
     ----------
     centred : (3, k, K) array
-        Means of consecutive cells minus their mean, and 0 after the end of a series.
+        Means of consecutive cells minus their common mean, and 0 after the end of a series.
     sizes : (k,) array
         Lengths of the series.
     white : (3, k) array
-        Variance of a cell mean for independent samples; axes with 0 are left out.
+        Variance of a cell mean for independent samples; axes with 0 are ignored.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
 
 
 def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
-    """Return (k, lags) by the Fourier transform, padded against wrapping around."""
+    """Return (k, lags) autocovariances, by a Fourier transform with zero padding."""
     length = centred.shape[2]
     padded = 1 << (2 * length - 1).bit_length()
     power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)

@@ -4,8 +4,8 @@
 """
 The sums of an ongoing dwell.
 
-The chunks of a dwell are kept as at most `2 · CELLS` cells of a power of two chunks each, so a
-dwell of days takes no more memory than one of a minute.
+The chunks of a dwell are combined into at most `2 · CELLS` cells. The number of chunks per cell is
+a power of two, so a dwell of days needs no more memory than a dwell of a minute.
 
 """
 
@@ -25,17 +25,17 @@ DWELL = np.dtype([*SUMS.descr,
 """Sums of a chunk in a dwell."""
 
 _AGREE_G = 2e-3
-"""Largest change of the mean over a knock [g], beside the noise: in the same orientation."""
+"""Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
 
 
 class OngoingDwell:
     """
-    The chunks of a dwell, as they come.
+    The accumulated chunks of a dwell.
 
     Parameters
     ----------
     chunks : Chunks
-        Where epoch, origin and length are taken from.
+        Source of epoch, origin and length.
     orientation : int
         Number of the dwell.
 
@@ -46,7 +46,7 @@ class OngoingDwell:
     cells : (n,) array of DWELL
         Sums over `size` chunks each.
     beside_slope : bool
-        Whether the reading sloped just before or after.
+        Whether the reading has a slope directly before or after the dwell.
 
     """
 
@@ -85,12 +85,12 @@ class OngoingDwell:
             self.size *= 2
 
     def total(self) -> Records:
-        """Return the sum of what was added, one record."""
+        """Return the sum of all chunks, one record."""
         every = chained(self.cells, self._partial)
         return summed(every, len(every))
 
     def continued_by(self, sums: Records, scale: float) -> bool:
-        """Return whether these chunks have the same mean reading as the dwell so far."""
+        """Return whether these chunks have the same mean reading as the dwell."""
         old, new = self.total(), summed(sums, len(sums))
         level = np.maximum(old['level'] / np.maximum(old['windows'], 1.0)[:, np.newaxis],
                            new['level'] / new['windows'][:, np.newaxis])[0, :3]

@@ -2,18 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Dwells to poses, and recordings to poses.
+From dwells or recordings to poses.
 
 **Repeated poses.** Two poses whose readings have the distance c differ in direction by
-2 asin(c/2r), with r the reading of 1 g; offsets cancel in the difference. In native units r is
-half the range of the readings on the axis where it is largest. Until the sensor has been turned
-over this is too small and the angle too large, so too few poses count as repeated rather than too
-many.
+2 asin(c/2r), where r is the reading of 1 g. Offsets cancel in the difference. In native units r is
+half the largest range of the readings over the axes. Until the sensor has been turned over, this r
+is too small and the angle too large. Then too few poses count as repeated, not too many.
 
-**Merging.** The mean of two readings on a sphere lies inside it: with weights w and 1 - w, by
-w (1 - w) c²/2r², which for 0.1 rad is 1.25 mg. If 1 g is known, the mean is moved outwards by this
-much. Weights are inverse variances of the means, and std/√count of the merged pose is the noise of
-the weighted mean.
+**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w
+by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean is moved outwards by
+this distance. The weights are the inverse variances of the means, and std/√count of the merged
+pose is the noise of the weighted mean.
 
 """
 
@@ -35,8 +34,8 @@ from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import UnitName, Units
 
-_BLOCK = 1 << 14     # samples summed at a time: few enough to stay in the cache
-_AT_ONCE = 1 << 17   # samples judged at a time
+_BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
+_AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
 
 @dataclass(frozen=True)
@@ -49,15 +48,15 @@ class Captured:
     poses : Poses
         The poses.
     samples : int
-        Samples of the recording that the poses are averages of.
+        Number of samples in the poses.
     threshold : float
-        Standard deviation below which a window was still at the end [unit of the readings].
+        Standard deviation below which a window is still, at the end [unit of the readings].
     seconds : float
-        Time from the first to the last stamp of the recording, without interruptions [s].
+        Duration of the recording without interruptions [s].
     interruptions : tuple of Interruption
         Interruptions of the stamps.
     recorded : int
-        All samples of the recording.
+        Number of samples in the recording.
 
     """
 
@@ -77,12 +76,12 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     Parameters
     ----------
     recording : Recording, or an iterable of them
-        The samples, whole or in blocks; ``rate``, ``temperature`` and ``supply_voltage`` are used
-        if they are there.
+        The samples, as a whole or in blocks. ``rate``, ``temperature`` and ``supply_voltage`` are
+        used if present.
     units : Units
         Unit of the readings.
     settings : CaptureSettings
-        What is still, and which poses to keep.
+        Settings of the detector and of the poses.
 
     Returns
     -------
@@ -118,7 +117,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
 
 
 def _block(recording: Recording, start: int, stop: int) -> Floats:
-    """Return the columns of some samples as rows, without the last rows if they have no value."""
+    """Return the columns of samples start to stop as rows, without missing columns at the end."""
     which = slice(start, stop)
     time = recording['time'][which]
     samples = np.empty((_width(recording), len(time)))
@@ -138,7 +137,8 @@ def _block(recording: Recording, start: int, stop: int) -> Floats:
 def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
     bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
     if len(bad):
-        message = f'row {row[bad[0]]} holds a time or reading that is not a finite number'
+        message = (f'row {row[bad[0]]} holds a time or reading that is not finite, expected '
+                   'finite numbers')
         raise InputError(message, 'remove that row, or repair the recording')
 
 
@@ -152,7 +152,8 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     """
     Return the pose table of these dwells.
 
-    It has the column ``orientation`` if ``max_dwell`` cuts dwells, and ``doubtful`` if any is.
+    The table has the column ``orientation`` if ``max_dwell`` is finite, and the column
+    ``doubtful`` if a dwell is doubtful.
 
     """
     columns: dict[str, NDArray[Any]] = {
@@ -171,7 +172,7 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
 
 
 def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> list[Dwell]:
-    """Keep, merge or refuse repeated dwells, as set; doubtful ones are kept."""
+    """Keep, merge or refuse repeated dwells, as set; doubtful dwells are kept."""
     if settings.repeated == 'keep':
         return list(dwells)
     radius = _radius([each.mean for each in dwells], units)
@@ -189,7 +190,7 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     """
     Return the weighted mean of two dwells in nearly the same direction.
 
-    Time and context are weighted by the samples; the orientation is that of the first.
+    Time and context are weighted by the number of samples. The first dwell sets the orientation.
 
     """
     weight = _weight(first, second)
@@ -224,7 +225,7 @@ def _radius(means: Sequence[Floats], units: Units) -> float:
 
 def _nearest(dwell: Dwell, others: Sequence[Dwell], radius: float, settings: CaptureSettings
              ) -> int | None:
-    """Return the index of the nearest other dwell, if it is within ``min_pose_angle``."""
+    """Return the index of the nearest other dwell within ``min_pose_angle``, or None."""
     far = [float(np.linalg.norm(dwell.mean - each.mean))
            if each.orientation != dwell.orientation and not each.doubtful else np.inf
            for each in others]

@@ -6,22 +6,23 @@ The stillness rule, over chunks.
 
 A window is the last `CHUNKS_PER_WINDOW` chunks. It is still if
 
-1. the variance of each axis is below `VARIANCE_RATIO` times the sensor's own noise;
-2. the variance of the rate, if there is one, is below `RATE_RATIO` times its noise. The mean rate
+1. the variance of each axis is below `VARIANCE_RATIO` times the noise of the sensor;
+2. the variance of the angular rate, if known, is below `RATE_RATIO` times its noise. The mean rate
    is not used, because gyros have biases, unless the user sets a limit;
 3. |mean reading| is near 1 g, if the unit of the readings is known;
-4. there is no slope over the last `SLOPE_CHUNKS`: none that is significant and larger than the
-   drift of a sensor that warms up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s and
-   does not show in any variance.
+4. the reading has no slope over the last `SLOPE_CHUNKS` that is both significant and larger than
+   the drift of a sensor during warm-up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s
+   and is not visible in any variance.
 
-**The sensor's own noise** is the lower envelope of what was seen so far. The mean variance v of
-the windows in `LONG` chunks is known to about v √(2/dof), with dof = 2 n / (1 + excess) for n
-samples whose mean is `excess` times as noisy as that of independent samples (exact for white,
-and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), is an upper bound of
-the noise if the sensor is still, and far above it if it moves; so its minimum so far is used. It
-is raised to what the resolution allows: a quantised reading that flips between two steps of
-height q has a variance of up to q²/4, and q is the smallest step seen. It is also at least a
-millionth of the reading, for data without noise.
+**The noise of the sensor** is the lower envelope of the variances so far. The mean variance v of
+the windows in `LONG` chunks has a standard error of about v √(2/dof), with dof = 2 n / (1 +
+excess) for n samples. Excess is the variance of their mean over that of independent samples (this
+is exact for white noise and close for AR(1) noise). The upper end of this range, v exp(2
+√(2/dof)), is an upper bound of the noise if the sensor is still, and far above the noise if the
+sensor moves. Its minimum so far is therefore used. It is at least the variance that the resolution
+causes: a quantised reading that alternates between two steps of height q has a variance of up to
+q²/4, and q is the smallest step so far. For data without noise, the noise is at least a millionth
+of the reading.
 
 Before the noise is known, the unit of the readings sets a limit: a sensor with a standard
 deviation above `STD_CAP_G` is not still.
@@ -53,25 +54,25 @@ from ..table import Floats
 from ..units import Units
 
 LONG = 12
-"""Chunks over which the noise is judged."""
+"""Number of chunks from which the noise is estimated."""
 
 SLOPE_CHUNKS = (LONG, 3 * LONG)
-"""Chunks over which slopes are sought; a longer stretch shows smaller slopes."""
+"""Numbers of chunks over which slopes are tested; a longer stretch reveals smaller slopes."""
 
 HORIZON = max(SLOPE_CHUNKS)
 """Number of chunks after which the verdict on a chunk is final."""
 
 VARIANCE_RATIO = 12.0
-"""Largest variance of a window over the noise: windows are short, and their variances scatter."""
+"""Largest ratio of the variance of a window to the noise; windows are short, so it scatters."""
 
 RATE_RATIO = 900.0
-"""The same for the rate: a gyro shows shaking that does not change the mean of a dwell."""
+"""The same for the rate: a gyro measures shaking that does not change the mean of a dwell."""
 
 STD_CAP_G = 0.15
 """Largest adaptive threshold [g], as standard deviation."""
 
 SHAKING_G = 0.06
-"""Largest shaking beside the noise of a noisy sensor [g], as standard deviation."""
+"""Largest shaking in addition to the noise of a noisy sensor [g], as standard deviation."""
 
 SLOPE_G = 4e-3
 """Largest slope within a dwell [g/s]: a sensor that settles on a soft base."""
@@ -80,37 +81,37 @@ DWELL_SLOPE_G = 2e-3
 """Largest slope of a whole dwell [g/s]: 0.11 °/s; warming up causes some 1e-5 g/s."""
 
 TURN_G = 8.7e-3
-"""Slope that a dwell must exclude [g/s]: turning at 0.5 °/s."""
+"""A dwell must exclude this slope [g/s]: turning at 0.5 °/s."""
 
 SURE = 2.33
-"""Distance from it in standard errors: a dwell that is turned passes in 1 % of the cases."""
+"""Required margin to `TURN_G` in standard errors; 1 % of the turned dwells pass."""
 
 SLOPE_NOISE = 0.1
-"""Largest slope in standard deviations of the samples per second, if 1 g is not known yet."""
+"""Largest slope in standard deviations of the samples per second, while 1 g is not known."""
 
 STRENGTH = 40.0
 """A slope is significant if the sum of its squared scores over 3 axes is larger: p ≈ 1e-6."""
 
 WEAK_STRENGTH = 8.0
-"""The same for a stretch next to a significant slope, where it may continue: p ≈ 0.05."""
+"""The same for a stretch next to a significant slope, which may continue there: p ≈ 0.05."""
 
 
 class Judged(NamedTuple):
     """
-    Chunks with the verdict on the window that ends with each.
+    Chunks with the verdict on the window that ends with each chunk.
 
     Parameters
     ----------
     chunks : Chunks
         The chunks.
     level : (6, m) array
-        Variance within the window, of reading and rate; NaN if not known.
+        Variance of reading and rate within the window; NaN if not known.
     limit : (6, m) array
-        Largest variance of a still window.
+        Largest variance for a still window.
     still : (m,) array of bool
         The verdict.
     trending : (m,) array of int
-        Number of chunks over which there is a slope; 0 if there is none.
+        Number of chunks over which the reading has a slope; 0 without slope.
 
     """
 
@@ -122,7 +123,7 @@ class Judged(NamedTuple):
 
 
 class Rule:
-    """The rule with its memory: the last chunks, and noise and resolution so far."""
+    """The rule with its state: the last chunks, and noise and resolution so far."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings = settings
@@ -144,9 +145,9 @@ class Rule:
 
     def noise_of(self, mean: Floats) -> Floats:
         """
-        Return the variance of the sensor's own noise, as known now, for (6, n) means.
+        Return the variance of the noise of the sensor as known now, for (6, n) means.
 
-        Infinite before anything is known.
+        It is infinite before any sample.
 
         """
         axes = len(mean)
@@ -160,16 +161,16 @@ class Rule:
         Returns
         -------
         std : (n,) array
-            Standard deviation of the rounding of a sample; always above 0.
+            Standard deviation of the rounding error of a sample; always above 0.
         variance : (3, n) array
-            Variance of the error of the mean that averaging does not remove.
+            Variance of the rounding error of the mean; averaging does not remove it.
 
         """
         return rounding(float(self._step[0]), self._floor[:3, np.newaxis], mean, std)
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
-        """Return the (3 or 6, n) largest variances of a still window at this noise."""
+        """Return the (3 or 6, n) largest variances of a still window, for this noise."""
         limit = noise * ratio
         limit[3:] = noise[3:] * rate_ratio
         if self.known:
@@ -181,7 +182,7 @@ class Rule:
         return np.asarray(limit)
 
     def feed(self, chunks: Chunks) -> Judged:
-        """Judge consecutive chunks."""
+        """Apply the rule to consecutive chunks."""
         if chunks.fresh:
             self._before = blank(SUMS, HORIZON - 1)
         sums = chained(self._before, chunks.sums)
@@ -208,7 +209,7 @@ class Rule:
               strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
               ) -> NDArray[np.bool_]:
         """
-        Return whether a slope is significant and more than a drift.
+        Return whether a slope is significant and larger than a drift.
 
         Parameters
         ----------
@@ -219,7 +220,7 @@ class Rule:
         variance : (3, ...) array
             Variance of the samples.
         strength : float or array
-            Strength from which it is significant.
+            Strength above which the slope is significant.
         drift_g : float
             Largest drift [g/s].
 
@@ -231,7 +232,7 @@ class Rule:
         return np.asarray(large & (found.strength > strength))
 
     def rests(self, found: Trend, excess: Floats) -> NDArray[np.bool_]:
-        """Return whether dwells exclude that they were turned slowly: see `TURN_G`."""
+        """Return whether dwells exclude a slow turn; see `TURN_G`."""
         size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
         return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
 
@@ -268,8 +269,8 @@ class Rule:
         return at_least(floor, steps, mean)
 
 
-def _six(values: Floats, rest: float) -> Floats:
-    """Return (6, m) values; those of a missing rate are `rest`."""
+def _six(values: Floats, fill: float) -> Floats:
+    """Return (6, m) values; the values of a missing rate are `fill`."""
     if len(values) == 6:
         return values
-    return np.concatenate([values, np.full_like(values, rest)])
+    return np.concatenate([values, np.full_like(values, fill)])

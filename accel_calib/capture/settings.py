@@ -27,28 +27,28 @@ class CaptureSettings:
     Parameters
     ----------
     still_window : float
-        Length of the sliding window [s]. At low rates it grows until it holds ten samples.
+        Length of the sliding window [s]. At low sample rates it is extended to ten samples.
     still_std_max : float
         Largest standard deviation of the samples of a still sensor, by axis; in g if the unit of
-        the readings is known, otherwise in native units. 0: adapt to the sensor's own noise.
+        the readings is known, otherwise in native units. 0: adapt to the noise of the sensor.
     still_gyro_max : float
         Largest magnitude of the mean angular rate [rad/s]. 0: not checked, because gyros have
         biases and may be in counts.
     still_norm_tolerance : float
-        Largest distance of |mean| from 1 g [g]; not used for native units. Wide, because the
-        sensor is not calibrated yet.
+        Largest difference of |mean| from 1 g [g]; not used for native units. The default is wide
+        because the sensor is not calibrated yet.
     min_dwell : float
-        Shortest dwell that makes a pose [s], without its edges. At low rates it grows until it
-        holds sixteen samples.
+        Shortest dwell that becomes a pose [s], without its edges. At low sample rates it is
+        extended to sixteen samples.
     max_dwell : float
-        A longer dwell is cut into poses of this length [s] that share their ``orientation``;
-        for a temperature that changes during a dwell. Infinite: one pose per dwell.
+        A longer dwell is split into poses of this length [s] with the same ``orientation``, for
+        example if the temperature changes during a dwell. Infinite: one pose per dwell.
     min_pose_angle : float
         Poses of different dwells within this angle count as repeated [rad].
     repeated : {'keep', 'merge', 'refuse'}
-        Whether a repeated pose is kept, averaged with the earlier one, or left out. Kept by
-        default: the fit weighs poses by their noise, and effects of temperature and time show
-        only in orientations that are repeated.
+        Keep a repeated pose, average it with the earlier pose, or leave it out. By default it is
+        kept: the fit weights poses by their noise, and only repeated orientations show effects of
+        temperature and time.
 
     """
 
@@ -79,14 +79,14 @@ class CaptureSettings:
 
 def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
     """
-    Return the settings that a user gave, the others with their defaults.
+    Return settings with these values, and the defaults for all others.
 
     Parameters
     ----------
     given : mapping of str to object
-        By the names of `CaptureSettings`; ``still_std_max`` in the unit of the readings.
+        Values by the names of `CaptureSettings`; ``still_std_max`` is in the unit of the readings.
     units : Units
-        That unit.
+        Unit of the readings.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
     unknown = sorted(set(given) - set(names))
     if unknown:
         raise InputError(f'{unknown[0]} is not a setting of the capture',
-                         f'give one of {", ".join(names)}')
+                         f'use one of {", ".join(names)}')
     known = dict(given)
     if 'still_std_max' in known:
         known['still_std_max'] = float(units.to_g(np.asarray(known['still_std_max'])))

@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Sums, maxima and slopes over sliding windows, at a cost that grows with the logarithm of length.
+Sums, maxima and slopes over sliding windows. The cost grows with the logarithm of the length.
 
-A window of L is composed of windows of 1, 2, 4, …, so the result of a window depends on its own
-values alone, not on the values before it or on where a block ends.
+A window of length L is composed of windows of length 1, 2, 4, …. The result of a window therefore
+depends only on the values in the window, not on earlier values or on the division into blocks.
 
-**Slope.** With k = 0 … L-1 and t = k - (L-1)/2 the least squares slope is Σ t x / Σ t², from
-Σ x and Σ k x. The power of the residuals r and the product of neighbours follow without the
-residuals themselves, from Σ x², Σ x x' (x' the next), and with m the mean, T = Σ t x, b the slope:
+**Slope.** With k = 0 … L-1 and t = k - (L-1)/2, the least squares slope is Σ t x / Σ t², computed
+from Σ x and Σ k x. The power of the residuals r and the product of neighbours are computed without
+the residuals, from Σ x² and Σ x x' (x' is the next value). With m the mean, T = Σ t x and b the
+slope:
 
     Σ r²   = Σ x² - L m² - b T
     Σ r r' = Σ x x' - m (2 Σ x - x_0 - x_L-1) + (L-1) m²
@@ -34,13 +35,13 @@ class Line(NamedTuple):
     Parameters
     ----------
     slope : (..., n) array
-        Per step.
+        Slope per step.
     square, neighbours : (..., n) array
-        Sum of the squared residuals, and of the products of neighbours.
+        Sums of the squared residuals, and of the products of neighbouring residuals.
     time_square : float or array
         Σ t².
     length : int or array
-        Of the windows.
+        Length of the windows.
 
     """
 
@@ -75,7 +76,7 @@ def lines(values: Floats, length: int) -> Line:
     moment = weighted - 0.5 * (length - 1) * total
     slope = moment / time_square
     mean = total / length
-    # Both relative to the mean: the digits of a small noise on a large level are lost only once.
+    # Relative to the mean: digits of a small noise on a large mean are lost only once.
     square -= total * mean
     square -= slope * moment
     product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
@@ -92,7 +93,7 @@ def lines_through(centred: Floats, sizes: Floats) -> Line:
     Parameters
     ----------
     centred : (axes, k, K) array
-        Values minus their mean, and 0 after the end of a series.
+        Values of each series minus their mean, and 0 after the end of a series.
     sizes : (k,) array
         Lengths of the series.
 
@@ -123,7 +124,7 @@ def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats
 
 
 def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
-    """Return Σ x and Σ k x over the windows."""
+    """Return the sums Σ x and Σ k x over the windows."""
     count = values.shape[-1] - length + 1
     weighted = np.zeros_like(values)
     total_found = np.zeros((*values.shape[:-1], count))

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sums over the samples of a chunk, one record per chunk; the sum of records is of all chunks."""
+"""Sums over the samples of chunks, one record per chunk. Records of several chunks add up."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Records = NDArray[Any]
 """One-dimensional structured array."""
 
 CONTEXT = ('temperature', 'supply_voltage')
-"""Columns of `accel_calib.table.COLUMNS` that are averaged beside reading and rate."""
+"""Columns of `accel_calib.table.COLUMNS` that are averaged together with reading and rate."""
 
 WIDTH = 7 + len(CONTEXT)
 """Numbers of a sample: time, reading, rate (NaN: none), context (NaN: none)."""
@@ -40,7 +40,7 @@ def blank(kind: np.dtype[Any], count: int) -> Records:
 
 
 def chained(*parts: Records) -> Records:
-    """Return records behind each other; `numpy.concatenate` copies them field by field."""
+    """Concatenate records; `numpy.concatenate` alone would copy them field by field."""
     filled = [part for part in parts if len(part)] or list(parts[:1])
     if len(filled) == 1:
         return filled[0]
@@ -49,7 +49,7 @@ def chained(*parts: Records) -> Records:
 
 
 def summed(records: Records, size: int) -> Records:
-    """Return the sums over each `size` consecutive records of floats."""
+    """Return the sums over groups of `size` consecutive records of floats."""
     numbers = np.ascontiguousarray(records).view(float).reshape(-1, size,
                                                                 records.dtype.itemsize // 8)
     return numbers.sum(axis=1).view(records.dtype)[:, 0]
@@ -62,16 +62,16 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> R
     Parameters
     ----------
     samples : (k, n) array
-        Time and reading (k = 4), and rate (7), and context (WIDTH).
+        Time and reading (k = 4), with rate (7), with context (WIDTH).
     starts : (m,) array of int
-        First samples of the chunks.
+        Index of the first sample of each chunk.
     epoch, origin : float, (6,) array
         Subtracted from time, and from reading and rate.
 
     Returns
     -------
     (m,) array of SUMS
-        Rates are NaN if there are none.
+        The sums; those of a missing rate are NaN.
 
     """
     sums = blank(SUMS, len(starts))
@@ -94,9 +94,9 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> R
 
 def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
     """
-    Return the (m,) smallest steps within chunks that are not 0, if they are below `least`.
+    Return the (m,) smallest nonzero steps within chunks, infinite unless they are below `least`.
 
-    Infinity otherwise: only a new smallest step matters.
+    Only a new smallest step is of interest.
 
     """
     step = np.abs(values[:, 1:] - values[:, :-1])

@@ -2,19 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Still chunks to dwells.
+From still chunks to dwells.
 
-The window of a chunk is judged at once, and again when `HORIZON` more chunks have shown the noise:
-only then does it join the dwell. So a dwell that began before the noise was known begins where the
-sensor came to rest, and a slope excludes all the chunks over which it was seen. A window that is
-not still ends the dwell at once, and the chunks that wait are judged by what is known then.
+The window of a chunk is tested at once, and again after `HORIZON` more chunks, when the noise is
+better known. Only then does the chunk join the dwell. A dwell that began before the noise was
+known therefore starts where the sensor came to rest, and a slope excludes all its chunks. A window
+that is not still ends the dwell at once; the waiting chunks are then decided with the noise known
+so far.
 
-In a stretch next to a slope the slope may continue without being significant; there a weaker sign
-of it excludes the dwell.
+Next to a significant slope, the slope may continue below significance. There a weaker slope is
+enough to reject the dwell.
 
-A still window makes all its chunks part of the dwell. The first and the last chunk of a dwell are
-trimmed. If the sensor is still again after a knock, in the same orientation as before, the dwell
-continues; so a dwell is returned when `KNOCK` chunks have passed since its end.
+All chunks of a still window belong to the dwell. The first and the last chunk of a dwell are
+trimmed. If the sensor is still again after a knock, in the same orientation, the dwell continues.
+A dwell is therefore returned `KNOCK` chunks after its end.
 
 """
 
@@ -32,10 +33,10 @@ from .settings import CaptureSettings
 from .sums import chained, CHUNKS_PER_WINDOW, Records
 
 _SAMPLES = 16
-"""Samples of a dwell, at least."""
+"""Smallest number of samples in a dwell."""
 
 KNOCK = CHUNKS_PER_WINDOW + 3
-"""Windows that may be disturbed within a dwell: a knock of some 4 chunks."""
+"""Largest number of disturbed windows within a dwell: a knock of about 4 chunks."""
 
 _LEAD = CHUNKS_PER_WINDOW - 2
 """Chunks before the first still window that belong to the dwell."""
@@ -43,7 +44,7 @@ _LEAD = CHUNKS_PER_WINDOW - 2
 _JUDGED = np.dtype([
     ('sums', DWELL), ('begin', float), ('end', float), ('limit', float, 6), ('still', bool),
     ('trending', np.intp)])
-"""A judged chunk, see `rule.Judged`."""
+"""A chunk with its verdict; see `rule.Judged`."""
 
 _NONE = np.empty(0, _JUDGED)
 
@@ -72,12 +73,12 @@ class Tracker:
         return self._decide(last=False)
 
     def close(self) -> list[OngoingDwell]:
-        """Return the dwell that ends because no chunk follows."""
+        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
         done = self._decide(last=True)
         return done + self._end()
 
     def current(self) -> OngoingDwell | None:
-        """Return the ongoing dwell as if it ended now; None if it is too short."""
+        """Return the ongoing dwell as if it ended now, or None if it is too short."""
         if not len(self._waiting) or not self._waiting['still'][-1]:
             return None
         twin = copy.copy(self)
@@ -158,7 +159,7 @@ class Tracker:
 
 
 def _records(judged: Judged) -> Records:
-    """Return judged chunks as records."""
+    """Return chunks with their verdicts as records."""
     chunks = judged.chunks
     found = np.empty(len(judged.still), _JUDGED)
     for name in chunks.sums.dtype.names or ():
@@ -175,14 +176,14 @@ def _tail(chunks: Records, size: int) -> Records:
 
 
 def _without_windows(chunks: Records) -> Records:
-    """Return the chunks without their windows in the sums."""
+    """Return the chunks without the variances of their windows."""
     found = chunks.copy()
     found['sums']['level'] = found['sums']['windows'] = 0.0
     return found
 
 
 def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
-    """Return the final verdict on those of the first chunks for which it is due."""
+    """Return the final verdict on the first chunks, as many as can be decided now."""
     size, still = len(chunks), chunks['still']
     index = np.arange(size)
     nearest = np.where(still, 2 * size + HORIZON, index)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Windows over chunks: their means, variances and slopes, and the least variance allowed."""
+"""Windows over chunks: means, variances, slopes, and lower limits of the variance."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .sums import CHUNKS_PER_WINDOW, Records
 from ..table import Floats
 
 RELATIVE = 1e-6
-"""Least standard deviation over the size of a reading, for data without noise."""
+"""Smallest ratio of standard deviation to reading, for data without noise."""
 
 STD_FLOOR_G = 3.3e-4
-"""Least noise of any sensor [g]: smaller shaking does no harm."""
+"""Smallest noise of a sensor [g]; smaller shaking is harmless."""
 
 _DIGITS = 1e-14
-"""Rounding error of differences of sums, over the square of a reading."""
+"""Rounding error of differences of sums, relative to the squared reading."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Columns:
     Parameters
     ----------
     count : (n,) array
-        Samples.
+        Number of samples.
     first, second : (axes, n) array
         Sums of reading and rate, and of their squares.
 
@@ -65,18 +65,18 @@ def windows(sums: Columns) -> tuple[Floats, Floats]:
 @dataclass(frozen=True)
 class Stretch:
     """
-    The last chunks before each chunk.
+    Figures of the last chunks up to each chunk.
 
     Parameters
     ----------
     trend : Trend
         Slopes of the reading, (3, m).
     excess : (groups, m) array
-        Excess of the noise of a mean, of reading and rate; see `noise`.
+        Excess of the noise of the mean, for reading and rate; see `noise`.
     variance : (axes, m) array
-        Mean of the variances of the windows.
+        Mean variance of the windows.
     highest : (3, m) array
-        Largest of them, of the reading.
+        Largest variance of the windows, for the reading.
     samples : (m,) array
         Number of samples.
 
@@ -90,7 +90,7 @@ class Stretch:
 
 
 def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
-    """Return the figures over the last `length` chunks, at each of the last `size` chunks."""
+    """Return the figures over `length` chunks that end at each of the last `size` chunks."""
     start = len(sums.count) - size - length + 1
     counts, first = sums.count[start:], sums.first[:, start:]
     inner = length - CHUNKS_PER_WINDOW + 1
@@ -110,20 +110,20 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
 
 
 def _grouped(values: Floats) -> Floats:
-    """Return (axes, n) as (3, groups, n)."""
+    """Reshape (axes, n) to (3, groups, n)."""
     return values.reshape(-1, 3, values.shape[-1]).swapaxes(0, 1)
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
     """
-    Return variances, raised to what resolution and size of the mean allow.
+    Return variances raised to the smallest values that resolution and mean allow.
 
     Parameters
     ----------
     floor : (axes, n) array
-        The variances, of the reading (axes = 3) and the rate (6).
+        The variances of the reading (axes = 3), or of reading and rate (6).
     step : (2, n) array
-        Smallest steps seen.
+        Smallest steps so far.
     mean : (axes, n) array
         Mean readings and rates.
 
@@ -135,13 +135,13 @@ def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
 
 
 def _tiny(mean: Floats) -> Floats:
-    """Return the (groups, n) least variances, for data without noise."""
+    """Return the (groups, n) smallest variances, for data without noise."""
     square = (mean * mean).reshape((-1, 3, *mean.shape[1:]))
     return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
 
 
 def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
-    """Return which axes are constant while another varies by more than rounding."""
+    """Return which axes are constant while another axis varies by more than rounding."""
     reading = mean[:3]
     tiny = _tiny(reading)
     least = at_least(np.zeros_like(reading), step, reading)
@@ -150,7 +150,7 @@ def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
 
 
 def at_least_any(noise: Floats, scale: Floats) -> Floats:
-    """Return (axes, n) variances, those of the reading raised to the least of any sensor."""
+    """Return (axes, n) variances, with those of the reading raised to `STD_FLOOR_G`."""
     found = noise.copy()
     found[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
     return found

@@ -6,20 +6,15 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from . import options
 from .progress import progress
-from ..calibrate import Calibration, check_units, of_samples
-from ..errors import InputError
-from ..files import (
-    check_sensor,
-    correct_bag,
-    is_bag,
-    read_calibration,
-    read_samples,
-    write_table,
-)
+from ..calibrate import Calibration, check_sensor, check_units, of_samples
+from ..errors import counted, InputError
+from ..files import correct_bag, is_bag, read_samples, write_table
+from ..units import UnitName
 
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
 
@@ -32,36 +27,38 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
                       help='stored calibration')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
-                      help='a CSV table, or a new bag of the kind of the recording')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several')
+                      help='CSV table or bag to write, of the same kind as the recording')
+    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Correct, and report the number of samples."""
-    calibration = read_calibration(args.calibration)
+    """Correct the recording, and print the number of samples."""
+    calibration = options.stored_calibration(args.calibration)
     if is_bag(args.recording):
         with progress('messages') as moved:
             count = correct_bag(args.recording, calibration, args.output, args.topic, moved)
     else:
         count = _correct_table(args.recording, calibration, args.output)
-    options.console(args).print(f'{count} samples corrected, stored in {args.output}',
+    options.console(args).print(f'corrected {counted(count, "sample")}, stored in {args.output}',
                                 markup=False)
     return 0
 
 
 def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
     if out.exists() and out.samefile(path):
-        raise InputError(f'{out} is the recording itself', 'give a new name')
+        raise InputError(f'{out} is the recording itself, expected another file',
+                         'choose another name')
     recording = read_samples(path)
     check_units(recording, calibration.units)
     check_sensor(calibration, recording.sensor)
     if recording.units not in ('', calibration.units.name):
-        raise InputError(f'{path} is in {recording.units}, the calibration is for readings in '
-                         f'{calibration.units.name}', 'give a recording in that unit')
+        raise InputError(f'{path} is in {recording.units}, but the calibration is for readings in '
+                         f'{calibration.units.name}', 'use a recording in that unit')
     known = of_samples(recording.columns, len(recording))
     columns = {'reading': calibration.correct(recording.reading, known)}
+    units: UnitName = 'g' if calibration.units.name == 'native' else calibration.units.name
     if 'rate' in recording:
         columns['rate'] = recording['rate'] @ calibration.model.rotation
-    write_table(out, recording.with_columns(**columns))
+    write_table(out, replace(recording.with_columns(**columns), units=units))
     return len(recording)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib capture``: recording to pose table."""
+"""``accel-calib capture``: from a recording to a pose table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from . import options
 from .progress import progress
 from ..calibrate import check_units
 from ..capture import capture, Captured, CaptureSettings, REPEATED, settings_from
-from ..errors import InputError
+from ..errors import counted, InputError
 from ..files import open_recording, OpenRecording, Progress, write_table
 from ..table import Recording
 from ..units import Units
@@ -29,7 +29,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='pose table to write')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several')
+    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
     made.add_argument('--sensor', default='', help='frame_id of the messages to use, for a topic '
                       'with several sensors')
     made.add_argument('--still-window', type=options.positive, metavar='S',
@@ -40,11 +40,11 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('--still-gyro-max', type=options.positive, metavar='RAD/S',
                       help='largest mean angular rate (default: not checked)')
     made.add_argument('--still-norm-tolerance', type=options.positive, metavar='G',
-                      help='largest distance of |mean| from 1 g')
+                      help='largest difference of |mean| from 1 g')
     made.add_argument('--min-dwell', type=options.positive, metavar='S',
-                      help='shortest still stretch that makes a pose')
+                      help='shortest still stretch that becomes a pose')
     made.add_argument('--max-dwell', type=options.positive, metavar='S',
-                      help='cut a longer stretch into poses that share their orientation')
+                      help='split a longer stretch into poses with the same orientation')
     made.add_argument('--min-pose-angle', type=options.positive, metavar='RAD',
                       help='poses within this angle count as repeated')
     made.add_argument('--repeated', choices=REPEATED,
@@ -55,14 +55,15 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Capture, write the poses, and report how many there are."""
+    """Capture and write the poses, and print their number."""
     with (open_recording(args.recording, args.topic, args.sensor) as recording,
           progress('samples') as moved):
         units = options.units_from(args, recording.units, args.recording)
         captured = capture(_blocks(recording, units, moved), units, _settings(args, units))
     if len(captured.poses) == 0:
-        raise InputError(f'{args.recording} has no still stretch in {captured.recorded} samples',
-                         'hold the sensor still in each pose for some seconds, or give '
+        raise InputError(f'{args.recording} has no still stretch in '
+                         f'{counted(captured.recorded, "sample")}, expected at least one',
+                         'hold the sensor still in each pose for some seconds, or set '
                          '--still-std-max and --min-dwell')
     write_table(args.output, replace(captured.poses, units=units.name))
     options.write_json(args.json, {
@@ -76,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace, captured: Captured) -> None:
     """Print the result."""
-    console, count = options.console(args), len(captured.poses)
-    console.print(f'{count} {"pose" if count == 1 else "poses"} in {captured.seconds:.0f} s of '
+    console = options.console(args)
+    console.print(f'{counted(len(captured.poses), "pose")} in {captured.seconds:.0f} s of '
                   f'{args.recording}, stored in {args.output}', markup=False)
     for item in captured.interruptions:
         what = {'gap': f'samples are missing for {item.seconds:.3g} s',
@@ -87,7 +88,7 @@ def _show(args: argparse.Namespace, captured: Captured) -> None:
 
 
 def _blocks(recording: OpenRecording, units: Units, moved: Progress) -> Iterator[Recording]:
-    """Yield the blocks, check the unit by the first, and move the progress bar."""
+    """Yield the blocks, check the unit of the first block, and update the progress bar."""
     done = 0
     for block in recording.blocks:
         if not done:
@@ -98,7 +99,7 @@ def _blocks(recording: OpenRecording, units: Units, moved: Progress) -> Iterator
 
 
 def _settings(args: argparse.Namespace, units: Units) -> CaptureSettings:
-    """Return the settings that were asked for, the others with their defaults."""
+    """Return the settings from the options; other settings have their defaults."""
     names = ('still_window', 'still_std_max', 'still_gyro_max', 'still_norm_tolerance',
              'min_dwell', 'max_dwell', 'min_pose_angle', 'repeated')
     return settings_from({name: getattr(args, name) for name in names

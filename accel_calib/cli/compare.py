@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib compare``: whether calibrations of one sensor agree."""
+"""``accel-calib compare``: test whether calibrations of one sensor agree."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..units import MG
 
 _EXAMPLE = ('accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
             'exit status:\n'
-            '  0: they agree, 1: they do not, 2: they cannot be compared')
+            '  0: they agree, 1: they do not agree, 2: they cannot be compared')
 
 DISAGREE = 1
 
@@ -33,7 +33,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, and report the result."""
+    """Compare the calibrations, and print the result."""
     try:
         calibrations = [read_calibration(path) for path in args.calibrations]
         comparison = compare(calibrations)
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dict[str, Any]:
-    """Return the result with the keys of the documentation."""
+    """Return the result for JSON."""
     outlier = comparison.outlier
     return {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
             'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
@@ -62,28 +62,28 @@ def _show(args: argparse.Namespace, models: list[str], comparison: Comparison) -
     for note in comparison.notes:
         console.print(f'note: {note}', markup=False)
     if comparison.tilt_deg is not None:
-        console.print(f'the directions of up of the levelled ones differ by up to '
+        console.print('the directions of up of levelled calibrations differ by up to '
                       f'{comparison.tilt_deg:.3g}°; the test does not use them')
     console.print(_answer(comparison), markup=False)
 
 
 def _answer(comparison: Comparison) -> str:
-    """Return in a line whether they agree."""
-    sure = f'p = {comparison.p_value:.2g}; they do not if p is below {LEVEL:g}'
+    """Return the result as one line."""
+    test = f'p = {comparison.p_value:.2g}, limit {LEVEL:g}'
     if comparison.agree:
-        return f'The calibrations agree within their uncertainties ({sure}).'
+        return f'The calibrations agree within their uncertainties ({test}).'
     if comparison.outlier is None:
         more = '' if len(comparison.runs) > 2 else '; a third run would show which one differs'
-        return f'The calibrations do not agree ({sure}){more}.'
-    return (f'The calibrations do not agree ({sure}): run {comparison.outlier + 1} differs, the '
+        return f'The calibrations do not agree ({test}){more}.'
+    return (f'The calibrations do not agree ({test}): run {comparison.outlier + 1} differs, the '
             'others agree.')
 
 
 def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) -> Any:
-    """Return a table of each run against the others."""
+    """Return a table that compares each run with the others."""
     from rich.table import Table
 
-    table = Table(title='Corrected |a| against the mean of the others, over all directions')
+    table = Table(title='Corrected |a| minus the mean of the others, over all directions')
     table.add_column('run')
     for name in ('model', 'RMS, mg', 'expected, mg', 'largest, mg', 'p'):
         table.add_column(name, justify='right')

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib demo``: the main job without hardware."""
+"""``accel-calib demo``: a demonstration without hardware."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run simulator and calibrator in processes of their own, and show the result."""
+    """Run simulator and calibrator in separate processes, and print the result."""
     try:
         from ..ros.demo import demonstrate
     except ImportError as err:
-        raise InputError(f'ROS 2 is not installed ({err}), the demonstration needs it',
-                         "source /opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'"
-                         ) from err
+        raise InputError(f'ROS 2 is not installed ({err}), but the demonstration needs it',
+                         'source /opt/ros/jazzy/setup.bash, or run pip install '
+                         "'accel_calib[ros]'") from err
     console = options.console(args)
     outcome = asdict(demonstrate(lambda line: console.print(line, markup=False)))
     options.write_json(args.json, outcome)
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 def _table(outcome: dict[str, Any]) -> Table:
     from rich.table import Table
 
-    table = Table(title=f'Turned again, at rest in {outcome["rests"]} orientations, '
+    table = Table(title=f'Errors at {outcome["rests"]} rests in other orientations, '
                   f'after {outcome["seconds"]:.0f} s')
     table.add_column('')
     for name in ('imu/data_raw', 'imu/data_calibrated'):

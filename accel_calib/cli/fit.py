@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib fit``: poses to calibration."""
+"""``accel-calib fit``: from poses to a calibration."""
 
 from __future__ import annotations
 
@@ -33,39 +33,40 @@ def add_to(made: argparse.ArgumentParser) -> None:
     options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help='file of the calibration (YAML); a folder for several POSES')
+                      help='calibration to write (YAML); a folder for several POSES')
     made.add_argument('--model', choices=MODEL_NAMES, default='auto',
                       help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
                       'cross-axis; 12: known orientation; auto (default): the smallest that the '
                       'data support')
     made.add_argument('--method', choices=METHODS, default='ml',
-                      help='ml (default) weighs poses by their noise and leaves out outliers; '
-                      "algebraic is the cost functions of AN5286 and the ESGI'95 report, with "
-                      'every row')
+                      help='ml (default) weights poses by their noise and leaves out outliers; '
+                      "algebraic minimises the cost functions of AN5286 and the ESGI'95 report, "
+                      'with every row')
     made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
-    made.add_argument('--flat', type=int, metavar='ROW', help='pose in which the robot was '
-                      'level; the mounting is derived from it')
-    made.add_argument('--nose-down', type=int, metavar='ROW', help='pose in which the nose of the '
-                      'robot was tilted straight down, by 10° or more; the heading of the '
-                      'mounting is derived from it (needs --flat)')
+    made.add_argument('--flat', type=int, metavar='ROW', help='row of a pose with the robot '
+                      'level, 1-based; it determines the mounting')
+    made.add_argument('--nose-down', type=int, metavar='ROW', help='row of a pose with the nose '
+                      'of the robot tilted straight down, by 10° or more; it determines the '
+                      'heading of the mounting (needs --flat)')
     made.add_argument('--frame', choices=FRAMES, default='ros',
                       help='levelled frame (default: ros, z up)')
     made.add_argument('--sensor', default='',
-                      help='name of the sensor (frame_id of its messages; default: '
-                      'that of the table)')
-    made.add_argument('--jobs', type=int, default=1, metavar='N', help='fit N tables at a time')
+                      help='name of the sensor (frame_id of its messages; default: the name in '
+                      'the table)')
+    made.add_argument('--jobs', type=int, default=1, metavar='N',
+                      help='number of tables to process in parallel')
     options.add_units(made)
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, store, and report the quality."""
+    """Fit and store, and print the quality."""
     if len(args.poses) == 1:
         return _run_one(args)
     if args.output is not None and not args.output.is_dir():
-        raise InputError(f'-o {args.output} is not a folder, and there are {len(args.poses)} pose '
-                         'tables', 'give an existing folder')
+        raise InputError(f'-o {args.output} is not a folder, expected a folder for '
+                         f'{len(args.poses)} pose tables', 'use an existing folder')
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
     options.write_json(args.json, results)
     console = options.console(args)
@@ -97,14 +98,15 @@ def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Fit one of several pose tables; an error becomes its result."""
+    """Fit one of several pose tables; an error is returned as the result."""
     try:
         calibration = fit_file(args, path)
         _store(calibration, args.output and args.output / f'{path.stem}.yaml')
     except AccelCalibError as err:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
-        return {'file': path, 'error': f'{path}: {err.strerror}', 'advice': 'check the name'}
+        return {'file': path, 'error': f'{path}: {err.strerror}',
+                'advice': 'check the name and the permissions'}
     result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration, args.model)})
     return result
 
@@ -128,7 +130,7 @@ def _show(args: argparse.Namespace, calibration: Calibration) -> None:
     console.print(parameter_table(calibration))
     console.print(f'model {calibration.name}: {calibration.reason}', markup=False)
     for rejected in calibration.rejected:
-        console.print(f'left out: row {rejected.row}, {rejected.reason}', markup=False)
+        console.print(f'left out: row {rejected.row}: {rejected.reason}', markup=False)
     for warning in calibration.warnings:
         console.print(f'note: {warning}', markup=False)
     asked = outlook(calibration, args.model).next_pose

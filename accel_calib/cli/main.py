@@ -4,7 +4,7 @@
 """
 The command ``accel-calib``.
 
-Only the module of the given command is imported, so that ``--help`` does not wait for numpy.
+Only the module of the requested command is imported, so that ``--help`` does not wait for numpy.
 
 """
 
@@ -22,15 +22,15 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 
 COMMANDS = {
-    'demo': 'the main job without hardware: simulated Imu, calibrator node, before and after',
+    'demo': 'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
     'capture': 'find the still stretches of a recording and write the pose table',
     'fit': 'fit a calibration to still poses',
     'verify': 'evaluate a calibration on poses that it was not fitted to',
     'compare': 'test whether calibrations of one sensor agree within their uncertainties',
-    'refine': 'find where simulation and measurement disagree, name the missing effect and add it',
+    'refine': 'find effects that a calibration lacks, and add them',
     'apply': 'correct a recording with a calibration',
     'simulate': 'simulate poses or a recording of a sensor with known effects',
-    'report': 'show what a calibration lacks: figures, and one self-contained page',
+    'report': 'write a report about effects that a calibration lacks, with figures (HTML)',
     'node': 'run the calibrator node',
     'simulator': 'run the simulated Imu node',
 }
@@ -42,8 +42,8 @@ _MODULES = {'node': 'nodes', 'simulator': 'nodes'}
 def parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """Return the parser of the command line, with the options of the wanted commands."""
     top = argparse.ArgumentParser(
-        prog='accel-calib', description='Calibrate an accelerometer from still poses and the fact '
-        'that gravity is 1 g.')
+        prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
+        'gravity as the reference.')
     top.add_argument('--version', action='version', version=__version__)
     commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND',
                                   required=True)
@@ -62,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0, or 2 after bad input, with one line on standard error.
+        Exit status: 0; 1 if a requested check fails; 2 for invalid input, with one line on
+        standard error.
 
     """
     own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Separate the arguments of this program from those of ROS, which argparse would refuse."""
+    """Split the arguments into those of this program and those of ROS."""
     at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
     return arguments[:at], arguments[at:]
 

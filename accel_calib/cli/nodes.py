@@ -18,7 +18,7 @@ _EXAMPLES = {'node': 'accel-calib node --ros-args -r imu/data_raw:=/imu/raw',
 def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLES[made.prog.split()[-1]])
-    made.epilog = f'{made.epilog}\n\nall after --ros-args is for ROS'
+    made.epilog = f'{made.epilog}\n\nall arguments after --ros-args are passed to ROS'
     made.set_defaults(run=run)
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A progress bar on standard error, if that is a terminal."""
+"""A progress bar on standard error, if it is a terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """Show a bar during the work; yield the function that moves it."""
+    """Show a progress bar, and yield the function that updates it."""
     if not sys.stderr.isatty():
         yield lambda done, count: None
         return

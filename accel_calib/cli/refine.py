@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib refine``: find what a calibration lacks, name it, and add it."""
+"""``accel-calib refine``: find effects that a calibration lacks, and add them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,8 @@ from . import options
 from .results import in_a_line, refine_result, steps_table
 from ..calibrate import Calibration
 from ..capture import capture, settings_from
-from ..errors import AccelCalibError, InputError, RefusedFitError
-from ..files import (
-    check_sensor,
-    is_bag,
-    read_calibration,
-    read_poses,
-    read_recording,
-    write_calibration,
-)
+from ..errors import AccelCalibError, InputError, listed, RefusedFitError
+from ..files import is_bag, read_poses, read_recording, write_calibration
 from ..refine import BASES, refine, Refinement
 from ..report import check_matplotlib, write_page
 from ..table import Poses, Recording
@@ -41,12 +34,13 @@ def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLE)
     made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
-                      help='pose table (CSV), or a recording: bags, and tables of samples')
+                      help='pose table (CSV), or recording (bag, or table of samples)')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help='file of the refined calibration (YAML); a folder for several POSES')
+                      help='refined calibration to write (YAML); a folder for several POSES')
     made.add_argument('--report', type=Path, metavar='FILE',
-                      help='page with figures to write (HTML); a folder for several POSES')
-    made.add_argument('--jobs', type=int, default=1, metavar='N', help='N tables at a time')
+                      help='report to write (HTML); a folder for several POSES')
+    made.add_argument('--jobs', type=int, default=1, metavar='N',
+                      help='number of tables to process in parallel')
     add_inputs(made)
     options.add_json(made)
     made.set_defaults(run=run)
@@ -56,22 +50,23 @@ def add_inputs(made: argparse.ArgumentParser) -> None:
     """Add the options of the input."""
     base = made.add_mutually_exclusive_group()
     base.add_argument('-c', '--calibration', type=Path, metavar='FILE',
-                      help='stored calibration to compare with, and to begin with')
+                      help='stored calibration to compare with and to start from')
     base.add_argument('--base', choices=BASES, default='auto',
-                      help='model to begin with (default: what fit --model auto would fit)')
+                      help='model to start from (default: the model that fit --model auto '
+                      'selects)')
     made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
     made.add_argument('--sensor', default='',
-                      help='name of the sensor (frame_id of its messages; default: '
-                      'that of the file)')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several')
+                      help='name of the sensor (frame_id of its messages; default: the name in '
+                      'the file)')
+    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
     made.add_argument('--max-dwell', type=options.positive, metavar='S',
-                      help='of a recording: cut longer rests into poses that share their '
+                      help='for a recording: split longer rests into poses with the same '
                       'orientation')
     options.add_units(made)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine, store, and report the result."""
+    """Refine and store, and print the result."""
     if args.report is not None:
         check_matplotlib()
     for option, path in (('-o', args.output), ('--report', args.report)):
@@ -88,13 +83,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_target(option: str, path: Path, count: int) -> None:
-    """Check, before the work, that there is a folder to write into."""
+    """Check before the work that the folder of an output exists."""
     if count > 1 and not path.is_dir():
-        raise InputError(f'{option} {path} is not a folder, and there are {count} tables',
-                         'give an existing folder')
+        raise InputError(f'{option} {path} is not a folder, expected a folder for {count} tables',
+                         'use an existing folder')
     if count == 1 and not path.parent.is_dir():
-        raise InputError(f'{option} {path}: {path.parent} is not a folder',
-                         'give a name in an existing folder')
+        raise InputError(f'{option} {path}: {path.parent} is not a folder, expected a folder',
+                         'choose a file in an existing folder')
 
 
 def _run_one(args: argparse.Namespace) -> int:
@@ -108,13 +103,13 @@ def _run_one(args: argparse.Namespace) -> int:
     stored = _store(result, path, args.output, args.report)
     _show(args, result, stored)
     if args.output is not None and args.output not in stored:
-        raise RefusedFitError(f'{result.refusal[0]}, so {args.output} is not written',
+        raise RefusedFitError(f'{args.output} is not written: {result.refusal[0]}',
                               result.refusal[1])
     return 0
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Refine with one of several tables; an error becomes its result."""
+    """Refine with one of several tables; an error is returned as the result."""
     try:
         result = refine_file(args, path)
         _store(result, path, args.output and args.output / f'{path.stem}.yaml',
@@ -125,7 +120,8 @@ def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     except AccelCalibError as err:
         return {'file': str(path), 'error': err.message, 'advice': err.advice}
     except OSError as err:
-        return {'file': str(path), 'error': f'{path}: {err.strerror}', 'advice': 'check the name'}
+        return {'file': str(path), 'error': f'{path}: {err.strerror}',
+                'advice': 'check the name and the permissions'}
     made: dict[str, Any] = options.plain({'file': path, **refine_result(result)})
     return made
 
@@ -134,14 +130,11 @@ def refine_file(args: argparse.Namespace, path: Path) -> Refinement:
     """Refine with one table or recording, with the given options."""
     base: str | Calibration = args.base
     if args.calibration is not None:
-        base = read_calibration(args.calibration)
+        base = options.stored_calibration(args.calibration)
     poses, units = _poses_from(args, path, base.units if isinstance(base, Calibration) else None)
-    sensor = args.sensor or poses.sensor
-    if isinstance(base, Calibration):
-        check_sensor(base, sensor)
     date = datetime.now(timezone.utc).isoformat(timespec='seconds')
-    return refine(options.rows_between(poses, args.rows), units, base=base, sensor=sensor,
-                  date=date)
+    return refine(options.rows_between(poses, args.rows), units, base=base,
+                  sensor=args.sensor, date=date)
 
 
 def _poses_from(args: argparse.Namespace, path: Path, units: Units | None) -> tuple[Poses, Units]:
@@ -149,8 +142,8 @@ def _poses_from(args: argparse.Namespace, path: Path, units: Units | None) -> tu
     table: Poses | Recording = (read_recording(path, args.topic, args.sensor) if is_bag(path)
                                 else read_poses(path))
     if units is not None and table.units not in ('', units.name):
-        raise InputError(f'{path} is in {table.units}, the calibration is for readings in '
-                         f'{units.name}', 'give poses in that unit')
+        raise InputError(f'{path} is in {table.units}, but the calibration is for readings in '
+                         f'{units.name}', 'use poses in that unit')
     units = units or options.units_from(args, table.units, path)
     if isinstance(table, Poses) and not _are_samples(table):
         return table, units
@@ -160,7 +153,7 @@ def _poses_from(args: argparse.Namespace, path: Path, units: Units | None) -> tu
 
 
 def _are_samples(table: Poses) -> bool:
-    """Return whether rows are samples: with times, no count, and too close or too many."""
+    """Return whether rows are samples: with time, without count, and dense or many."""
     if 'time' not in table or 'count' in table or len(table) < 2:
         return False
     apart = float(np.median(np.diff(table['time'])))
@@ -169,7 +162,7 @@ def _are_samples(table: Poses) -> bool:
 
 def _store(result: Refinement, source: Path, output: Path | None, report: Path | None
            ) -> list[Path]:
-    """Write the page, and the calibration unless the gate refuses it; return what was written."""
+    """Write the report, and the calibration if it is usable; return the paths written."""
     written = []
     if report is not None:
         write_page(report, result, str(source))
@@ -187,8 +180,7 @@ def _show(args: argparse.Namespace, result: Refinement, stored: list[Path]) -> N
         console.print(steps_table(result), soft_wrap=False)
     console.print(f'{verdict_words(result)}\n{residual_words(result)}', markup=False)
     if result.disturbed_poses:
-        rows = ', '.join(str(row) for row in result.disturbed_poses)
-        console.print(f'left out as outliers: rows {rows}', markup=False)
+        console.print(f'left out: {listed("row", result.disturbed_poses)}', markup=False)
     for line in result.calibration.warnings:
         console.print(f'note: {line}', markup=False)
     for line in result.advice:

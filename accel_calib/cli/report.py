@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib report``: the figures of a refinement, and the page that holds them."""
+"""``accel-calib report``: refine a calibration, and write a report with figures."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from . import options
 from .refine import add_inputs, refine_file
+from ..errors import counted
 from ..report import check_matplotlib, write_figures, write_page
 
 _EXAMPLE = 'accel-calib report poses.csv -o report.html --figures figures'
@@ -19,17 +20,17 @@ def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLE)
     made.add_argument('poses', type=Path, metavar='POSES',
-                      help='pose table (CSV), or a recording: bags, and tables of samples')
+                      help='pose table (CSV), or recording (bag, or table of samples)')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
-                      help='page to write (HTML)')
+                      help='report to write (HTML)')
     made.add_argument('--figures', type=Path, metavar='FOLDER',
-                      help='folder for each figure as SVG and PNG')
+                      help='folder for the figures as SVG and PNG')
     add_inputs(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine and draw."""
+    """Refine, and write the report and the figures."""
     check_matplotlib()
     result = refine_file(args, args.poses)
     write_page(args.output, result, str(args.poses))
@@ -37,5 +38,5 @@ def run(args: argparse.Namespace) -> int:
     console.print(f'{result.verdict}, stored in {args.output}', markup=False)
     if args.figures is not None:
         count = len(write_figures(args.figures, result))
-        console.print(f'{count} figures, stored in {args.figures}', markup=False)
+        console.print(f'{counted(count, "file")}, stored in {args.figures}', markup=False)
     return 0

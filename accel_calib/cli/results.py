@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations and refinements as JSON, and as tables and lines for people."""
+"""Calibrations and refinements as JSON, and as tables and lines of text."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..calibrate import Calibration, Outlook, outlook
 from ..effects import effect_named
+from ..errors import counted
 from ..estimate.sensing_axes import sensing_axes
 from ..units import MG
 from ..words import base_words, chance, short
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
-    """Return the result of ``fit``, of the model asked for, as JSON."""
+    """Return the result of ``fit`` for JSON; `asked` is the requested model."""
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -39,7 +40,7 @@ def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
 
 
 def _outlook(found: Outlook) -> dict[str, Any]:
-    """Return what the poses determine, and the next one."""
+    """Return what the poses determine, and the next pose, for JSON."""
     seen, asked = found.identifiability, found.next_pose
     unseen = seen.open_parameters
     return {
@@ -55,7 +56,7 @@ def _outlook(found: Outlook) -> dict[str, Any]:
 
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:
-    """Return the parameters of model 9, and of known orientations, as the report names them."""
+    """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
     if calibration.name == '9':
         axes = sensing_axes(calibration.gain, calibration.offset)
         return {'shifts': axes.shifts, 'scales': axes.scales,
@@ -67,11 +68,11 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
 
 
 def quality_table(calibration: Calibration) -> Table:
-    """Return a table of the residual before and after."""
+    """Return a table of the residual before and after the fit."""
     from rich.table import Table
 
     quality = calibration.quality
-    table = Table(title=f'Residual of |force| over {len(calibration.used_poses)} poses '
+    table = Table(title=f'Residual of |force| over {counted(len(calibration.used_poses), "pose")} '
                   f'(model {calibration.name})')
     table.add_column('')
     for name in ('before', 'after'):
@@ -106,7 +107,7 @@ def _short(value: float | None) -> str:
 
 
 def refine_result(result: Refinement) -> dict[str, Any]:
-    """Return the result of ``refine`` with the keys of the documentation."""
+    """Return the result of ``refine`` for JSON."""
     return {
         'verdict': result.verdict, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
@@ -122,7 +123,7 @@ def refine_result(result: Refinement) -> dict[str, Any]:
 
 
 def in_a_line(result: dict[str, Any]) -> str:
-    """Return one of several results in a line."""
+    """Return one of several results as one line."""
     if 'error' in result:
         return f'{result["error"]}; {result["advice"]}'
     names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
@@ -137,7 +138,7 @@ def steps_table(result: Refinement) -> Table:
     table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
                   show_lines=True)
     table.add_column('', justify='right')
-    table.add_column('effect, and where it was seen', min_width=24, overflow='fold')
+    table.add_column('effect, and where it was found', min_width=24, overflow='fold')
     for name in ('residual', 'chance'):
         table.add_column(name, no_wrap=True)
     table.add_column('rivals', overflow='fold')

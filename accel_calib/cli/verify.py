@@ -14,7 +14,7 @@ from typing import Any
 from . import options
 from ..api import verify
 from ..errors import AccelCalibError
-from ..files import read_calibration, read_poses
+from ..files import read_poses
 
 _EXAMPLE = 'accel-calib verify other_poses.csv -c calibration.yaml'
 
@@ -27,13 +27,14 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
                       help='stored calibration')
     made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
-    made.add_argument('--jobs', type=int, default=1, metavar='N', help='N tables at a time')
+    made.add_argument('--jobs', type=int, default=1, metavar='N',
+                      help='number of tables to process in parallel')
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Verify, and report the result."""
+    """Verify, and print the result."""
     if len(args.poses) == 1:
         result = _verify(args, args.poses[0])
         options.write_json(args.json, result)
@@ -46,20 +47,20 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    calibration = read_calibration(args.calibration)
+    calibration = options.stored_calibration(args.calibration)
     poses = options.rows_between(read_poses(path), args.rows)
     return {'file': path, 'poses': len(poses), **asdict(verify(poses, calibration))}
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Verify on one of several tables; an error becomes its result."""
+    """Verify on one of several tables; an error is returned as the result."""
     try:
         return _verify(args, path)
     except AccelCalibError as err:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
         return {'file': path, 'error': f'{err.filename}: {err.strerror}',
-                'advice': 'check the name'}
+                'advice': 'check the name and the permissions'}
 
 
 def _show(args: argparse.Namespace, results: list[dict[str, Any]]) -> None:

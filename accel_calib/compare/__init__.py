@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Repeated calibrations of one sensor: whether they agree within their uncertainties.
+Comparison of repeated calibrations of one sensor, given their uncertainties.
 
-`comparability` checks that they can be compared, `rotation_free` takes their axes out,
-`common_scale` puts their covariances on one scale, `agreement` tests, `comparison` is the way in.
+`comparison` is the entry point. `comparability` checks that the calibrations can be compared,
+`rotation_free` computes parameters that do not depend on the axes, `common_scale` converts the
+covariances to one scale, and `agreement` contains the test. A run is one of the calibrations.
 
 """
 

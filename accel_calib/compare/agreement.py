@@ -2,18 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether parameters of several runs agree within their covariances.
+Test whether the parameters of several runs agree within their covariances.
 
-If runs with parameters x_i and covariances C_i are of one sensor, contrasts of the x_i, such as
-their differences, are normal about zero with the covariance K diag(C_i) Kᵀ, and
+Runs of one sensor have parameters x_i with covariances C_i. Contrasts of the x_i, such as their
+differences, are then normally distributed about zero with the covariance K diag(C_i) Kᵀ, and
 
     T² = dᵀ (K diag(C_i) Kᵀ)⁺ d,   d = K x
 
-over its rank has an F distribution with the degrees of freedom of the noise. T² tests all
-directions at once. In addition each parameter of each run is compared with the mean of the other
-runs (Student's t), for a change of one parameter alone. The smaller of the two probabilities
-counts, corrected for two tests and for the number of parameters (Bonferroni). The run without
-which T² falls most is the one that differs.
+divided by its rank has an F distribution with the degrees of freedom of the noise. T² tests all
+directions at once. In addition, each parameter of each run is compared with the mean of the other
+runs (Student's t), to detect a change of a single parameter. The smaller of the two probabilities
+is used, corrected for two tests and for the number of parameters (Bonferroni). The differing run
+is the run whose removal reduces T² most.
 
 """
 
@@ -26,30 +26,30 @@ import numpy as np
 from ..table import Floats
 
 LEVEL = 0.03
-"""Probability that runs that agree are reported to differ."""
+"""Probability that runs of an unchanged sensor are reported to differ."""
 
 SAME_G = 1e-7
-"""Differences below this are none."""
+"""Differences below this count as zero [g]."""
 
 _NO_SPREAD = 1e-10
-"""A variance this much below the largest is none."""
+"""A variance below this part of the largest counts as zero."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs in common parameters: (n, t) values, (n, t, t) covariances, dof of the noise."""
+    """Runs in common parameters: (n, t) values, (n, t, t) covariances, and dof of the noise."""
 
     values: Floats
     covariances: Floats
     dof: float
 
     def without(self, run: int) -> Runs:
-        """Return the other runs."""
+        """Return the runs without one run."""
         return Runs(np.delete(self.values, run, 0), np.delete(self.covariances, run, 0), self.dof)
 
     @property
     def squared(self) -> tuple[float, int]:
-        """T² and its rank: differences over their variances, in all directions at once."""
+        """T² and its rank: squared differences in all directions over their variances."""
         count = len(self.values)
         contrasts = np.linalg.svd(np.ones((1, count)))[2][1:]
         away = (contrasts @ self.values).ravel()
@@ -63,7 +63,7 @@ class Runs:
 
     @property
     def least(self) -> Floats:
-        """(n,) array, the probability of the parameter of each run that is off the most."""
+        """(n,) array, the probability of the most deviating parameter of each run."""
         from scipy.special import stdtr
 
         variance = np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0) + SAME_G ** 2
@@ -77,14 +77,14 @@ class Runs:
 
     @property
     def p_value(self) -> float:
-        """Probability of differences as large, if the runs agree."""
+        """Probability of differences at least this large, if the runs agree."""
         count = len(self.values)
         tests = 1 if count == 2 else count
         return _either(_beyond(*self.squared, self.dof), float(np.min(self.least)) * tests)
 
 
 def _beyond(chi2: float, rank: int, dof: float) -> float:
-    """Return the probability that T² of this rank is as large."""
+    """Return the probability of a T² of this rank that is at least this large."""
     from scipy.special import chdtrc, fdtrc
 
     if rank == 0 or not np.isfinite(chi2):
@@ -97,7 +97,7 @@ def _either(first: float, second: float) -> float:
 
 
 def p_values(runs: Runs) -> Floats:
-    """Return the probability of the differences of each run to the others."""
+    """Return the probability of the differences between each run and the others."""
     if len(runs.values) == 2:
         return np.full(2, runs.p_value)
     chi2, rank = runs.squared
@@ -109,7 +109,7 @@ def p_values(runs: Runs) -> Floats:
 
 
 def outlier(runs: Runs) -> int | None:
-    """Return the one run without which the others agree; None if there is none."""
+    """Return the index of the run without which the others agree, or None."""
     if len(runs.values) == 2:
         return None
     left = [runs.without(k) for k in range(len(runs.values))]

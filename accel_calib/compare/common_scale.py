@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The uncertainty of a calibration, given others of the same sensor.
+The uncertainty of calibrations, estimated together with others of the same sensor.
 
-A few poses beyond the free parameters determine the noise of a fit badly: with three to spare, the
-stated variance is easily wrong by a factor of three, and a test that believed it would raise a
-false alarm in a third of all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not
-depend on that. Its scale is therefore taken from all runs together,
+A fit with few degrees of freedom estimates its noise badly. With three, the stated variance is
+often wrong by a factor of three, and a test based on it would raise a false alarm in a third of
+all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not depend on the noise. The
+scale is therefore estimated from all runs together,
 
     s² = (b + Σ chi²) / (b + Σ dof)
 
-where the measured noise of the runs counts as b degrees of freedom (each as in
+where the measured noise of the runs counts as b degrees of freedom (for each run as in
 `accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
 repeat significantly worse than those of the others keeps its own scale.
 
@@ -31,10 +31,10 @@ from ..model import Model
 from ..table import Floats, Poses
 
 _WORSE = 0.001
-"""A run is noisier than the others below this probability of its chi²."""
+"""A run is noisier than the others if the probability of its chi² is lower."""
 
 _CONTRADICTED = 0.1
-"""Measured noise is not believed below this probability of the chi² of all runs."""
+"""Measured noise is ignored if the probability of the chi² of all runs is lower."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Spread:
     Parameters
     ----------
     covariances : tuple of (p, p) arrays
-        Of each ``model.vector`` [g].
+        Covariance of each ``model.vector`` [g²].
     dof : float
         Degrees of freedom of the common scale.
     noisier : tuple of int
-        Calibrations whose poses repeat significantly worse than those of the others.
+        Indices of calibrations whose poses repeat significantly worse than the others.
 
     """
 
@@ -60,7 +60,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class _Run:
-    """The chi² of one run, its degrees of freedom, and the factor on its stated variance."""
+    """The chi² of a run, its degrees of freedom, its stated variance, and the dof of its noise."""
 
     chi2: float
     dof: int
@@ -69,7 +69,7 @@ class _Run:
 
 
 def on_one_scale(calibrations: Sequence[Calibration]) -> Spread:
-    """Return the covariances of calibrations of one sensor, on a scale from all of them."""
+    """Return the covariances of calibrations of one sensor on a common scale."""
     runs = [_run_of(calibration) for calibration in calibrations]
     factors, noisier, dofs = np.ones(len(runs)), [], []
     for measured in (True, False):  # without measured noise, chi² has no unit
@@ -86,7 +86,7 @@ def on_one_scale(calibrations: Sequence[Calibration]) -> Spread:
 
 
 def _pooled(runs: Sequence[_Run]) -> tuple[float, float, list[int]]:
-    """Pool runs, the quietest first: scale, its degrees of freedom, and the noisier runs."""
+    """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
     from scipy.special import fdtrc
 
     pool, worse = [run for run in runs if run.dof == 0], []
@@ -102,7 +102,7 @@ def _pooled(runs: Sequence[_Run]) -> tuple[float, float, list[int]]:
 
 
 def _scale(pool: Sequence[_Run]) -> tuple[float, float]:
-    """Return the scale of these runs and its degrees of freedom; 1 and 0 without either."""
+    """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
     from scipy.special import chdtrc
 
     chi2, dof = sum(run.chi2 for run in pool), sum(run.dof for run in pool)
@@ -113,10 +113,10 @@ def _scale(pool: Sequence[_Run]) -> tuple[float, float]:
 
 
 def _run_of(calibration: Calibration) -> _Run:
-    """Return what the poses of a calibration say of its noise."""
+    """Return the figures about the noise of a calibration."""
     fit = _fit_of(calibration)
     free = int(np.linalg.matrix_rank(fit.columns))
-    # Over its own poses, the variance of a fit sums to the number of its free parameters.
+    # Over its own poses, the variances of a fit sum to the number of free parameters.
     total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
     belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
     return _Run(fit.chi2, fit.equations.count - free, total / free if free else 0.0, belief)

@@ -13,18 +13,18 @@ import numpy as np
 from ..calibrate import Calibration
 from ..calibrate.unknown_orientation import fit_unknown
 from ..effects import Context
-from ..errors import InputError, RefusedFitError
+from ..errors import counted, InputError, listed, RefusedFitError
 from ..model import MODELS
 from ..table import Floats
 
 _COMMON = ('temperature', 'supply_voltage')
-"""Context that is set alike for all runs; the rest is each run's own."""
+"""Context that is set to the same value for all runs; other context is specific to a run."""
 
 _LARGER = {'4': ('7', '10'), '7': ('10',)}
-"""Models that include a smaller one; 9 and 12 add nothing to |a| beyond 10."""
+"""Models that include a smaller model; for |a|, models 9 and 12 are equivalent to 10."""
 
 _WARMER = 5.0
-"""Difference of temperature between runs that is worth a note [°C]."""
+"""Difference of temperature between runs that causes a note [°C]."""
 
 
 def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
@@ -34,35 +34,36 @@ def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
     Raises
     ------
     InputError
-        If they cannot.
+        If the calibrations cannot be compared.
 
     """
     if len(calibrations) < 2:
-        raise InputError('there is nothing to compare a single calibration with',
-                         'give two or more of the same sensor')
+        raise InputError(f'found {counted(len(calibrations), "calibration")}, expected at least 2',
+                         'select two or more calibrations of the same sensor')
     sensors = list(dict.fromkeys(run.sensor for run in calibrations if run.sensor))
     if len(sensors) > 1:
         raise InputError(f'the calibrations are of the sensors {" and ".join(sensors)}, expected '
-                         'one sensor', 'give calibrations of one sensor; if it was only renamed, '
-                         'write one name into sensor: of the files')
+                         'one sensor', 'select calibrations of one sensor; if it was only '
+                         'renamed, set sensor: in the files to one name')
     native = [run.units.name == 'native' for run in calibrations]
     if any(native) and not all(native):
         other = next(run.units.name for run in calibrations if run.units.name != 'native')
-        raise InputError(f'run {native.index(True) + 1} is in native units, another in {other}, '
-                         'and nothing says how many native units make one of it',
-                         'fit all of them from readings in one unit')
+        raise InputError(f'run {native.index(True) + 1} is in native units and another run in '
+                         f'{other}, expected the same unit, because the conversion is not known',
+                         'fit all runs from readings in one unit')
     for k, run in enumerate(calibrations, 1):
         if not np.all(np.isfinite(run.covariance)):
-            raise InputError(f'run {k} has no uncertainty', 'fit it again with more poses')
+            raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
+                             'fit it again with more poses')
 
 
 def with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """
-    Return fits whose uncertainties hold for runs with smaller models, too.
+    Return fits whose uncertainties are valid for runs with smaller models, too.
 
-    A smaller model takes what it leaves out to be zero, without uncertainty. But `auto` leaves out
-    what it cannot see in the noise, so the uncertainty of such a run is that of the largest model
-    of the runs, fitted to its poses.
+    A smaller model assumes that the omitted effects are exactly zero. However, `auto` omits
+    effects that are hidden in the noise. The uncertainty of such a run is therefore that of the
+    largest model of the runs, fitted to its poses.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration
     Returns
     -------
     tuple of Calibration
-        Each run itself, or its poses fitted with the largest model, if they determine it.
+        Each run, or a fit of the largest model to its poses if they determine it.
 
     """
     names = {'10' if run.name in ('9', '12') else run.name for run in calibrations}
@@ -81,7 +82,7 @@ def with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration
 
 
 def _fitted_with(name: str, run: Calibration) -> Calibration:
-    """Return the poses of a run fitted with a larger model, if it is one and they determine it."""
+    """Return a fit of a larger model to the poses of a run, or the run if that is not possible."""
     if name not in _LARGER.get(run.name, ()) or run.model.effects != MODELS[run.name]:
         return run
     try:
@@ -91,7 +92,7 @@ def _fitted_with(name: str, run: Calibration) -> Calibration:
 
 
 def contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
-    """Return the context in which each run is compared, one row each."""
+    """Return the context for the comparison of each run, one row each."""
     common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
                                       if key in run.poses])])
               for key in _COMMON if any(key in run.poses for run in calibrations)}
@@ -99,7 +100,7 @@ def contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
 
 
 def _own_context(run: Calibration) -> Context:
-    """Return the middle of a run: not turning, and without a previous pose."""
+    """Return the median context of a run, with zero rate and without a previous pose."""
     context: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
     if 'time' in run.poses:
         context['time'] = np.array([np.median(run.poses['time'])])
@@ -112,63 +113,62 @@ def notes_of(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
              names: tuple[str, ...], deviation: Floats, noisier: Sequence[int]
              ) -> tuple[str, ...]:
     """
-    Return what else to know of a comparison.
+    Return notes that limit the meaning of a comparison.
 
     Parameters
     ----------
     calibrations, sure : sequence of Calibration
-        The runs, and what `with_largest_model` made of them.
+        The runs, and the result of `with_largest_model` for them.
     names : tuple of str
-        Of the t common parameters.
+        Names of the t common parameters.
     deviation : (n, t) array
-        Their standard deviations; 0 if a run leaves one out.
+        Standard deviations of the parameters; 0 if the model of a run omits the parameter.
     noisier : sequence of int
-        Runs whose poses repeat worse than those of the others.
+        Indices of runs whose poses repeat worse than those of the others.
 
     """
-    smaller = [f'run {k} (model {run.name}) leaves out what model {larger.name} finds in others: '
-               'it counts as zero there, with the uncertainty of its poses'
+    smaller = [f'run {k} (model {run.name}) omits parameters of model {larger.name}: they are '
+               'taken as zero, with the uncertainty that its poses allow'
                for k, (run, larger) in enumerate(zip(calibrations, sure, strict=True), 1)
                if run is not larger]
     return (*_shared(calibrations), *smaller, *_left_out(names, deviation),
             *_temperatures(calibrations),
-            *(f'the poses of run {k + 1} repeat significantly worse than those of the others: it '
-              'counts for less' for k in noisier))
+            *(f'the poses of run {k + 1} repeat significantly worse than those of the others: the '
+              'run has less weight' for k in noisier))
 
 
 def _shared(calibrations: Sequence[Calibration]) -> list[str]:
-    """Return notes on runs that were fitted to the same poses."""
+    """Return notes about runs with common poses."""
     rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(9).tolist()}
             for run in calibrations]
     notes = []
     for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
         common, least = len(first & second), min(len(first), len(second))
         if common:
-            what = 'the same poses' if common == least else f'{common} poses'
-            notes.append(f'runs {i} and {j} share {what}: they are not independent, and that they '
-                         'agree says little')
+            what = 'all their poses' if common == least else counted(common, 'pose')
+            notes.append(f'runs {i} and {j} share {what}: they are not independent, so their '
+                         'agreement means little')
     return notes
 
 
 def _left_out(names: tuple[str, ...], deviation: Floats) -> list[str]:
-    """Return notes on parameters that some models leave out and others have."""
+    """Return notes about parameters that only some of the models have."""
     notes: dict[tuple[int, ...], list[str]] = {}
     for name, column in zip(names, deviation.T, strict=True):
         without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
         if 0 < len(without) < len(column):
             notes.setdefault(without, []).append(name)
-    return [f'{", ".join(found)}: left out by the model of run{"s" * (len(runs) > 1)} '
-            f'{", ".join(map(str, runs))}, so that there it counts as known to be zero; for a '
-            'comparison of like with like, fit all runs with one model'
+    return [f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
+            'for an equal comparison, fit all runs with one model'
             for runs, found in notes.items() if found]
 
 
 def _temperatures(calibrations: Sequence[Calibration]) -> list[str]:
-    """Return a note if temperatures differ and some runs do not correct for that."""
+    """Return a note if the temperatures differ and some runs do not correct for temperature."""
     known = [float(np.median(run.poses['temperature'])) for run in calibrations
              if 'temperature' in run.poses]
     if len(known) < 2 or max(known) - min(known) < _WARMER or all(
             'temperature' in run.model.needs for run in calibrations):
         return []
     return [f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all runs '
-            'correct for temperature: it may be what differs']
+            'correct for temperature: this can cause differences']

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether calibrations of one sensor agree within their uncertainties.
+Comparison of calibrations of one sensor, to test whether they agree within uncertainties.
 
-The calibrations are compared in parameters that do not depend on their axes (`.rotation_free`),
-with covariances on one scale (`.common_scale`), by the test of `.agreement`. A run with a smaller
-model keeps its values; its uncertainty is that of the largest model.
+The test of `.agreement` is applied to parameters that do not depend on the axes
+(`.rotation_free`), with covariances on a common scale (`.common_scale`). A run with a smaller
+model keeps its values, but its uncertainty is that of the largest model.
 
 """
 
@@ -34,18 +34,18 @@ _DIRECTIONS = spread_directions(300)
 @dataclass(frozen=True)
 class Parameter:
     """
-    One parameter over the runs.
+    Values of one parameter over the runs.
 
     Parameters
     ----------
     name : str
-        ``offset.x``, ``gain.xy``, …: of V, and of the symmetric gain.
+        ``offset.x``, ``gain.xy``, …: entries of V, and of the symmetric gain.
     values, stated_sd : (n,) array
-        Of each run [g].
+        Value and stated standard deviation in each run [g].
     spread : float
         Standard deviation over the runs [g].
     ratio : float or None
-        The spread over the stated deviation, RMS; None if that is zero.
+        Spread over the stated standard deviation (RMS); None if the latter is zero.
 
     """
 
@@ -59,19 +59,19 @@ class Parameter:
 @dataclass(frozen=True)
 class Run:
     """
-    One calibration against the others.
+    One calibration compared with the others.
 
     Parameters
     ----------
     rms_mg, expected_mg : float
-        Difference of the corrected |a| to the mean of the others, RMS over all directions, and
-        what the uncertainties predict [mg].
+        Difference of the corrected |a| from the mean of the others, RMS over all directions, and
+        the same as predicted from the uncertainties [mg].
     largest_mg : float
-        The largest such difference [mg].
+        Largest difference over all directions [mg].
     direction : (3,) array
-        Where that is: what points up, in the axes of the sensor.
+        Direction of up, in the sensor axes, where the difference is largest.
     p_value : float
-        Probability of a difference as large, if this run agrees with the others.
+        Probability of a difference at least this large, if this run agrees with the others.
 
     """
 
@@ -85,28 +85,28 @@ class Run:
 @dataclass(frozen=True)
 class Comparison:
     """
-    Whether calibrations agree.
+    The result of a comparison.
 
     Parameters
     ----------
     agree : bool
-        Whether they do, at `LEVEL`.
+        Whether the calibrations agree, at `LEVEL`.
     p_value : float
-        Probability of differences as large, if they are of one sensor that has not changed.
+        Probability of differences at least this large, if the sensor has not changed.
     chi2 : float
         T², the squared differences over their variances.
     dof : int
-        What T² is on average, if they agree.
+        Expected value of T², if the calibrations agree.
     outlier : int or None
-        The one run without which the others agree, from 0.
+        Index of the run without which the others agree, 0-based.
     runs : tuple of Run
-        Each against the others.
+        Each run compared with the others.
     parameters : tuple of Parameter
-        Spread over the runs.
+        Spread of each parameter over the runs.
     tilt_deg : float or None
-        Largest angle between the directions of up of two levelled runs [°]; None with fewer.
+        Largest angle between the directions of up of levelled runs [°]; None with fewer than two.
     notes : tuple of str
-        What else to know.
+        Notes that limit the meaning of the comparison.
 
     """
 
@@ -123,28 +123,28 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Run:
-    """A calibration, its fit with the largest model, its context and common parameters."""
+    """A calibration, its fit with the largest model, its context and rotation-free parameters."""
 
     calibration: Calibration
     sure: Calibration
     context: Context
-    said: RotationFree
+    free: RotationFree
     slope: Floats
     covariance: Floats
 
     def length(self, reading: Floats) -> tuple[Floats, Floats]:
-        """Return the corrected |a| of (n, 3) readings in the common unit, and its variance."""
+        """Return the corrected |a| of (n, 3) readings and its variance, in the common unit."""
         here = {key: np.repeat(column, len(reading), 0) for key, column in self.context.items()}
-        u = sensor_force(self.calibration.model, reading / self.said.reading_scale, here)
+        u = sensor_force(self.calibration.model, reading / self.free.reading_scale, here)
         model = self.sure.model
         rows = model.basis(u, here).along(length_rows(model, u, here))
         variance = np.maximum(np.einsum('np,pq,nq->n', rows, self.covariance, rows), 0.0)
-        scale = self.said.force_scale
+        scale = self.free.force_scale
         return np.linalg.norm(u, axis=1) * scale, variance * scale ** 2
 
     def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
         """Return the (t, t) covariance of the common parameters."""
-        slope = _into(names, self.said, self.slope)
+        slope = _into(names, self.free, self.slope)
         carried: Floats = slope @ covariance @ slope.T
         return carried
 
@@ -156,40 +156,40 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
     Parameters
     ----------
     calibrations : sequence of Calibration
-        Two or more, of any models.
+        Two or more calibrations with any models.
 
     Returns
     -------
     Comparison
-        The result, and what differs by how much.
+        The result of the test, with the differences.
 
     Raises
     ------
     InputError
-        If they cannot be compared: fewer than two, other sensors, other units, no uncertainty.
+        If there are fewer than two, or their sensors or units differ, or one has no uncertainty.
 
     """
     refuse_if_unlike(calibrations)
     sure = with_largest_model(calibrations)
     scaled = on_one_scale(sure)
-    looked = _looked_at(calibrations, sure, scaled.covariances)
-    names = tuple(dict.fromkeys(name for run in looked for name in run.said.names))
-    values = np.array([_into(names, run.said, run.said.values) for run in looked])
-    runs = Runs(values, np.array([run.spread(names, run.covariance) for run in looked]),
+    prepared = _prepared(calibrations, sure, scaled.covariances)
+    names = tuple(dict.fromkeys(name for run in prepared for name in run.free.names))
+    values = np.array([_into(names, run.free, run.free.values) for run in prepared])
+    runs = Runs(values, np.array([run.spread(names, run.covariance) for run in prepared]),
                 scaled.dof)
     stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.sure.covariance))
-                                 for run in looked], 0.0))
+                                 for run in prepared], 0.0))
     (chi2, rank), p_value = runs.squared, runs.p_value
     return Comparison(
         p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
-        _each(looked, p_values(runs)),
+        _each(prepared, p_values(runs)),
         tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
-        _tilt_deg(looked), notes_of(calibrations, sure, names, stated, scaled.noisier))
+        _tilt_deg(prepared), notes_of(calibrations, sure, names, stated, scaled.noisier))
 
 
-def _looked_at(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
-               covariances: Sequence[Floats]) -> list[_Run]:
-    """Return each calibration in the common unit and context."""
+def _prepared(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
+              covariances: Sequence[Floats]) -> list[_Run]:
+    """Return each calibration with its context and parameters in the common unit."""
     per_g = float(np.mean([run.units.per_g for run in calibrations]))
     return [_Run(run, one, context, rotation_free(run, context, per_g),
                  rotation_free(one, context, per_g).slope, covariance)
@@ -198,7 +198,7 @@ def _looked_at(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
 
 
 def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
-    """Return (t, …) rows in the order of the common names; those that a run lacks are zero."""
+    """Return (t, …) rows in the order of the common names; missing rows are zero."""
     found = np.zeros((len(names), *rows.shape[1:]))
     found[[names.index(name) for name in run.names]] = rows
     return found
@@ -209,11 +209,11 @@ def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
-def _each(looked: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
+def _each(prepared: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
     """Compare the corrected |a| of each run with that of the others, over all directions."""
-    reading = (np.mean([run.said.vec_v for run in looked], axis=0)
-               + _DIRECTIONS @ np.mean([run.said.mat_s for run in looked], axis=0))
-    found = [run.length(reading) for run in looked]
+    reading = (np.mean([run.free.vec_v for run in prepared], axis=0)
+               + _DIRECTIONS @ np.mean([run.free.mat_s for run in prepared], axis=0))
+    found = [run.length(reading) for run in prepared]
     length, variance = (np.array(part) for part in zip(*found, strict=True))
     weight = 1.0 / (np.mean(variance, axis=1) + SAME_G ** 2)
     runs = []
@@ -231,9 +231,9 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
 
 
-def _tilt_deg(looked: Sequence[_Run]) -> float | None:
+def _tilt_deg(prepared: Sequence[_Run]) -> float | None:
     """Return the largest angle between the directions of up of levelled runs [°]."""
-    up = [run.said.axes[:, 2] for run in looked
+    up = [run.free.axes[:, 2] for run in prepared
           if not np.array_equal(run.calibration.model.rotation, np.eye(3))]
     if len(up) < 2:
         return None

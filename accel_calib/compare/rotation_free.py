@@ -4,13 +4,13 @@
 """
 The parameters of a calibration that do not depend on its axes, and their uncertainty.
 
-|force| depends on W through W Wᵀ alone: turning the axes of the force, W -> W Q, changes nothing.
-So calibrations with other axes (9 in the sensing axes, 10 symmetric, 12 and levelled ones turned)
-are compared in V and in S = (W Wᵀ)^(1/2), the symmetric factor of the polar decomposition W = S Q.
-Its derivative solves S dS + dS S = dW Wᵀ + W dWᵀ.
+|force| depends on W only through W Wᵀ: a rotation of the axes of the force, W -> W Q, does not
+change it. Calibrations with different axes (model 9 in the sensing axes, 10 symmetric, 12 and
+levelled ones rotated) are therefore compared in V and in S = (W Wᵀ)^(1/2), the symmetric factor of
+the polar decomposition W = S Q. The derivative of S solves S dS + dS S = dW Wᵀ + W dWᵀ.
 
-Effects that depend on the context are taken at one context, as parts of V and W; effects that
-bend with the force add their own parameters.
+Effects that depend on the context are evaluated at one context, as parts of V and W. Effects with
+bending terms add their own parameters.
 
 """
 
@@ -42,15 +42,15 @@ class RotationFree:
     Parameters
     ----------
     names : tuple of str
-        `NAMES`, and those of the effects that bend with the force.
+        `NAMES`, and the parameters of effects with bending terms.
     values : (t,) array
-        In g.
+        Values of the parameters [g].
     slope : (t, p) array
-        Their derivative by ``calibration.model.vector``.
+        Derivative of the parameters by ``calibration.model.vector``.
     axes : (3, 3) array
         Q ΔR, the rotation from the levelled frame to the axes of S.
     reading_scale, force_scale : float
-        Factors from readings and forces in the calibration's own g to the common unit.
+        Factors from readings and forces in the local g of the calibration to the common unit.
 
     """
 
@@ -74,21 +74,21 @@ class RotationFree:
 
 def rotation_free(calibration: Calibration, context: Context, per_g: float) -> RotationFree:
     """
-    Return the parameters that do not depend on the axes.
+    Return the parameters of a calibration that do not depend on its axes.
 
     Parameters
     ----------
     calibration : Calibration
-        Any.
+        A calibration with any model.
     context : mapping of str to array
-        What its effects need, one row.
+        Columns that the effects need, one row.
     per_g : float
-        Native readings that count as 1 g; of no effect for other units.
+        Native reading that counts as 1 g; not used for other units.
 
     Returns
     -------
     RotationFree
-        At that context.
+        The parameters at this context.
 
     """
     model = calibration.model
@@ -114,7 +114,7 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
 
 
 def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
-    """Return the factors of readings and forces to the common unit, standard g or native."""
+    """Return the factors from readings and forces to the common unit, standard g or native."""
     units = calibration.units
     if units.name == 'native':
         return units.per_g / per_g, 1.0

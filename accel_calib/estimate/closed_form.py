@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from .quadric import centred, DIAGONAL, quadric, sphere_of, SYMMETRIC
-from ..errors import RefusedFitError
+from ..errors import counted, RefusedFitError
 from ..table import Floats
 
 _FACE_COSINE = np.cos(np.radians(20.0))
@@ -95,9 +95,9 @@ def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
     design = np.column_stack([reference, np.ones(len(reference))])
     solution, _, rank, _ = np.linalg.lstsq(design, reading, rcond=1e-6)
     if rank < 4:
-        raise RefusedFitError(f'the known forces of the {len(reading)} poses lie in a plane, '
-                              'expected three dimensions', 'take poses with each side of the '
-                              'sensor up and down, and some edges')
+        raise RefusedFitError(f'the known forces of {counted(len(reading), "pose")} lie in a '
+                              'plane, expected three dimensions', 'take poses with each side of '
+                              'the sensor up and down, and some edges')
     return solution[:3].T, solution[3]
 
 

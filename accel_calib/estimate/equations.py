@@ -103,7 +103,7 @@ class Equations:
         return _joined([part.columns(model) for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:
-        """Return the (n,) residuals of the poses [g]: signed for one equation per pose, else RMS."""
+        """Return the (n,) residuals of poses [g]: signed for one equation each, else RMS."""
         sizes = residual * self.scale[self.pose]
         if len(sizes) == len(self.scale):
             signed = np.zeros(len(self.scale))
@@ -276,7 +276,7 @@ class _Shared:
         return summed.reshape(groups, *parts.shape[1:])
 
     def _projected(self, rows: Floats) -> Floats:
-        """Return (n, 3, p) rows minus the part that a rotation of the common direction explains."""
+        """Return (n, 3, p) rows minus the part that a rotation of the direction explains."""
         onto = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ rows)
         return rows - self._turn @ onto[self._group]
 

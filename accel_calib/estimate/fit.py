@@ -16,10 +16,11 @@ here: native readings can have any offset, and known orientations any rotation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .equations import Equations, equations, noise_of
 from .noise import belief_in, variance_factor
@@ -40,6 +41,43 @@ _SMALLEST = 1e-12
 
 _SHAPE_ROOM = 5.0
 """Factor by which a fitted shape constant may exceed the range that the search tries."""
+
+
+@dataclass(frozen=True)
+class ByPose:
+    """
+    The equations of a fit, by pose.
+
+    Parameters
+    ----------
+    residual : (n, k) array
+        Residuals in units of the noise, padded with 0.
+    columns : (n, k, q) array
+        Derivative of the prediction, padded with 0.
+    rows : (n,) array of int
+        Number of equations of each pose.
+
+    """
+
+    residual: Floats
+    columns: Floats
+    rows: NDArray[np.int64]
+
+    @cached_property
+    def spread(self) -> Floats:
+        """(q, q) array, (JᵀJ)⁻¹."""
+        flat = self.flat
+        return np.linalg.pinv(flat.T @ flat, hermitian=True)
+
+    @property
+    def flat(self) -> Floats:
+        """(n k, q) array, the derivative with one row per equation."""
+        return self.columns.reshape(self.residual.size, self.columns.shape[2])
+
+    def own(self, spread: Floats) -> Floats:
+        """Return the (n, k, k) matrices I - leverage of each pose."""
+        return (np.eye(self.columns.shape[1])
+                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
 
 
 @dataclass(frozen=True)
@@ -83,7 +121,7 @@ class Fit:
 
     @property
     def dof(self) -> int:
-        """Number of independent equations minus number of free values."""
+        """Return the number of independent equations minus that of free values."""
         return self.equations.count - self.columns.shape[1]
 
     @cached_property
@@ -100,6 +138,23 @@ class Fit:
     def variance_dof(self) -> float:
         """Degrees of freedom of `variance`."""
         return belief_in(self.noise_known) + self.dof
+
+    @cached_property
+    def by_pose(self) -> ByPose:
+        """Return the equations by pose."""
+        pose, count = self.equations.pose, len(self.poses_g)
+        rows = np.bincount(pose, minlength=count)
+        if len(pose) == count:
+            order = np.argsort(pose)
+            return ByPose(self.residual[order][:, np.newaxis],
+                          self.columns[order][:, np.newaxis], rows)
+        order = np.argsort(pose, kind='stable')
+        slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
+        residual = np.zeros((count, int(rows.max())))
+        columns = np.zeros((*residual.shape, self.columns.shape[1]))
+        residual[pose[order], slot] = self.residual[order]
+        columns[pose[order], slot] = self.columns[order]
+        return ByPose(residual, columns, rows)
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
@@ -176,7 +231,7 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
         with np.errstate(all='ignore'):
             try:
                 near = equations(model, poses_g, noise)
-                return Point(near.residual, near.columns(model)[:, fitted])
+                return Point(near.residual, near.columns(model)[:, fitted], near)
             except np.linalg.LinAlgError:
                 return NOWHERE
 
@@ -184,9 +239,10 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
         return judge(start, poses_g)
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
-    values, _ = solve(point_at, start.vector[fitted], lower, upper)
+    values, found = solve(point_at, start.vector[fitted], lower, upper)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
-    return replace(judge(model_at(values), poses_g), at_bound=at_bound)
+    return Fit(model_at(values), poses_g, found.source, found.columns,
+               free_of(start.effects), at_bound)
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:

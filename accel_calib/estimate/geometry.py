@@ -23,12 +23,12 @@ evenly. `accel_calib.estimate.identifiability` describes what the poses do not d
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 
 from .noise import believable, LEAST_NOISE
-from ..model import MODELS, parameter_names, with_vector
+from ..model import Model, MODELS, parameter_names, with_vector
 from ..sphere import spread_directions
 from ..table import Floats
 
@@ -65,9 +65,14 @@ def parameters_of(name: str) -> tuple[str, ...]:
     return parameter_names(effects_of(name))
 
 
+@cache
+def _no_errors(name: str) -> Model:
+    return with_vector(effects_of(name), np.zeros(free_parameters(name)))
+
+
 def rows_of(name: str, directions: Floats) -> Floats:
     """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    basis = with_vector(effects_of(name), np.zeros(free_parameters(name))).basis(directions, {})
+    basis = _no_errors(name).basis(directions, {})
     return basis.full if name == '12' else basis.along(directions)[:, np.newaxis]
 
 

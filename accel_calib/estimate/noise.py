@@ -109,7 +109,7 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
 
 
 def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and the normal distribution."""
+    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
     from scipy.special import stdtrit
 
     return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2

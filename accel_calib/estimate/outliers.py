@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import Fit
+from .fit import ByPose, Fit
 from .noise import belief_in
 from ..table import Floats
 
@@ -30,7 +30,7 @@ LEVEL = 0.007
 """Probability that a pose of a set without outliers is removed."""
 
 LARGEST_SHARE = 0.25
-"""Largest share of the poses that can be excluded."""
+"""Largest share of the poses that can be left out."""
 
 _LEAST_OWN = 1e-6
 """1 - leverage below this: this pose alone determines a parameter, and cannot be tested."""
@@ -48,61 +48,8 @@ _DOUBTED = 1.0
 
 
 @dataclass(frozen=True)
-class ByPose:
-    """
-    The equations of a fit, by pose.
-
-    Parameters
-    ----------
-    residual : (n, k) array
-        Residuals in units of the noise, padded with 0.
-    columns : (n, k, q) array
-        Derivative of the prediction, padded with 0.
-    rows : (n,) array of int
-        Number of equations of each pose.
-
-    """
-
-    residual: Floats
-    columns: Floats
-    rows: NDArray[np.int64]
-
-    @property
-    def spread(self) -> Floats:
-        """(q, q) array, (JᵀJ)⁻¹."""
-        flat = self.flat
-        return np.linalg.pinv(flat.T @ flat, hermitian=True)
-
-    @property
-    def flat(self) -> Floats:
-        """(n k, q) array, the derivative with one row per equation."""
-        return self.columns.reshape(self.residual.size, self.columns.shape[2])
-
-    def own(self, spread: Floats) -> Floats:
-        """Return the (n, k, k) matrices I - leverage of each pose."""
-        return (np.eye(self.columns.shape[1])
-                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
-
-
-def by_pose(fit: Fit) -> ByPose:
-    """Return the equations of a fit by pose."""
-    pose, count = fit.equations.pose, len(fit.poses_g)
-    rows = np.bincount(pose, minlength=count)
-    if len(pose) == count:
-        order = np.argsort(pose)
-        return ByPose(fit.residual[order][:, np.newaxis], fit.columns[order][:, np.newaxis], rows)
-    order = np.argsort(pose, kind='stable')
-    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
-    residual = np.zeros((count, int(rows.max())))
-    columns = np.zeros((*residual.shape, fit.columns.shape[1]))
-    residual[pose[order], slot] = fit.residual[order]
-    columns[pose[order], slot] = fit.columns[order]
-    return ByPose(residual, columns, rows)
-
-
-@dataclass(frozen=True)
 class Outliers:
-    """Poses to exclude, as (d,) indices among the poses of a fit, and the chi² of the others."""
+    """Poses to leave out, as (d,) indices among the poses of a fit, and the chi² of the others."""
 
     poses: NDArray[np.intp]
     chi2: float
@@ -117,7 +64,7 @@ def outliers(fit: Fit, total: int) -> Outliers:
     fit : Fit
         Fit to the poses that are kept so far.
     total : int
-        Number of poses before any was excluded.
+        Number of poses before any was left out.
 
     Returns
     -------
@@ -126,7 +73,7 @@ def outliers(fit: Fit, total: int) -> Outliers:
         them.
 
     """
-    data = by_pose(fit)
+    data = fit.by_pose
     limit = most_outliers(fit, total, int(data.rows.max())) - (total - len(data.rows))
     if limit <= 0:
         return Outliers(np.zeros(0, np.intp), fit.chi2)
@@ -150,7 +97,7 @@ def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
 
 
 def most_outliers(fit: Fit, total: int, rows: int = 1) -> int:
-    """Return the largest number of poses to exclude, each with `rows` equations."""
+    """Return the largest number of poses to leave out, each with `rows` equations."""
     spare = fit.dof + rows * (total - len(fit.poses_g))
     return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
 

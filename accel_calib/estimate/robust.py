@@ -23,21 +23,21 @@ from numpy.typing import NDArray
 from .closed_form import closed_form
 from .equations import noise_of
 from .fit import estimate, Fit, judge
-from .outliers import belief_beside, beyond, by_pose, LARGEST_SHARE, LEVEL, outliers
+from .outliers import belief_beside, beyond, LARGEST_SHARE, LEVEL, outliers
 from .solve import NotConvergedError
 from ..model import Model, MODELS, parameter_names, with_linear_part
 from ..table import Floats, Poses
 
 _ROUNDS = 6
-"""Largest number of fits after which poses are excluded or included."""
+"""Largest number of fits after which poses are left out or included."""
 
 _SUSPICIOUS = 4.0
 """chi² per degree of freedom above which the fit of all poses is suspicious."""
 
 _CLEARLY = 10.0
-"""Ratio of the variances above which a pose that the robust fit excludes is an outlier. The choice
-among subsets makes small differences look significant, so a smaller ratio is ignored; `.outliers`
-decides about the other poses."""
+"""Ratio of the variances above which a pose that the robust fit leaves out is an outlier. The
+choice among subsets makes small differences look significant, so a smaller ratio is ignored;
+`.outliers` decides about the other poses."""
 
 _MOST_SUBSETS = 400
 """Largest number of subsets that are fitted."""
@@ -100,7 +100,7 @@ def start_of(name: str, reading: Floats) -> Model:
 
 
 def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.intp]:
-    """Return the poses that a fit excludes, in decreasing order of the residual."""
+    """Return the poses that a fit leaves out, in decreasing order of the residual."""
     out = np.setdiff1d(np.arange(len(poses_g)), kept)
     away = np.abs(judge(fit.model, poses_g).residual[out])
     return out[np.argsort(-away, kind='stable')]
@@ -108,7 +108,7 @@ def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray
 
 def _without_outliers(name: str, poses_g: Poses, kept: NDArray[np.intp]
                       ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Fit poses and exclude outliers until there are none; None if a fit does not converge."""
+    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
     fit = _fit(name, poses_g, kept)
     for _ in range(_ROUNDS):
         out = () if fit is None else outliers(fit, len(poses_g)).poses
@@ -133,7 +133,7 @@ def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.i
 
 def _with_those_that_agree(name: str, poses_g: Poses, kept: NDArray[np.intp]
                            ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Include the poses that agree with a fit, exclude the others; None if too few agree."""
+    """Include the poses that agree with a fit, leave out the others; None if too few agree."""
     tried: set[bytes] = set()
     while (fit := _fit(name, poses_g, kept)) is not None:
         tried.add(kept.tobytes())
@@ -155,7 +155,7 @@ def _fit(name: str, poses_g: Poses, kept: NDArray[np.intp]) -> Fit | None:
 
 
 def _most(name: str, count: int) -> int:
-    """Return the largest number of poses that can be excluded."""
+    """Return the largest number of poses that can be left out."""
     return min(int(LARGEST_SHARE * count), (count - _free(name)) // 2)
 
 
@@ -165,10 +165,8 @@ def _free(name: str) -> int:
 
 def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool_]:
     """Return which poses agree with a fit to the poses kept."""
-    data = by_pose(judge(fit.model, poses_g))
-    flat = fit.columns
-    spread = np.linalg.pinv(flat.T @ flat, hermitian=True)
-    leverage = np.einsum('nkp,pq,nkq->n', data.columns, spread, data.columns)
+    data = judge(fit.model, poses_g).by_pose
+    leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
     inside = np.isin(np.arange(len(poses_g)), kept)
     spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
     belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)

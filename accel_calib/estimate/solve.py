@@ -12,7 +12,7 @@ long, mostly because of overhead (`benchmarks/fits.py`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,10 +46,11 @@ class NotConvergedError(RefusedFitError):
 
 
 class Point(NamedTuple):
-    """The (m,) residuals and the (m, q) derivative of the prediction at some values."""
+    """The (m,) residuals and (m, q) derivative at some values, and the object they are from."""
 
     residual: Floats
     columns: Floats
+    source: Any = None
 
     @property
     def cost(self) -> float:

@@ -1,20 +1,14 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pose tables, recordings and calibrations as files: one reader and one writer each."""
+"""Files of pose tables, recordings and calibrations, with one reader and one writer each."""
 
 from .bag import is_bag
 from .bag_correction import correct_bag, Progress
-from .calibration_yaml import (
-    check_sensor,
-    format_calibration,
-    parse_calibration,
-    read_calibration,
-    write_calibration,
-)
+from .calibration_yaml import read_calibration, write_calibration
 from .recording import open_recording, OpenRecording, read_recording
 from .table_csv import read_poses, read_samples, write_table
 
-__all__ = ['OpenRecording', 'Progress', 'check_sensor', 'correct_bag', 'format_calibration',
-           'is_bag', 'open_recording', 'parse_calibration', 'read_calibration', 'read_poses',
-           'read_recording', 'read_samples', 'write_calibration', 'write_table']
+__all__ = ['OpenRecording', 'Progress', 'correct_bag', 'is_bag', 'open_recording',
+           'read_calibration', 'read_poses', 'read_recording', 'read_samples',
+           'write_calibration', 'write_table']

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write a file as a whole, or leave it unchanged."""
+"""Writing of files that are either complete or unchanged."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from typing import TextIO
 
 
 def previous(path: Path) -> Path:
-    """Return the name under which the previous file is kept."""
+    """Return the path under which the previous file is kept."""
     return path.with_name(f'{path.name}.before')
 
 
 def write_atomically(path: Path, write: Callable[[TextIO], object], *,
                      keep_before: bool = False) -> None:
     """
-    Write to a temporary file beside the target, flush it to the disk, rename it.
+    Write a file through a temporary file, which is flushed to the disk and renamed.
 
     Parameters
     ----------
     path : Path
-        The target; its folder must exist.
+        The file; its folder must exist.
     write : callable
-        Writes the content to an open file.
+        Function that writes the content to an open file.
     keep_before : bool
         Keep the previous file as ``<name>.before``.
 
     Raises
     ------
     OSError
-        If the folder is missing or cannot be written; the target is then unchanged.
+        If the folder is missing or cannot be written. The file is then unchanged.
 
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
@@ -52,14 +52,14 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
 
 
 def _keep(path: Path) -> None:
-    """Copy the file to the name of the previous one, as a whole or not at all."""
+    """Copy the file to the name of the previous file, completely or not at all."""
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.before')
     shutil.copy2(path, temporary)
     temporary.replace(previous(path))
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the renaming survive a loss of power."""
+    """Flush a folder, so that a renamed file survives a loss of power."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

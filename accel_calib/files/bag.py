@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags, without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
+Reader of bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-`rosbags` reads them; the serialized messages of a topic are joined to blocks of arrays
-(`accel_calib.messages.arrays`), and a bag of any length takes the memory of a block.
+`rosbags` reads the serialized messages. They are joined to blocks of arrays
+(`accel_calib.messages.arrays`), so the memory needed does not depend on the length of the bag.
 
 """
 
@@ -36,19 +36,19 @@ IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 SUFFIXES = ('.bag', '.mcap', '.db3')
 BLOCK = 4096
-"""Messages that are joined; a block fits into the cache of a processor."""
+"""Number of messages per block; a block fits in the cache of the processor."""
 
 _ROWS = 65536
-"""Samples of a block, at least."""
+"""Smallest number of samples in a block of a recording."""
 
 _TEMPERATURE_DOUBLES = 2
-"""Temperature and its variance."""
+"""Number of doubles of a Temperature: temperature and variance."""
 
 _HELD_BACK = 8
-"""Blocks that wait for the temperature after them, at most."""
+"""Largest number of blocks that wait for a later temperature."""
 
 _AROUND = 10
-"""Temperatures kept from before a block."""
+"""Number of temperatures that are kept before a block."""
 
 
 def is_bag(path: Path) -> bool:
@@ -59,16 +59,16 @@ def is_bag(path: Path) -> bool:
 @dataclass(frozen=True)
 class Bag:
     """
-    An open bag; made by `open_bag`.
+    An open bag; `open_bag` makes it.
 
     Parameters
     ----------
     path : Path
         File or folder.
     reader : Reader
-        It, as `rosbags` has it.
+        The reader of `rosbags`.
     ros2 : bool
-        False for a ROS 1 bag.
+        Whether it is a rosbag2; otherwise it is a ROS 1 bag.
 
     """
 
@@ -81,34 +81,34 @@ class Bag:
         return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
 
     def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
-        """Return the connections of a topic; there may be several."""
+        """Return the connections of a topic; a topic can have several."""
         return [c for c in self.reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
 
-    def count(self, topic: str, msgtype: str = IMU) -> int:
-        """Return the number of messages of a topic, by the index of the bag."""
-        return sum(connection.msgcount for connection in self.connections(topic, msgtype))
+    def count(self, topic: str) -> int:
+        """Return the number of Imu messages of a topic, according to the index of the bag."""
+        return sum(connection.msgcount for connection in self.connections(topic))
 
     def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
                ) -> Iterator[list[tuple[Connection, int, bytes]]]:
         """
-        Yield messages by blocks, in the order of receipt.
+        Yield blocks of messages, in order of receipt.
 
         Parameters
         ----------
         connections : sequence of Connection
-            What to read; by default all.
+            Connections to read; by default all.
         size : int
-            Messages of a block.
+            Largest number of messages in a block.
 
         Yields
         ------
         list of (Connection, int, bytes)
-            With the time of receipt [ns].
+            Connection, time of receipt [ns] and serialized message.
 
         """
         messages = self.reader.messages(connections)
         while True:
-            with _asking_rosbags(self.path):
+            with _rosbags_errors(self.path):
                 block = list(islice(messages, size))
             if not block:
                 return
@@ -117,7 +117,7 @@ class Bag:
     def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
                ) -> Messages:
         """
-        Return messages of a topic as arrays; `before` is the number of those before them.
+        Return messages of a topic as arrays; `before` is the number of earlier messages.
 
         Raises
         ------
@@ -136,9 +136,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises
     ------
     InputError
-        If it is not a whole bag; also later, while it is read.
+        If the bag is damaged; also later, while it is read.
     FileNotFoundError
-        If it is missing.
+        If the file is missing.
 
     """
     from rosbags import rosbag1, rosbag2
@@ -146,7 +146,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not path.exists():
         raise FileNotFoundError(2, 'No such file or directory', str(path))
     ros2 = path.suffix != '.bag'
-    with _asking_rosbags(path):
+    with _rosbags_errors(path):
         reader = (rosbag2.Reader if ros2 else rosbag1.Reader)(path)
         reader.open()
     try:
@@ -156,45 +156,46 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 @contextmanager
-def _asking_rosbags(path: Path) -> Iterator[None]:
-    """Report what `rosbags` raises as an InputError; nothing but calls of it belong inside."""
+def _rosbags_errors(path: Path) -> Iterator[None]:
+    """Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside."""
     try:
         yield
     except OSError as err:
         if err.errno is not None:
             raise
         raise _not_whole(path, err) from err
-    except Exception as err:  # damaged bytes raise whatever its parsers and SQLite meet first
+    except Exception as err:  # damaged bytes cause many kinds of errors
         raise _not_whole(path, err) from err
 
 
 def _not_whole(path: Path, err: Exception) -> InputError:
     what = ' '.join(str(err).split()) or type(err).__name__
-    return InputError(f'{path} is not a whole bag ({what})',
-                      'give a rosbag2 folder, .mcap, .db3 or .bag; ros2 bag reindex may repair it')
+    return InputError(f'{path} is damaged or not a bag ({what}), expected a rosbag2 folder, '
+                      '.mcap, .db3 or .bag', 'use another file; ros2 bag reindex may repair this '
+                      'one')
 
 
 def imu_topic(bag: Bag, topic: str = '') -> str:
     """
-    Return the one Imu topic of an open bag, or the one asked for.
+    Return the Imu topic of an open bag, or check the given topic.
 
     Raises
     ------
     InputError
-        If there is none, or more than one to choose from.
+        If there is no such topic, or there are several and none is given.
 
     """
     topics = bag.topics(IMU)
     if not topics:
         others = ', '.join(sorted(f'{c.topic} ({c.msgtype})' for c in bag.reader.connections))
-        raise InputError(f'{bag.path} has no topic of type {IMU}, only {others or "none"}',
+        raise InputError(f'{bag.path} has {others or "no topics"}, expected a topic of type {IMU}',
                          'record the Imu topic')
     if topic and topic not in topics:
-        raise InputError(f'{bag.path} has no Imu topic {topic}, only {", ".join(topics)}',
-                         'choose one with --topic')
+        raise InputError(f'{bag.path} has the Imu topics {", ".join(topics)}, expected {topic}',
+                         'choose one of them with --topic')
     if not topic and len(topics) > 1:
-        raise InputError(f'{bag.path} has {len(topics)} Imu topics: {", ".join(topics)}',
-                         'choose one with --topic')
+        raise InputError(f'{bag.path} has {len(topics)} Imu topics, expected one: '
+                         f'{", ".join(topics)}', 'choose one of them with --topic')
     return topic or topics[0]
 
 
@@ -205,12 +206,12 @@ def first_frame_id(bag: Bag, topic: str) -> str:
     Raises
     ------
     InputError
-        If there is no message, or it is damaged.
+        If there is no message, or the message is damaged.
 
     """
     block = next(bag.blocks(bag.connections(topic), 1), None)
     if block is None:
-        raise InputError(f'{bag.path} has no message on {topic}',
+        raise InputError(f'{bag.path} has no message on {topic}, expected Imu messages',
                          'record while the sensor publishes')
     return frame_ids(bag.joined([block[0][2]], topic, 0))[0]
 
@@ -218,45 +219,46 @@ def first_frame_id(bag: Bag, topic: str) -> str:
 def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str, *,
               chosen: bool) -> NDArray[np.bool_]:
     """
-    Return which messages are of a sensor.
+    Return a mask of the messages of a sensor.
 
     Parameters
     ----------
     bag, topic
-        Where they come from.
+        Source of the messages.
     messages : Messages
-        A block of the topic.
+        A block of messages of the topic.
     before : int
-        Messages before these.
+        Number of earlier messages.
     sensor : str
-        The frame_id of the sensor.
+        frame_id of the sensor.
     chosen : bool
-        Whether the user chose it; otherwise messages of another are refused.
+        Whether the user chose the sensor; otherwise messages of another sensor are refused.
 
     Raises
     ------
     InputError
-        If a message is of another sensor, and none was chosen.
+        If a message is from another sensor, and the user did not choose a sensor.
 
     """
     names = frame_ids(messages)
     same = np.array([name == sensor for name in names])
     if not chosen and not np.all(same):
         first = int(np.argmin(same))
-        raise InputError(f'{bag.path}, {topic}: message {before + first + 1} is of the sensor '
-                         f'{names[first]!r}, those before it are of {sensor!r}',
-                         'choose one with --sensor')
+        raise InputError(f'{bag.path}, {topic}: message {before + first + 1} is from the sensor '
+                         f'{names[first]!r}, expected {sensor!r} as before',
+                         'capture and refine choose one with --sensor; apply needs a topic for '
+                         'each sensor')
     return np.broadcast_to(same, len(messages))
 
 
 def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool) -> Iterator[Recording]:
     """
-    Read the samples of an Imu topic in blocks; parameters as `of_sensor`.
+    Yield the samples of an Imu topic in blocks; parameters as in `of_sensor`.
 
     Raises
     ------
     InputError
-        If a message is damaged, holds NaN, or is of another sensor.
+        If a message is damaged, contains NaN, or is from another sensor.
 
     """
     waiting: deque[Recording] = deque()
@@ -281,14 +283,14 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool) -> Iterator[
 
 
 def _raw_messages(bag: Bag, topic: str) -> Iterator[tuple[list[bytes], list[bytes]]]:
-    """Yield serialized Imu and Temperature messages by blocks; one pass over the bag."""
+    """Yield blocks of serialized Imu and Temperature messages, in one pass over the bag."""
     warm = [c for name in bag.topics(TEMPERATURE) for c in bag.connections(name, TEMPERATURE)]
     are_warm = {id(connection) for connection in warm}
     messages = bag.reader.messages([*bag.connections(topic), *warm])
     while True:
         imus: list[bytes] = []
         temperatures: list[bytes] = []
-        with _asking_rosbags(bag.path):
+        with _rosbags_errors(bag.path):
             for connection, _, raw in islice(messages, BLOCK):
                 (temperatures if id(connection) in are_warm else imus).append(raw)
         if not imus and not temperatures:
@@ -298,7 +300,7 @@ def _raw_messages(bag: Bag, topic: str) -> Iterator[tuple[list[bytes], list[byte
 
 def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
              ) -> Recording:
-    """Return Imu messages as samples; parameters as `of_sensor`."""
+    """Return Imu messages as samples; parameters as in `of_sensor`."""
     messages = bag.joined(raws, topic, before)
     which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
     columns = samples_of(messages)
@@ -315,34 +317,34 @@ def _with_temperature(samples: Recording, track: Track | None) -> Recording:
 
 
 def together(parts: Sequence[Recording]) -> Recording:
-    """Return recordings, at least one, behind each other."""
+    """Concatenate one or more recordings."""
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
     return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
 
 
 def _check_finite(bag: Bag, reading: Floats, before: int) -> None:
-    """Refuse messages whose acceleration is not a number."""
+    """Check that the accelerations are finite."""
     if not np.isfinite(reading).all():
         first = int(np.argmin(np.isfinite(reading).all(axis=1)))
-        raise InputError(f'{bag.path}: Imu message {before + first + 1} holds NaN or infinity',
-                         'fix the driver, or record again')
+        raise InputError(f'{bag.path}: Imu message {before + first + 1} contains NaN or infinity, '
+                         'expected finite numbers', 'fix the driver, or record again')
 
 
 @dataclass(frozen=True)
 class Track:
-    """Temperatures [°C] at times [s], which rise; NaN if it is empty."""
+    """Temperatures [°C] at increasing times [s]."""
 
     time: Floats
     temperature: Floats
 
     def at(self, time: Floats) -> Floats:
-        """Return the temperature at these times, (n,)."""
+        """Return the (n,) interpolated temperature; NaN if the track is empty."""
         if not len(self.time):
             return np.full(len(time), np.nan)
         return np.interp(time, self.time, self.temperature)
 
     def plus(self, messages: Messages) -> Track:
-        """Return it with Temperature messages added."""
+        """Return the track with Temperature messages added."""
         temperature = doubles_at(messages, slice(0, 1))[:, 0]
         known = np.isfinite(temperature)
         time = np.concatenate([self.time, stamps_of(messages)[known]])
@@ -350,11 +352,11 @@ class Track:
         return Track(time[order], np.concatenate([self.temperature, temperature[known]])[order])
 
     def covers(self, samples: Recording) -> bool:
-        """Return whether it reaches to the end of these samples."""
+        """Return whether the track reaches the end of these samples."""
         return bool(len(self.time) and samples['time'][-1] <= self.time[-1])
 
     def since(self, time: float) -> Track:
-        """Return it without what is long before a time."""
+        """Return the track without temperatures long before a time."""
         first = max(0, int(np.searchsorted(self.time, time)) - _AROUND)
         return Track(self.time[first:], self.temperature[first:])
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Correction of a bag: a copy with the Imu topic corrected and all other messages byte for byte.
+Correction of a bag: a copy with a corrected Imu topic; all other messages are unchanged.
 
-The copy is written by `rosbags`, with the storage of the original. What it does not keep is said
-in the documentation of the files (attachments of MCAP, the division into several files, …).
+`rosbags` writes the copy, with the storage of the original. The copy does not contain everything
+(not the attachments of MCAP, and not the division into several files); see docs/files.md.
 
 """
 
@@ -26,8 +26,7 @@ from .bag import (
     TEMPERATURE,
     temperature_track,
 )
-from .calibration_yaml import check_sensor
-from ..calibrate import Calibration
+from ..calibrate import Calibration, check_sensor
 from ..errors import InputError
 from ..messages.arrays import doubles_at, Messages, put_doubles, samples_of
 from ..messages.correction import corrected
@@ -37,10 +36,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 Progress = Callable[[int, int], object]
-"""Called with the number of messages done, and of all."""
+"""Function called with the number of corrected messages and the number of all messages."""
 
 _NO_HASH = 'RIHS01_' + 64 * '0'
-"""Hash of a type whose definition neither the bag nor Jazzy has."""
+"""Hash of a type whose definition is neither in the bag nor in Jazzy."""
 
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
@@ -53,36 +52,41 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     path : Path
         A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
     calibration : Calibration
-        In m/s².
+        The calibration, in m/s².
     out : Path
-        The copy; must not exist. A rosbag2 becomes a folder, or a file if `out` has the suffix
-        of its storage; a ROS 1 bag becomes a ROS 1 bag.
+        The copy; it must not exist. A copy of a rosbag2 is a folder, or a file if `out` has the
+        suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
     topic : str
-        Imu topic, for a bag with several.
+        Imu topic, for a bag with several Imu topics.
     progress : callable
-        Called after each block of messages.
+        Function that is called after each block of messages.
 
     Returns
     -------
     int
-        Imu messages corrected.
+        Number of corrected Imu messages.
 
     Raises
     ------
     InputError
-        If the bag is not whole, has no Imu or Imu messages of several sensors, or `out` exists.
+        If the bag is damaged, has no Imu messages or those of several sensors, or `out` exists.
     StoredCalibrationError
-        If the calibration is of another sensor.
+        If the calibration belongs to another sensor.
     OSError
-        If a file cannot be read or written; `out` then does not exist.
+        If a file cannot be read or written. `out` then does not exist.
 
     """
     if out.exists():
-        raise InputError(f'{out} exists', 'give a new name')
+        raise InputError(f'{out} exists, expected a new file', 'choose another name')
     if calibration.units.name != 'm/s2':
-        raise InputError(f'the calibration is for readings in {calibration.units.name}, Imu '
-                         'messages are in m/s2', 'fit it to poses in m/s2')
+        raise InputError(f'the calibration is for readings in {calibration.units.name}, expected '
+                         'm/s2 for Imu messages', 'fit it to poses in m/s2')
     with open_bag(path) as bag:
+        if (out.suffix == '.bag') is bag.ros2:
+            raise InputError(f'{path} is a ROS {2 if bag.ros2 else 1} bag, but {out} is not the '
+                             'name of one', 'choose a name that ends in .mcap or .db3, or the '
+                             'name of a folder' if bag.ros2 else
+                             'choose a name that ends in .bag')
         name = imu_topic(bag, topic)
         sensor = first_frame_id(bag, name)
         check_sensor(calibration, sensor)
@@ -92,7 +96,7 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
 
 @contextmanager
 def _new(out: Path) -> Iterator[Path]:
-    """Yield a folder beside the target to write into, and remove it at the end."""
+    """Yield a temporary folder next to the target, and remove it at the end."""
     folder = out.with_name(f'.{out.name}.partial')
     if folder.exists():
         shutil.rmtree(folder)
@@ -113,7 +117,7 @@ class _Correction:
         self.topic, self.done = topic, 0
 
     def __call__(self, raws: list[bytes]) -> Messages:
-        """Return messages corrected, in a new buffer."""
+        """Return corrected messages in a new buffer."""
         messages = self._bag.joined(raws, self.topic, self.done)
         of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
         context = samples_of(messages)
@@ -126,11 +130,11 @@ class _Correction:
 
 
 def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: Progress) -> int:
-    """Copy all messages, those of the Imu corrected."""
+    """Copy all messages, and correct those of the Imu topic."""
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
     count = bag.count(correction.topic)
     imu = {id(connection) for connection in bag.connections(correction.topic)}
-    writer = _writer(bag, target)
+    writer = _writer(bag, target, out.suffix)
     with writer:
         outputs = _added(bag, writer)
         for block in bag.blocks():
@@ -146,8 +150,8 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
     return correction.done
 
 
-def _writer(bag: Bag, target: Path) -> Any:
-    """Return a writer of the kind of the bag that is read."""
+def _writer(bag: Bag, target: Path, suffix: str) -> Any:
+    """Return a writer for the kind of bag that the suffix names, otherwise for the same kind."""
     if not bag.ros2:
         from rosbags.rosbag1 import Writer as Writer1
 
@@ -155,17 +159,19 @@ def _writer(bag: Bag, target: Path) -> Any:
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
 
-    mcap = bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))
+    mcap = suffix == '.mcap' or (suffix != '.db3' and (
+        bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))))
     writer = Writer2(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
                      else StoragePlugin.SQLITE3)
     mode = bag.reader.compression_mode if isinstance(bag.reader, Reader) else None
-    if mode:
+    # A compressed file has another suffix.
+    if mode and (mode == 'message' or suffix not in ('.mcap', '.db3')):
         writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     return writer
 
 
 def _added(bag: Bag, writer: Any) -> dict[int, Any]:
-    """Add the connections of a bag to a writer; return the new ones by the id of the old."""
+    """Add the connections of a bag to a writer; return the new ones by the id of the old ones."""
     made: dict[tuple[Any, ...], Any] = {}
     outputs = {}
     for each in bag.reader.connections:

@@ -4,10 +4,10 @@
 """
 Stored calibrations: readable, versioned YAML.
 
-`format_calibration` and `parse_calibration` convert text; only `write_calibration` and
-`read_calibration` touch the disk. What is read is checked value by value and passes the gate of
-every other calibration (`accel_calib.calibrate.gate`). The last line is a checksum of the text
-before it, which distinguishes a file that was edited by hand.
+`format_calibration` and `parse_calibration` convert text. Only `write_calibration` and
+`read_calibration` access the disk. The reader checks every value, and the calibration then passes
+the same gate as a fit (`accel_calib.calibrate.gate`). The last line of a file is a checksum of the
+text before it; it reveals a file that was edited by hand.
 
 """
 
@@ -24,7 +24,17 @@ import yaml
 
 from .atomic import write_atomically
 from .. import __version__
-from ..calibrate import Calibration, FRAMES, gated, in_g, METHODS, MODEL_NAMES, Quality, Rejected
+from ..calibrate import (
+    Calibration,
+    EDITED,
+    FRAMES,
+    gated,
+    in_g,
+    METHODS,
+    MODEL_NAMES,
+    Quality,
+    Rejected,
+)
 from ..effects import EFFECTS
 from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
 from ..estimate.fit import judge
@@ -32,7 +42,7 @@ from ..model import Model, parameter_names
 from ..table import COLUMNS, Floats, Poses
 from ..units import UNIT_NAMES, Units
 
-try:  # eight times as fast, if PyYAML was built with it
+try:  # eight times as fast, but not in every build of PyYAML
     from yaml import CSafeDumper as SafeDumper
     from yaml import CSafeLoader as SafeLoader
 except ImportError:
@@ -41,9 +51,7 @@ except ImportError:
 FORMAT = 'accel_calib calibration'
 _FIRST_LINE = f'format: {FORMAT}'
 VERSION = 2
-"""Version 1 had no stream, no checksum, and NaN for a covariance that nothing determined."""
-
-EDITED = 'the file was edited by hand since it was stored'
+"""Version 1 had no stream and no checksum, and NaN for an undetermined covariance."""
 
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
 _CHECKSUM = '\nchecksum: sha256 '
@@ -81,7 +89,7 @@ def _digest(text: str) -> str:
 
 
 class _Dumper(SafeDumper):
-    """The safe dumper without anchors: two equal lists are written out twice."""
+    """The safe dumper without anchors: equal lists are written in full."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -89,29 +97,29 @@ class _Dumper(SafeDumper):
 
 def parse_calibration(text: str, name: str) -> Calibration:
     """
-    Read the text of a stored calibration.
+    Return the calibration in the text of a file.
 
     Parameters
     ----------
     text : str
-        YAML.
+        Text in YAML.
     name : str
-        What to call it in messages.
+        Name of the file for error messages.
 
     Returns
     -------
     Calibration
-        With the warning `EDITED` if its checksum does not match.
+        The calibration, with the warning `EDITED` if the checksum does not match.
 
     Raises
     ------
     StoredCalibrationError
-        If it is damaged, newer than this package, or not one that a sensor can have.
+        If the text is damaged, is newer than this package, or has implausible values.
 
     """
     if not text.startswith(_FIRST_LINE):
-        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, whose first '
-                                     f'line is "{_FIRST_LINE}"', 'give a file that fit wrote')
+        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
+                                     f'first line "{_FIRST_LINE}"', 'use a file that fit wrote')
     try:
         content = yaml.load(text, Loader=SafeLoader)
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as err:
@@ -125,7 +133,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     try:
         calibration = gated(calibration)
     except RefusedFitError as err:
-        raise DamagedCalibrationError(f'{name} is not a calibration to use: {err.message}',
+        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
                                       err.advice) from err
     if content['version'] == 1:
         return calibration
@@ -138,24 +146,25 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 
 def _damaged(name: str, what: str) -> DamagedCalibrationError:
-    return DamagedCalibrationError(f'{name} is not a whole calibration ({" ".join(what.split())})',
-                                   'fit again, or use the file kept as .before')
+    return DamagedCalibrationError(f'{name} is damaged ({" ".join(what.split())}), expected a '
+                                   'whole calibration',
+                                   'fit again, or use the previous file (.before)')
 
 
 def _check_version(content: Any, name: str) -> None:
     """Refuse a calibration of a newer version."""
     if not isinstance(content, Mapping):
-        raise _damaged(name, 'it is not YAML with names')
+        raise _damaged(name, 'it is not a YAML mapping')
     version = content.get('version')
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise _damaged(name, f'its version is {version!r}')
     if version > VERSION:
-        raise StoredCalibrationError(f'{name} has version {version}, this package reads up to '
-                                     f'{VERSION}', 'update accel_calib, or fit again')
+        raise StoredCalibrationError(f'{name} has version {version}, expected {VERSION} or less',
+                                     'update accel_calib, or fit again')
 
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
-    """Return the record with the content of a file; ValueError if something is not as expected."""
+    """Return the record with the content of a file; raise ValueError for an unexpected value."""
     values = {str(name): np.array([_number(effect, part) for part in EFFECTS[name].values])
               for name, effect in _known_effects(content).items()}
     size = len(parameter_names(tuple(values)))
@@ -176,7 +185,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
 
 
 def _from_version_1(calibration: Calibration) -> Calibration:
-    """Return the calibration with a covariance where version 1 had NaN."""
+    """Return the calibration with a finite covariance if version 1 stored NaN."""
     if np.all(np.isfinite(calibration.covariance)) or not len(calibration.used_poses):
         return calibration
     fit = judge(Model(calibration.model.values), in_g(calibration.used_poses, calibration.units))
@@ -187,9 +196,9 @@ def _known_effects(content: Mapping[str, Any]) -> Mapping[str, Any]:
     effects = _mapping(content, 'effects')
     for name, effect in effects.items():
         if name not in EFFECTS:
-            raise ValueError(f'effect {name!r} is not known')
+            raise ValueError(f'effect {name!r} is not in the catalogue')
         if not isinstance(effect, Mapping):
-            raise ValueError(f'effect {name} is {effect!r}')
+            raise ValueError(f'effect {name} is {_short(effect)}, expected names with values')
     return effects
 
 
@@ -259,7 +268,7 @@ def _array(content: Mapping[str, Any], key: str, shape: tuple[int, ...], *, fini
     if array.shape != shape:
         raise ValueError(f'{key} has shape {array.shape}, expected {shape}')
     if finite and not np.all(np.isfinite(array)):
-        raise ValueError(f'{key} holds a number that is not finite')
+        raise ValueError(f'{key} contains a number that is not finite')
     return array
 
 
@@ -275,46 +284,30 @@ def read_calibration(path: Path) -> Calibration:
     Raises
     ------
     StoredCalibrationError
-        If it is damaged, newer than this package, or not one that a sensor can have.
+        If the file is damaged, is newer than this package, or has implausible values.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     try:
         text = path.read_text(encoding='utf-8')
     except UnicodeDecodeError as err:
-        raise StoredCalibrationError(f'{path} is not a text file', 'give a file that fit wrote'
-                                     ) from err
+        raise StoredCalibrationError(f'{path} is not a text file, expected a calibration (YAML)',
+                                     'use a file that fit wrote') from err
     return parse_calibration(text, str(path))
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """
-    Store a calibration; the previous one is kept as ``<name>.before``.
+    Write a calibration; the previous file is kept as ``<name>.before``.
 
     Raises
     ------
     RefusedFitError
-        If it is not one that a sensor can have.
+        If the calibration is not plausible.
     OSError
-        If it cannot be written; what was stored is then as it was.
+        If the file cannot be written. The stored file is then unchanged.
 
     """
     text = format_calibration(gated(calibration))
     write_atomically(path, lambda file: file.write(text), keep_before=True)
-
-
-def check_sensor(calibration: Calibration, sensor: str) -> None:
-    """
-    Check that a calibration is of this sensor; an empty name matches any.
-
-    Raises
-    ------
-    StoredCalibrationError
-        If it is of another.
-
-    """
-    if calibration.sensor and sensor and calibration.sensor != sensor:
-        raise StoredCalibrationError(f'the calibration is of sensor {calibration.sensor!r}, the '
-                                     f'readings come from {sensor!r}',
-                                     'give the calibration of this sensor, or fit it')

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recordings of any kind, CSV tables and bags: block by block, or whole."""
+"""Readers of recordings, from CSV tables and bags: block by block, or as a whole."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from ..units import UnitName
 @dataclass(frozen=True)
 class OpenRecording:
     """
-    An open recording, to be read block by block; made by `open_recording`.
+    An open recording that is read block by block; `open_recording` makes it.
 
     Parameters
     ----------
     blocks : iterator of Recording
-        The samples, in order. However long the recording is, a block takes bounded memory.
+        The samples, in order. The size of a block does not depend on that of the recording.
     samples : int
-        Number of samples, by the index of the file.
+        Number of samples, according to the index of the file.
     units : {'m/s2', 'g', 'native', ''}
-        Unit of the readings, m/s² for Imu messages; empty if the file does not say it.
+        Unit of the readings, m/s² for Imu messages; empty if the file does not state it.
     sensor : str
-        frame_id of the messages; empty if the file does not say it.
+        frame_id of the messages; empty if the file does not state it.
 
     """
 
@@ -50,17 +50,17 @@ def open_recording(path: Path, topic: str = '', sensor: str = '') -> Iterator[Op
     path : Path
         The file or folder.
     topic : str
-        Imu topic, for a bag with several.
+        Imu topic, for a bag with several Imu topics.
     sensor : str
         frame_id of the messages to read, for a topic with several sensors.
 
     Raises
     ------
     InputError
-        If it is not what its name says, holds no samples, or samples of several sensors; also
-        while it is read.
+        If the format does not match the file name, or the file contains no samples or samples of
+        several sensors; also while it is read.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     if not is_bag(path):
@@ -75,6 +75,6 @@ def open_recording(path: Path, topic: str = '', sensor: str = '') -> Iterator[Op
 
 
 def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
-    """Return a whole recording; takes and raises what `open_recording` does."""
+    """Return a whole recording; parameters and errors as in `open_recording`."""
     with open_recording(path, topic, sensor) as recording:
         return together(list(recording.blocks))

@@ -4,8 +4,8 @@
 """
 Pose tables and recordings as CSV: ``#`` comments, one header line, columns by name.
 
-The names are those of `accel_calib.table.COLUMNS`. Columns of other names are ignored. Of the
-comments ``# units: "m/s2"`` and ``# sensor: "imu_link"`` are read, values in JSON.
+The column names are those of `accel_calib.table.COLUMNS`; other columns are ignored. Two kinds of
+comments are read, with values in JSON: ``# units: "m/s2"`` and ``# sensor: "imu_link"``.
 
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import write_atomically
-from ..errors import InputError
+from ..errors import counted, InputError
 from ..table import check_values, COLUMNS, numbered, Poses, present, Recording, Table
 from ..units import UNIT_NAMES
 
@@ -36,9 +36,9 @@ def read_poses(path: Path) -> Poses:
     Raises
     ------
     InputError
-        If it is empty, lacks columns, or holds something that is not a finite number.
+        If the table is empty, lacks columns, or contains a value that is not a finite number.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     columns, about = _read(path, needed=('reading',))
@@ -53,9 +53,9 @@ def read_samples(path: Path) -> Recording:
     Raises
     ------
     InputError
-        If it is empty, lacks columns, or holds something that is not a finite number.
+        If the table is empty, lacks columns, or contains a value that is not a finite number.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     """
     columns, about = _read(path, needed=('time', 'reading'))
@@ -64,12 +64,12 @@ def read_samples(path: Path) -> Recording:
 
 def write_table(path: Path, table: Table) -> None:
     """
-    Write poses or samples; a reader finds the same columns, units and sensor.
+    Write poses or samples, with their columns, units and sensor.
 
     Raises
     ------
     OSError
-        If it cannot be written; an earlier file is then unchanged.
+        If the file cannot be written. An earlier file is then unchanged.
 
     """
     keys = [key for key, column in COLUMNS.items() if key in table and not column.made]
@@ -88,30 +88,32 @@ def write_table(path: Path, table: Table) -> None:
 
 
 def _as_text(values: NDArray[Any]) -> list[list[str]]:
-    """Return the columns of an array as text, with enough digits for any sensor."""
+    """Return the columns of an array as text, with enough digits for all sensors."""
     if values.dtype.kind in 'US':
         return [values.tolist()]
-    digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need them all
+    digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need all digits
     return [[format(value, digits) for value in column.tolist()]
             for column in np.atleast_2d(values.T)]
 
 
 def _read(path: Path, needed: Sequence[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Read a table into columns of `COLUMNS`, and its units and sensor."""
+    """Return the columns of a table under the keys of `COLUMNS`, and its units and sensor."""
     try:
         filled = list(filter(str.strip, path.read_text(encoding='utf-8').splitlines()))
     except UnicodeDecodeError as err:
-        raise InputError(f'{path} is not a text file', 'give a CSV table or a bag') from err
+        raise InputError(f'{path} is not a text file, expected a CSV table',
+                         'use a CSV table or a bag') from err
     about = _about(path, [line for line in filled if line[0] == '#'])
     lines = [line for line in filled if line[0] != '#']
     if not lines:
-        raise InputError(f'{path} is empty', f'expected a header line such as '
-                         f'{",".join(_names(needed))} and a row for each pose or sample')
+        raise InputError(f'{path} is empty, expected a header line such as '
+                         f'{",".join(_names(needed))} and one row for each pose or sample',
+                         'check that this is the intended file')
     header = [name.strip() for name in lines[0].split(',')]
     keys = _keys(path, header, needed)
     if len(lines) == 1:
-        raise InputError(f'{path} has a header line and no rows',
-                         'give one row for each pose or sample')
+        raise InputError(f'{path} has a header line but no rows, expected one row for each pose '
+                         'or sample', 'add the rows')
     columns: dict[str, NDArray[Any]] = {}
     numeric = [key for key in keys if key != 'label']
     names = _names(numeric)
@@ -126,7 +128,7 @@ def _read(path: Path, needed: Sequence[str]) -> tuple[dict[str, NDArray[Any]], d
 
 
 def _about(path: Path, comments: list[str]) -> dict[str, Any]:
-    """Return units and sensor, from the comments."""
+    """Return units and sensor from the comments."""
     about = {}
     for line in comments:
         name, colon, text = line[1:].partition(':')
@@ -134,9 +136,9 @@ def _about(path: Path, comments: list[str]) -> dict[str, Any]:
             try:
                 about[name.strip()] = json.loads(text)
             except ValueError:
-                continue  # a remark of the user
+                continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):
-        raise InputError(f'{path} says that its units are {about["units"]!r}, expected one of '
+        raise InputError(f'{path} has the units {about["units"]!r}, expected one of '
                          f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')
     return about
 
@@ -146,16 +148,17 @@ def _names(keys: Iterable[str]) -> list[str]:
 
 
 def _keys(path: Path, header: list[str], needed: Sequence[str]) -> list[str]:
-    """Return which columns there are; refuse one that is there twice, or in part."""
+    """Return the keys of the columns in a header; refuse duplicate and incomplete columns."""
     for name in header:
         if header.count(name) > 1 and name in _names(COLUMNS):
-            raise InputError(f'{path} has {header.count(name)} columns {name}', 'keep one')
+            raise InputError(f'{path} has {header.count(name)} columns {name}, expected one',
+                             'remove or rename the others')
     return present(header, needed, str(path))
 
 
 def _numbers(path: Path, rows: list[str], header: list[str],
              names: list[str]) -> NDArray[np.float64]:
-    """Read these columns of all rows."""
+    """Return the (n, k) numbers in the columns with these names."""
     which = [header.index(name) for name in names]
     try:
         values = np.loadtxt(rows, delimiter=',', usecols=which, ndmin=2, comments=None,
@@ -171,7 +174,7 @@ def _fault(path: Path, rows: list[str], header: list[str], names: list[str]) -> 
     """Return the error for the first cell that is not a finite number."""
     for number, cells in enumerate(csv.reader(rows), 1):
         if len(cells) < len(header):
-            return InputError(f'{path}: row {number} has {len(cells)} values, expected '
+            return InputError(f'{path}: row {number} has {counted(len(cells), "value")}, expected '
                               f'{len(header)}', 'complete the row or remove it')
         for name in names:
             text = cells[header.index(name)].strip()
@@ -182,4 +185,5 @@ def _fault(path: Path, rows: list[str], header: list[str], names: list[str]) -> 
             if not sound:
                 return InputError(f'{path}: row {number}, column {name} is {text!r}, expected a '
                                   'finite number', 'correct the row or remove it')
-    return InputError(f'{path} cannot be read as a table', 'check it for stray characters')
+    return InputError(f'{path} cannot be read, expected a CSV table',
+                      'check it for stray characters')

@@ -4,7 +4,7 @@
 """
 Serialized sensor_msgs/Imu messages, from bags and from topics.
 
-`layout` says what is where in a message. `arrays` reads many messages at once and `correction`
-corrects them; `rewriter` corrects one message after the other.
+`layout` defines the places of the fields in a message. `arrays` reads many messages at once, and
+`correction` corrects them. `rewriter` corrects single messages.
 
 """

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Many serialized messages as arrays: one buffer for all, and none is deserialized on its own.
+Many serialized messages as arrays, in one buffer and without deserializing each message.
 
-The messages of a bag may differ in the length of frame_id and in the byte order, so both are read
-from each message; see `accel_calib.messages.layout`. ROS 1 is always little endian, a CDR message
-if the second byte of its encapsulation is 1.
+The messages of a bag can differ in the length of frame_id and in the byte order. Both are
+therefore read from each message; see `accel_calib.messages.layout`. ROS 1 messages are always
+little endian. CDR messages are little endian if the second byte of the encapsulation is 1.
 
 """
 
@@ -39,22 +39,22 @@ _NANO = 1e-9
 @dataclass(frozen=True)
 class Messages:
     """
-    Serialized messages with a header and doubles, in one buffer; made by `joined`.
+    Serialized messages with a header and doubles, in one buffer; `joined` makes them.
 
     Parameters
     ----------
     data : (m,) array of bytes
         The buffer.
     start, stop : (n,) array
-        Where each message begins and ends.
+        Place of the beginning and of the end of each message.
     head : (n, 4) array of uint32
-        The first four words.
+        First four words of each message.
     begin : (n,) array
-        Place of the first double in the buffer.
+        Place of the first double of each message.
     swapped : (n,) array of bool
-        True if the message is big endian.
+        Whether the message is big endian.
     ros2 : bool
-        CDR, otherwise the serialization of ROS 1.
+        Whether the messages are CDR; otherwise they have the serialization of ROS 1.
 
     """
 
@@ -79,25 +79,25 @@ class Messages:
 def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2: bool = True,
            before: int = 0) -> Messages:
     """
-    Copy messages into one buffer, which can be written to.
+    Copy messages into one writable buffer.
 
     Parameters
     ----------
     raws : sequence of bytes
-        At least one message, of a type with a header and this number of doubles.
+        One message or more, of a type with a header and this number of doubles.
     doubles : int
         Number of doubles.
     name : str
-        Name of the topic, for errors.
+        Name of the topic, for error messages.
     ros2 : bool
-        CDR, otherwise the serialization of ROS 1.
+        Whether the messages are CDR; otherwise they have the serialization of ROS 1.
     before : int
-        Messages of the topic before these.
+        Number of earlier messages of the topic.
 
     Raises
     ------
     InputError
-        If a message is shorter or longer than its header says, or is not plain CDR.
+        If the length of a message does not match its header, or it is not plain CDR.
 
     """
     stop = np.cumsum(np.fromiter(map(len, raws), np.int64, len(raws)))
@@ -119,11 +119,12 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
 
 
 def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> None:
-    """Refuse messages that are not sound, and name the first."""
+    """Check that all messages are sound; the error names the first one that is not."""
     if not np.all(sound):
         first = int(np.argmin(sound))
-        raise InputError(f'{name}: message {before + first + 1}, of {size[first]} bytes, is not '
-                         'whole', 'remove it from the bag, or record again')
+        raise InputError(f'{name}: message {before + first + 1} of {size[first]} bytes is '
+                         'damaged, expected a whole message',
+                         'remove it from the bag, or record again')
 
 
 def stamps_of(messages: Messages) -> Floats:
@@ -134,7 +135,7 @@ def stamps_of(messages: Messages) -> Floats:
 
 
 def frame_ids(messages: Messages) -> list[str]:
-    """Return the frame_id of each message, or of all in a list of one."""
+    """Return the frame_id of each message; only one item if all are equal."""
     length = messages.head[:, 3].astype(np.int64)
     if np.all(length == length[0]):
         names = _rows_at(messages.data, messages.start + LETTERS_AT, int(length[0]))
@@ -149,7 +150,7 @@ def _text(name: bytes) -> str:
 
 
 def doubles_at(messages: Messages, which: slice) -> Floats:
-    """Return these of the doubles, (n, k)."""
+    """Return a slice of the doubles of each message, (n, k)."""
     width = 8 * (which.stop - which.start)
     values = _rows_at(messages.data, messages.begin + 8 * which.start, width).view('<f8')
     if np.any(messages.swapped):
@@ -158,7 +159,7 @@ def doubles_at(messages: Messages, which: slice) -> Floats:
 
 
 def put_doubles(messages: Messages, values: Floats) -> None:
-    """Write all doubles, (n, k), into the buffer of the messages."""
+    """Write all (n, k) doubles into the buffer of the messages."""
     stored = np.ascontiguousarray(values, '<f8')
     if np.any(messages.swapped):
         stored = np.where(messages.swapped[:, np.newaxis], stored.byteswap(), stored)
@@ -173,8 +174,8 @@ def samples_of(messages: Messages) -> dict[str, Floats]:
     Returns
     -------
     dict
-        ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s], the rate NaN if a
-        message has none.
+        ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s]. The rate is NaN for a
+        message without a rate.
 
     """
     rate = doubles_at(messages, ANGULAR_VELOCITY)
@@ -186,5 +187,5 @@ def samples_of(messages: Messages) -> dict[str, Floats]:
 
 
 def _rows_at(data: Bytes, place: Indices, width: int) -> Bytes:
-    """Return `width` bytes from each place on, (n, width)."""
+    """Return the (n, width) bytes that start at each place."""
     return sliding_window_view(data, width)[place]

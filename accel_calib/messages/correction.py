@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a calibration changes in sensor_msgs/Imu messages.
+Correction of sensor_msgs/Imu messages by a calibration.
 
-Stamp and orientation stay; the acceleration is corrected. If ΔR turns the frame, angular velocity
-and covariances turn with it. The covariance of the acceleration keeps its conventions (first
-element -1: no data; all zero: unknown); a known one is transformed by A = ΔRᵀ W⁻¹, and the
-uncertainty of the calibration is added.
+The acceleration is corrected; stamp and orientation do not change. If ΔR is a rotation of the
+frame, angular velocity and covariances are rotated, too. The conventions for the covariance of the
+acceleration are kept (first element -1: no data; all zero: unknown). A known covariance is
+transformed by A = ΔRᵀ W⁻¹, and the covariance of the calibration is added.
 
 """
 
@@ -30,16 +30,16 @@ from ..table import Floats
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None
               ) -> Floats:
     """
-    Correct the numbers of Imu messages.
+    Return the corrected doubles of Imu messages.
 
     Parameters
     ----------
     calibration : Calibration
-        In the unit of the messages.
+        The calibration, in the unit of the messages.
     doubles : (n, 37) array
-        One row per message, see `accel_calib.messages.layout`.
+        One row per message; see `accel_calib.messages.layout`.
     context : mapping of str to array, optional
-        What is known beside the messages, n rows each.
+        Columns that the effects need, n rows each.
 
     Returns
     -------

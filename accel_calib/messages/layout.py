@@ -4,11 +4,11 @@
 """
 The layout of serialized messages.
 
-A message with a header begins, both in CDR (ROS 2) and in the serialization of ROS 1, with four
-32-bit words: the encapsulation (CDR) or seq (ROS 1), the two of the stamp, and the length of
-frame_id, which follows. Then come the doubles: 37 of an Imu, 2 of a Temperature. CDR aligns them
-to 8 bytes, counted from behind the encapsulation, and its length of frame_id includes a NUL. ROS 1
-aligns nothing. Padding may hold anything.
+In both CDR (ROS 2) and the serialization of ROS 1, a message with a header starts with four 32-bit
+words: the encapsulation (CDR) or seq (ROS 1), two words of the stamp, and the length of frame_id.
+The letters of frame_id follow, and then the doubles: 37 for an Imu, 2 for a Temperature. CDR
+aligns the doubles to 8 bytes, counted from the end of the encapsulation, and its length of
+frame_id includes a NUL. ROS 1 has no alignment. Padding bytes can have any value.
 
 """
 
@@ -25,19 +25,19 @@ ANGULAR_VELOCITY_COVARIANCE = slice(16, 25)
 ACCELERATION = slice(25, 28)
 ACCELERATION_COVARIANCE = slice(28, 37)
 IMU_DOUBLES = 37
-"""Number of doubles of an Imu, and the places of its fields among them."""
+"""Number of doubles of an Imu; the slices above are the places of its fields."""
 
 LITTLE_ENDIAN = b'\x00\x01\x00\x00'
-"""Encapsulation of plain CDR in little endian, which all common middlewares send."""
+"""Encapsulation of plain little-endian CDR, which all common middlewares send."""
 
 STAMP_AT, NAME_AT, LETTERS_AT = 4, 12, 16
-"""Places of the stamp, of the length of frame_id, and of frame_id."""
+"""Places of the stamp, of the length of frame_id, and of the letters of frame_id."""
 
 THREE, NINE, STAMP = struct.Struct('<3d'), struct.Struct('<9d'), struct.Struct('<iI')
 
 
 def begin_of(name_length: Any, *, ros2: bool) -> Any:
-    """Return the place of the first double, for a length of frame_id or for an array of them."""
+    """Return the place of the first double for one length of frame_id, or an array of lengths."""
     end = LETTERS_AT + name_length
     return (end - STAMP_AT + 7) // 8 * 8 + STAMP_AT if ros2 else end
 
@@ -50,7 +50,7 @@ class Layout:
     Parameters
     ----------
     name : bytes
-        Length and letters of frame_id, as in the message.
+        Length and letters of frame_id, as in a message.
     begin : int
         Place of the first double.
     size : int
@@ -64,7 +64,7 @@ class Layout:
 
     @property
     def name_end(self) -> int:
-        """Place behind frame_id."""
+        """Place after the letters of frame_id."""
         return NAME_AT + len(self.name)
 
     @property
@@ -84,7 +84,7 @@ def layout_with(frame_id: str) -> Layout:
 
 
 def layout_of(data: bytes) -> Layout | None:
-    """Return the layout of a message; None if it is not a whole Imu in little-endian CDR."""
+    """Return the layout of a message, or None if it is not a whole Imu in little-endian CDR."""
     length = int.from_bytes(data[NAME_AT:LETTERS_AT], 'little')
     name = data[NAME_AT:LETTERS_AT + length]
     layout = _layout_named(name)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Correction of one serialized Imu after the other.
+Correction of single serialized Imu messages.
 
-The result is that of `accel_calib.messages.correction`, in floats (`accel_calib.one_reading`); a
-test compares the two. Covariances hardly ever change from message to message, so each is
-transformed once.
+The result is the same as that of `accel_calib.messages.correction`, but computed with Python
+floats (`accel_calib.one_reading`); a test compares both. Covariances rarely change from message to
+message, so each covariance is transformed only once.
 
 """
 
@@ -39,8 +39,8 @@ from ..one_reading import AtReading, OneReading, Triple
 from ..table import Floats
 
 LARGEST_G = 100.0
-"""Corrected forces beyond this are never published [g]; common accelerometers end at 16 to 40 g,
-shock sensors are no subject of a calibration by gravity."""
+"""Larger corrected forces are not published [g]. The range of common accelerometers is 16 to 40 g;
+shock sensors cannot be calibrated by gravity."""
 
 _FORCE, _MOTION, _ALL = (struct.Struct(each) for each in ('<12d', '<3d72s3d', '<3d72s12d'))
 _ABSENT = struct.pack('<d', -1.0)
@@ -55,20 +55,20 @@ class Rewriter:
     Parameters
     ----------
     layout : Layout
-        Of the messages.
+        Layout of the messages.
     calibration : Calibration
-        In the unit of the readings.
+        The calibration, in the unit of the readings.
     scale : float
-        m/s² in one unit of its corrected force.
+        m/s² per unit of the corrected force.
     gravity : float
         Local gravity [m/s²].
     frame_id : str
-        New frame_id; empty: keep it.
+        New frame_id; empty: keep the frame_id.
 
     Attributes
     ----------
     layout : Layout
-        Of the corrected messages.
+        Layout of the corrected messages.
 
     """
 
@@ -98,24 +98,24 @@ class Rewriter:
 
     def __call__(self, data: bytes, temperature: float) -> bytes | None:
         """
-        Return a corrected message.
+        Return the corrected message.
 
         Parameters
         ----------
         data : bytes
-            A message of the layout.
+            A message with the layout.
         temperature : float
-            The last one [°C]; NaN: none came.
+            Last temperature [°C]; NaN if there is none.
 
         Returns
         -------
         bytes or None
-            Of the layout ``self.layout``; None if the reading is not finite.
+            The message with the layout ``self.layout``; None if the reading is not finite.
 
         Raises
         ------
         InputError
-            If the model needs context that is missing, or the corrected force is not plausible.
+            If context is missing, or the corrected force is not plausible.
 
         """
         p, q, r, spread, x, y, z = _MOTION.unpack_from(data, self._rate)
@@ -147,13 +147,13 @@ class Rewriter:
                                  *at.with_spread(force, self._own))
 
     def _front(self, data: bytes, end: int) -> bytes:
-        """Return the message up to a place, renamed if that is asked for."""
+        """Return the message up to a place, with the new frame_id if there is one."""
         if not self._name:
             return data[:end]
         return LITTLE_ENDIAN + data[STAMP_AT:NAME_AT] + self._name + data[self._given.begin:end]
 
     def _at_context(self, data: bytes, temperature: float) -> AtReading:
-        """Return the calibration at the context of a message, and keep it for the next."""
+        """Return the calibration at the context of a message, and cache it."""
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
         rate: Triple = THREE.unpack_from(data, self._rate)
         absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
@@ -179,12 +179,12 @@ class Rewriter:
 
 def _implausible(force: Triple) -> InputError:
     words = ', '.join(f'{part:.3g}' for part in force)
-    return InputError(f'a corrected acceleration is ({words}) m/s², expected less than '
+    return InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
                       f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
 
 
 def _transformed(matrix: Floats, covariance: bytes) -> list[float] | None:
-    """Return A C Aᵀ of a covariance; None if it is absent or unknown."""
+    """Return A C Aᵀ of a covariance, or None if the covariance is absent or unknown."""
     numbers = np.frombuffer(covariance, '<f8')[np.newaxis]
     if not is_known(numbers)[0]:
         return None
@@ -193,6 +193,6 @@ def _transformed(matrix: Floats, covariance: bytes) -> list[float] | None:
 
 
 def motion_of(data: bytes, layout: Layout, gravity: Floats) -> bytes:
-    """Return the Vector3Stamped of a corrected message without gravity [m/s²]."""
+    """Return a serialized Vector3Stamped: the acceleration of a message minus gravity [m/s²]."""
     x, y, z = THREE.unpack_from(data, layout.place(ACCELERATION))
     return data[:layout.begin] + THREE.pack(x - gravity[0], y - gravity[1], z - gravity[2])

@@ -1,9 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rests of a calibrated sensor against its calibration: `drift`, decided by `change_detection`."""
+"""
+Drift of a calibrated sensor: every rest is compared with the calibration.
 
-from .change_detection import Change
+`drift` is the entry point; `change_detection` contains the test.
+
+"""
+
 from .drift import compared, Drift, monitor, rests_of, status
 
-__all__ = ['Change', 'Drift', 'compared', 'monitor', 'rests_of', 'status']
+__all__ = ['Drift', 'compared', 'monitor', 'rests_of', 'status']

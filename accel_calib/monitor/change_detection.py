@@ -2,20 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether a sensor has left its calibration for good: a likelihood ratio.
+Detection of a lasting change of a sensor since its calibration, by a likelihood ratio.
 
-The errors e = |force| - 1 of the last n rests are jointly normal with covariance S: the noise of
-each rest, and the calibration's own uncertainty, which rests in similar attitudes share. Each rest
-may have been knocked, with probability `_KNOCKED`, by some `_KNOCK` [g]: the likelihood is the sum
-over all 2ⁿ combinations of knocks. The alternative is a lasting change that began at the third
-last rest or before:
+The errors e = |force| - 1 of the last n rests are jointly normal with covariance S. S contains the
+noise of each rest, and the uncertainty of the calibration, which is common to rests in similar
+orientations. Each rest can be disturbed by a knock, with probability `_KNOCKED` and a size of
+about `_KNOCK` [g]. The likelihood is therefore the sum over all 2ⁿ combinations of knocks. The
+alternative is a lasting change that began at the third last rest or earlier:
 
-    offset   e changes by up · b    b normal, of each size of `_SIZES`, in three directions
-    gain     e changes by b         the same in every attitude
+    offset   e changes by up · b    b normal with a standard deviation of `_SIZES`, three axes
+    gain     e changes by b         the same in every orientation
 
-averaged over instants, kinds and sizes; it may continue to change by `_WANDER` of its size, as
-with temperature. By Markov's inequality such a ratio exceeds `SURE` by chance in at most one of
-that many rests. One or two knocks are no lasting change; three rests that agree are.
+The likelihood of the alternative is averaged over instants, kinds and sizes. The change may
+continue to vary by `_WANDER` of its size, for example with temperature. By Markov's inequality the
+ratio exceeds `SURE` by chance in at most one of `SURE` rests. One or two knocks are not a lasting
+change; three rests that agree are.
 
 """
 
@@ -30,22 +31,22 @@ import numpy as np
 from ..table import Floats
 
 MEMORY = 6
-"""Rests that are used."""
+"""Number of rests that are used."""
 
 _FEWEST = 3
-"""Rests that a change must have lasted."""
+"""Smallest number of rests that a lasting change has."""
 
 SURE = float(np.exp(13.0))
-"""Ratio of the likelihoods from which a change is believed: one in 440,000."""
+"""Likelihood ratio above which a change is reported: 440,000."""
 
-_KNOCKED, _KNOCK = 0.003, 0.05
-_SIZES = (0.005, 0.05)   # [g]
-_WANDER = 0.1            # part of a change by which it continues from rest to rest
-_CLEAR = 20.0              # ratio from which one kind is distinguished from the other
+_KNOCKED, _KNOCK = 0.003, 0.05   # probability and size [g] of a knock
+_SIZES = (0.005, 0.05)           # sizes of a change [g]
+_WANDER = 0.1                    # variation of a change from rest to rest, relative to its size
+_CLEAR = 20.0                    # likelihood ratio above which one kind is clearly distinguished
 
 KINDS: dict[str, Callable[[Floats], Floats]] = {
     'offset': lambda up: up, 'gain': lambda up: np.ones((len(up), 1))}
-"""For each kind of change the (n, q) array by which the rests show it."""
+"""Kinds of change: (n, 3) up -> (n, q) derivative of the errors by the change."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +57,17 @@ class Change:
     Parameters
     ----------
     rests : int
-        Number of last rests that show it.
+        Number of rests since the change.
     kind : str
-        Of `KINDS`, the likelier one.
+        More likely kind of `KINDS`.
     clear : bool
-        Whether the attitudes distinguish this kind from the other.
+        Whether the orientations of the rests clearly distinguish this kind from the other.
     shift : (q,) array
         The change [g].
     covariance : (q, q) array
-        Of the shift [g²].
+        Covariance of the shift [g²].
     error : float
-        Its effect on |a| at these rests, RMS, with a sign if all have the same [g].
+        Effect on |a| at these rests, RMS [g]; signed if the sign is the same for all.
 
     """
 
@@ -80,29 +81,29 @@ class Change:
 
 def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
     """
-    Return a lasting change, if there is one.
+    Return a lasting change, or None.
 
     Parameters
     ----------
     error : (n,) array
-        |force| - 1 of the last rests, the latest last [g].
+        |force| - 1 of the last rests, in order of time [g].
     covariance : (n, n) array
-        Of these errors, if nothing changed [g²].
+        Covariance of these errors without a change [g²].
     up : (n, 3) array
-        Where up is in each rest, unit vectors in the sensor axes.
+        Direction of up in each rest, unit vectors in the sensor axes.
 
     Returns
     -------
     Change or None
-        None: the stated uncertainty explains the errors, or knocks do.
+        None if the stated uncertainty or knocks explain the errors.
 
     """
     most = 0.5 * float(error @ np.linalg.solve(covariance, error))
     if len(error) < _FEWEST or most - len(error) * np.log1p(-_KNOCKED) < np.log(SURE):
         return None   # the ratio cannot be larger
     found = {(kind, rests): np.logaddexp.reduce([
-        _likelihood(error, covariance + _moved(_shown(kind, rests, up), size)) for size in _SIZES])
-        for kind in KINDS for rests in range(_FEWEST, len(error) + 1)}
+        _likelihood(error, covariance + _added(_derivative(kind, rests, up), size))
+        for size in _SIZES]) for kind in KINDS for rests in range(_FEWEST, len(error) + 1)}
     same = _likelihood(error, covariance) + np.log(len(found) * len(_SIZES))
     if np.logaddexp.reduce(list(found.values())) - same < np.log(SURE):
         return None
@@ -113,33 +114,33 @@ def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
 
 
 def is_over(known: Change, error: Floats, covariance: Floats, up: Floats) -> bool:
-    """Return whether the last rests are clearly without this change; arguments as `change`."""
-    shown = KINDS[known.kind](up)
-    stays = _likelihood(error - shown @ known.shift,
-                        covariance + shown @ known.covariance @ shown.T)
+    """Return whether this change is clearly absent now; parameters as in `change`."""
+    slope = KINDS[known.kind](up)
+    stays = _likelihood(error - slope @ known.shift,
+                        covariance + slope @ known.covariance @ slope.T)
     return bool(_likelihood(error, covariance) - stays > np.log(SURE))
 
 
-def _shown(kind: str, rests: int, up: Floats) -> Floats:
-    """Return how the rests show a change that came before the last `rests` of them."""
-    shown = KINDS[kind](up).copy()
-    shown[:len(up) - rests] = 0.0
-    return shown
+def _derivative(kind: str, rests: int, up: Floats) -> Floats:
+    """Return the (n, q) derivative of the errors by a change before the last `rests` rests."""
+    slope = KINDS[kind](up).copy()
+    slope[:len(up) - rests] = 0.0
+    return slope
 
 
-def _moved(shown: Floats, size: float) -> Floats:
-    """Return the (n, n) covariance that a change of this size adds to the errors."""
-    common: Floats = size ** 2 * shown @ shown.T
+def _added(slope: Floats, size: float) -> Floats:
+    """Return the (n, n) covariance of the errors that a change of this size causes."""
+    common: Floats = size ** 2 * slope @ slope.T
     return common + _WANDER ** 2 * np.diag(np.diag(common))
 
 
 def _likelihood(error: Floats, covariance: Floats) -> float:
-    """Return the logarithm of the likelihood, with any of the rests knocked."""
+    """Return the logarithm of the likelihood, summed over all combinations of knocks."""
     return float(np.logaddexp.reduce(_knocks(error, covariance)[1]))
 
 
 def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """Return the (k, n) combinations of knocks, as ones and zeros, and log likelihoods (k,)."""
+    """Return the (k, n) combinations of knocks as 0 and 1, and their (k,) log likelihoods."""
     knocked = np.array(list(product((0.0, 1.0), repeat=len(error))))
     spread = covariance + _KNOCK ** 2 * knocked[:, :, np.newaxis] * np.eye(len(error))
     count = knocked.sum(axis=1)
@@ -151,15 +152,15 @@ def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
 
 def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Floats,
                up: Floats) -> Change:
-    """Estimate a change, without the rests that were most likely knocked."""
-    shown = _shown(kind, rests, up)
+    """Return the estimate of a change, without the rests that were most likely knocked."""
+    slope = _derivative(kind, rests, up)
     prior = max(_SIZES) ** 2
-    knocked, likely = _knocks(error, covariance + _moved(shown, max(_SIZES)))
+    knocked, likely = _knocks(error, covariance + _added(slope, max(_SIZES)))
     spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
-    told = shown.T @ np.linalg.inv(spread)
-    found = np.linalg.inv(told @ shown + np.eye(shown.shape[1]) / prior)
-    shift = found @ told @ error
-    moved = shown[len(up) - rests:] @ shift
+    weighted = slope.T @ np.linalg.inv(spread)
+    found = np.linalg.inv(weighted @ slope + np.eye(slope.shape[1]) / prior)
+    shift = found @ weighted @ error
+    moved = slope[len(up) - rests:] @ shift
     sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
     return Change(rests, kind, clear, shift, found,
                   sign * float(np.sqrt(np.mean(moved ** 2))))

@@ -4,12 +4,13 @@
 """
 Drift of a calibrated sensor: every rest is compared with 1 g and the stated uncertainty.
 
-A rest has the error e = |force| - 1. Its variance is the sum of the noise of its mean along the
-force, the uncertainty of the calibration (shared by rests in similar attitudes), and the part by
-which the poses of the calibration repeat worse than their samples. Few poses determine the last,
-so the scatter of the rests is learned too: the factor by which they repeat worse than stated
-follows the median of the differences of successive rests, which a shift does not change.
-`change_detection` decides from the last rests; the state is one record of bounded size.
+A rest has the error e = |force| - 1. The variance of e has three parts: the noise of the mean
+along the force, the uncertainty of the calibration (common to rests in similar orientations), and
+the part by which the poses of the calibration repeat worse than the noise of their samples
+predicts. The last part is badly known from few poses. A factor on the stated scatter is therefore
+estimated from the rests. It follows the median of the differences of successive rests, which a
+lasting change does not affect. `change_detection` tests the last rests. The state is one record of
+bounded size.
 
 """
 
@@ -22,33 +23,34 @@ import numpy as np
 from .change_detection import Change, change, is_over, MEMORY
 from ..calibrate import Calibration
 from ..effects import Context
+from ..errors import counted
 from ..model import length_rows, sensor_force
 from ..table import Floats
 from ..units import MG
 
-_LEAST_NOISE = 2e-5   # [g] smallest noise of a rest
-_LEARN = 0.02         # relative step of the scatter per rest; larger at first
-_MEDIAN = 0.6745      # of the absolute value, standard normal
-_WARMER = 2.0         # [°C] change of temperature that counts
+_LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
+_LEARN = 0.02         # relative step of the scatter per rest; larger in the beginning
+_MEDIAN = 0.6745      # median of the absolute value of a standard normal variable
+_WARMER = 2.0         # temperatures outside of the range by more cause an advice [°C]
 
 
 @dataclass(frozen=True)
 class Rest:
     """
-    One rest.
+    One rest of the sensor.
 
     Parameters
     ----------
     error : float
         |force| - 1 [g].
     variance : float
-        Of its noise [g²].
+        Variance of the error from the noise of the mean [g²].
     slope : (p,) array
         Derivative of the error by the values of the model.
     up : (3,) array
         Direction of up, unit vector in the sensor axes.
     temperature : float
-        [°C]; NaN if it is not known.
+        Temperature [°C]; NaN if not known.
 
     """
 
@@ -62,26 +64,26 @@ class Rest:
 @dataclass(frozen=True)
 class Drift:
     """
-    The rests since a calibration.
+    The state of the monitor: the rests since a calibration.
 
     Parameters
     ----------
     covariance : (p, p) array
-        Of the calibration [g²].
+        Covariance of the calibration [g²].
     repeats : float
-        Variance by which its poses repeat worse than their samples say [g²].
+        Variance of the poses of the calibration beyond the noise of their samples [g²].
     temperatures : tuple of float
-        Lowest and highest at which it was made [°C]; empty if that is not known.
+        Lowest and highest temperature of these poses [°C]; empty if not known.
     rests : tuple of Rest
-        The last ones.
+        The last rests.
     count : int
-        Rests so far.
+        Number of rests so far.
     scatter : float
-        Factor by which the rests scatter more than stated.
+        Factor on the stated scatter of the rests.
     change : Change or None
-        None: the sensor is as calibrated.
+        The lasting change; None if the sensor is unchanged.
     since : int
-        Number of the first rest that showed the change, from 1; 0 without one.
+        Number of the first rest with the change, 1-based; 0 without a change.
 
     """
 
@@ -101,33 +103,33 @@ class Drift:
 
     @property
     def error(self) -> float:
-        """Median of | |a| - 1 | over the last rests [g]; NaN without any."""
+        """Median of | |a| - 1 | over the last rests [g]; NaN without rests."""
         return float(np.median([abs(rest.error) for rest in self.rests])) if self.rests else np.nan
 
     @property
     def lasted(self) -> int:
-        """Rests since the change began; 0 without one."""
+        """Return the number of rests since the change; 0 without a change."""
         return self.count - self.since + 1 if self.since else 0
 
     @property
     def temperature(self) -> float:
-        """Temperature of the last rest [°C]; NaN if it is not known."""
+        """Temperature of the last rest [°C]; NaN if not known."""
         return self.rests[-1].temperature if self.rests else np.nan
 
 
 def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
              ) -> list[Rest]:
     """
-    Return rests as errors from 1 g.
+    Return rests with their errors from 1 g.
 
     Parameters
     ----------
     calibration : Calibration
         The calibration in use.
     reading, noise : (n, 3) array
-        Mean readings and the noise of these means, in the unit of the readings.
+        Mean readings and noise of these means, in the unit of the readings.
     context : mapping of str to array
-        What the effects need, n rows.
+        Columns that the effects need, n rows.
 
     """
     model, units = calibration.model, calibration.units
@@ -142,7 +144,7 @@ def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: 
 
 
 def monitor(calibration: Calibration) -> Drift:
-    """Return the state of a sensor that has just been calibrated."""
+    """Return the initial state of the monitor after a calibration."""
     poses = calibration.poses
     temperatures: tuple[float, ...] = ()
     if 'temperature' in poses and len(poses):
@@ -152,7 +154,7 @@ def monitor(calibration: Calibration) -> Drift:
 
 
 def _repeats(calibration: Calibration) -> float:
-    """Return the variance of pose means that their samples do not account for [g²]."""
+    """Return the variance of pose means beyond the noise of their samples [g²]."""
     quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
     spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
     excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
@@ -161,16 +163,16 @@ def _repeats(calibration: Calibration) -> float:
 
 def compared(before: Drift, rest: Rest, least: float) -> Drift:
     """
-    Return the state after one more rest.
+    Return the state of the monitor after one more rest.
 
     Parameters
     ----------
     before : Drift
-        The rests so far.
+        The previous state.
     rest : Rest
-        The next one.
+        The next rest.
     least : float
-        Smaller changes are ignored [g].
+        Smallest change to report [g].
 
     """
     rests = (*before.rests, rest)
@@ -191,7 +193,7 @@ def compared(before: Drift, rest: Rest, least: float) -> Drift:
 
 
 def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
-    """Return the (n, n) covariance of the errors of these rests, if nothing changed [g²]."""
+    """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
     noise = np.array([rest.variance + state.repeats for rest in rests])
     covariance: Floats = slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise)
@@ -199,7 +201,7 @@ def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
 
 
 def _scatter(state: Drift, rests: tuple[Rest, ...]) -> float:
-    """Return the scatter after the difference of two rests that are older than a change."""
+    """Return the updated scatter, from two rests that are older than a possible change."""
     covariance = _covariance(state, rests)
     stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
     step = max(_LEARN, 2.0 / (state.count + 4.0))
@@ -208,21 +210,22 @@ def _scatter(state: Drift, rests: tuple[Rest, ...]) -> float:
 
 
 def status(state: Drift) -> str:
-    """Return the state of the sensor in a line, and what to do."""
+    """Return the state of the sensor and advice as one line."""
     if not state.count:
-        return 'no rest since the calibration yet'
+        return 'no rest since the calibration'
     if not np.isfinite(state.stated):
-        return 'the calibration states no uncertainty to compare rests with'
+        return 'the calibration has no uncertainty, so rests cannot be compared with it'
     if state.change is None:
-        return (f'{state.error * MG:.2f} mg off 1 g at rest since the calibration, '
-                f'{state.stated * MG:.2f} mg stated')
+        return (f'|a| at rest differs by {state.error * MG:.2f} mg from 1 g, stated uncertainty '
+                f'{state.stated * MG:.2f} mg')
     found = state.change
-    return (f'|a| at rest is {found.error * MG:+.2f} mg off 1 g, for {state.lasted} rests, '
-            f'where {state.stated * MG:.2f} mg is stated{_kind(found)}: {_advice(state)}')
+    return (f'|a| at rest has differed by {found.error * MG:+.2f} mg from 1 g for '
+            f'{counted(state.lasted, "rest")}, stated uncertainty {state.stated * MG:.2f} mg'
+            f'{_kind(found)}: {_advice(state)}')
 
 
 def _kind(found: Change) -> str:
-    """Return what changed, if the attitudes of the rests show it."""
+    """Return a text about what changed, if the orientations of the rests show it."""
     if not found.clear:
         return ''
     if found.kind == 'gain':
@@ -232,11 +235,12 @@ def _kind(found: Change) -> str:
 
 
 def _advice(state: Drift) -> str:
-    """Return what to do about a change."""
+    """Return the advice for a change."""
     if state.temperatures:
         low, high = state.temperatures
         now = state.temperature
         if now < low - _WARMER or now > high + _WARMER:
-            return (f'the temperature is {now:.1f} °C, it was {low:.1f} to {high:.1f} °C when '
-                    'calibrated: capture poses at this temperature and call ~/refine')
+            return (f'the temperature is {now:.1f} °C, but the sensor was calibrated at '
+                    f'{low:.1f} to {high:.1f} °C: capture poses at this temperature and call '
+                    '~/refine')
     return 'call ~/reset, capture poses and call ~/fit'

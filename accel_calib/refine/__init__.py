@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Poses and calibration to gap, named effect, larger model.
+From poses and a calibration to the gap, the named effect and the larger model.
 
-`base` is the model to begin with, `stored` a calibration that is compared as it is. `state` is a
-model fitted to the poses kept, `candidates` are the effects of the catalogue as columns beside it
-(`output` and `wander` those that are none), `search` adds, pairs and takes back, `refinement` is
-the way in and makes the record; `where`, `untestable` and `advice` put it into words.
+`refinement` is the entry point and makes the record (`records`). `base` is the model to start
+from; `stored` prepares a stored calibration as the base. `search` adds and removes effects.
+`state` is a model fitted to the poses kept, and `candidates` ranks the effects of the catalogue as
+columns of the equations. `output` and `wander` are effects that are not such columns. `where`,
+`untestable` and `advice` describe the result.
 
 """
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What to do after a refinement: which poses or conditions would show more."""
+"""Advice after a refinement: the poses or conditions that would show more."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..effects import CHANGES, effect_named, TO_SEPARATE
+from ..errors import counted
 from ..model import parameter_names
 
 if TYPE_CHECKING:
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
     from .state import State
 
 _FAR = 10.0
-"""Sizes beyond this many times the typical one are worth a remark."""
+"""Ratio to the typical size above which there is a remark."""
 
 _FEW = 10
-"""Degrees of freedom below which most effects cannot show."""
+"""Degrees of freedom below which most effects cannot be detected."""
 
 _OTHER_SENSOR = 'this is probably another sensor'
 
@@ -29,20 +30,20 @@ _OTHER_SENSOR = 'this is probably another sensor'
 def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
                untestable: tuple[tuple[str, str], ...], left_out: int) -> tuple[str, ...]:
     """
-    Return what to do.
+    Return advice for the user, one line each.
 
     Parameters
     ----------
     verdict : str
-        Of the refinement.
+        Verdict of the refinement.
     found : Found
         The result of the search.
     steps : tuple of Step
-        What was added.
+        The added effects.
     untestable : tuple of (str, str)
-        Effects that cannot be seen, and what they need.
+        Effects that the data cannot show, and the data to record for them.
     left_out : int
-        Poses that were left out.
+        Number of poses that were left out.
 
     """
     lines = _other_sensor(found)
@@ -50,33 +51,34 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
     lines += [line for step in steps for line in _remarks(step)]
     if left_out:
         poses = '1 pose was' if left_out == 1 else f'{left_out} poses were'
-        lines.append(f'{poses} disturbed; take {"it" if left_out == 1 else "them"} again')
+        lines.append(f'{poses} left out; take {"it" if left_out == 1 else "them"} again')
     if found.base.dof < _FEW:
-        lines.append(f'{len(found.base.poses_g)} poses leave {found.base.dof} numbers to find an '
-                     'effect with, and most effects cannot show: take 24 poses or more')
+        lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
+                     f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
+                     'most effects: take 24 poses or more')
     if verdict == 'unexplained':
-        nearest = f'; {", ".join(found.taken_back)} would explain a part alone' if (
+        nearest = f'; {", ".join(found.taken_back)} would explain only a part' if (
             found.taken_back) else ''
-        lines.append('a gap remains that no effect that these data can show explains'
-                     f'{nearest}: see what differs between the poses, and repeat some of them')
+        lines.append('a gap remains that no effect testable with these data explains'
+                     f'{nearest}: check what differs between the poses, and repeat some of them')
         columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
         if columns:
-            lines.append(f'record {"; ".join(columns)}: effects of these cannot be seen yet')
+            lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
     return tuple(lines)
 
 
 def _other_sensor(found: Found) -> list[str]:
-    """Return a line if the sensor has changed more than one sensor does."""
+    """Return a line if the changes are too large for one sensor."""
     for name, values in found.final.model.values.items():
         if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
             return [f'{_OTHER_SENSOR}: its {name.removesuffix("_change")} differs from the stored '
-                    f'one by {np.max(np.abs(values)):.2g} {CHANGES[name].unit}, more than one '
-                    'sensor changes; fit it from its own poses']
+                    f'one by {np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much '
+                    'for one sensor; fit a new calibration from its own poses']
     return []
 
 
 def change_words(name: str, state: State, date: str) -> str:
-    """Return how a value of a stored calibration has changed, with its uncertainty."""
+    """Return a text about the change of a value since a stored calibration, with uncertainty."""
     effect, model = effect_named(name), state.model
     which = [parameter_names(model.effects).index(f'{name}.{part}') for part in effect.parameters]
     deviation = float(np.sqrt(np.mean(np.diag(state.fit.covariance)[which])))
@@ -90,19 +92,19 @@ def change_words(name: str, state: State, date: str) -> str:
 
 
 def _separating(step: Step) -> str:
-    """Return what would separate an effect from its rivals."""
+    """Return advice on how to separate an effect from its rivals."""
     families = {effect_named(name).family for name in (step.effect, *step.rivals)}
     family = families.pop() if len(families) == 1 else ''
-    return (f'{step.effect} and {", ".join(step.rivals)} look alike here: '
+    return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
             f'{TO_SEPARATE[family]}')
 
 
 def _remarks(step: Step) -> list[str]:
-    """Return remarks on values far outside what common parts have."""
+    """Return a remark on values that are far larger than in common parts."""
     effect = effect_named(step.effect)
     largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                   default=0.0)
     if largest <= _FAR * effect.typical:
         return []
-    return [f'{step.effect} is {largest:.2g} {effect.unit}, common parts have about '
-            f'{effect.typical:.2g}: make sure that it is the sensor and not the set-up']
+    return [f'{step.effect} is {largest:.2g} {effect.unit}, typical parts have about '
+            f'{effect.typical:.2g}: check that the sensor causes it, and not the setup']

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model that a refinement begins with."""
+"""The base: the model that a refinement starts from."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ BASES = ('auto', 'ideal', '4', '7', '10', '12')
 
 
 def base_of(poses: Poses, units: Units, name: str) -> Calibration:
-    """Return the calibration to begin with; raises as `fit_poses`."""
+    """Return the base as a calibration; errors as in `fit_poses`."""
     if name not in BASES:
-        raise ValueError(f'base {name!r} is none of {BASES}')
+        raise ValueError(f'base is {name!r}, expected one of {BASES}')
     if name == 'ideal':
         return ideal(poses, units)
     try:
@@ -33,7 +33,7 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
 
 
 def ideal(poses: Poses, units: Units) -> Calibration:
-    """Return the ideal sensor; native readings have no zero, so theirs is fitted first."""
+    """Return the ideal sensor; for native readings with a fitted offset and scale."""
     values: dict[str, Floats] = {}
     if units.name == 'native':
         mat_w, vec_v = fit_4(poses.reading)

@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Candidates: effects as columns of the equations, ranked and admitted.
+Candidates: effects as columns of the equations, with their ranking and significance.
 
-An effect with a shape is searched over the shapes of the catalogue. Candidates are ranked by the
-Bayesian information criterion with the scale of the noise free (Schwarz 1978): it falls by
+For an effect with a shape, the shapes of the catalogue are tried. Candidates are ranked by the
+Bayesian information criterion with a free scale of the noise (Schwarz 1978). The criterion
+decreases by
 
     N log(RSS / (RSS - gain)) - q log N - 2 log(shapes tried)
 
-when q parameters explain `gain` of the residual sum of squares. A name is admitted by an F test,
-its probability multiplied by the number of candidates and of shapes tried, and only if the poses
-held out agree. The scale is free because poses repeat worse than their samples say; measured noise
-decides whether a gap remains.
+if q parameters explain `gain` of the residual sum of squares. An effect is accepted by an F test,
+with the probability multiplied by the number of candidates and of shapes tried, and only if it
+also reduces the held-out residual. The scale is free because poses repeat worse than the noise of
+their samples predicts. The measured noise decides whether a gap remains.
 
 """
 
@@ -32,42 +33,42 @@ from ..model import Model
 from ..table import Floats
 
 LEVEL = 0.005
-"""Probability, over all candidates, of a name if nothing is hidden."""
+"""Probability that any effect is named if there is no hidden effect."""
 
 RIVAL = 9.0
-"""Effects whose criterion is within this of the named one's are its rivals: odds of 1 to 90."""
+"""Largest difference of the criterion between an effect and its rivals: odds of 1 to 90."""
 
 _AS_GOOD = 6.0
-"""Within this of the best criterion the effect with the fewest parameters is taken."""
+"""Within this difference from the best criterion, the effect with fewest parameters wins."""
 
 _SHAPES_AT_ONCE = 250
-"""Of more shapes than these, evenly spread ones are tried first, then those near the best."""
+"""If there are more shapes, evenly spread shapes are tried first, then those near the best."""
 
 _USUAL = 1.6
-"""Standard deviation of the logarithm of the size of an effect about its typical size."""
+"""Standard deviation of the logarithm of the size of an effect relative to its typical size."""
 
 
 @dataclass(frozen=True)
 class Candidate:
     """
-    An effect beside a model.
+    An effect that is a candidate for a model.
 
     Parameters
     ----------
     effect : str
-        Its name.
+        Name of the effect.
     shape : (s,) array
-        Its shape.
+        Shape of the effect.
     columns : (m, r) array
-        What it adds to the equations outside the model, orthonormal.
+        Columns of the effect outside of the model, orthonormal.
     size : float
-        Largest of its values if it is added, over the typical size.
+        Largest value of the effect if it is added, relative to the typical size.
     visible : float
-        Change of the residuals at most that it makes in its typical size, over their noise.
+        Largest change of the residuals by an effect of typical size, relative to the noise.
     searched : int
-        Values of its shape that were found from the same data.
+        Number of values of the shape that were estimated from the same data.
     tried : float
-        Number of independent shapes that were tried.
+        Number of independent shapes tried.
 
     """
 
@@ -81,11 +82,11 @@ class Candidate:
 
     @property
     def parameters(self) -> int:
-        """Return the number of parameters that it costs."""
+        """Return the number of parameters, including searched values of the shape."""
         return self.columns.shape[1] + self.searched
 
     def beside(self, fitted: Projected) -> Candidate:
-        """Return the candidate beside a model that has further columns."""
+        """Return the candidate for a model with further columns."""
         return replace(self, columns=fitted.outside(self.columns))
 
 
@@ -97,15 +98,15 @@ def candidates(equations: Equations, fitted: Projected, context: Context, names:
     Parameters
     ----------
     equations : Equations
-        Near the model.
+        Equations near the model.
     fitted : Projected
-        With the model projected out.
+        The equations with the model projected out.
     context : mapping of str to array
-        Of the poses.
+        Context of the poses.
     names : tuple of str
         Names of effects.
     whiten : callable, optional
-        Applied to their columns, as it was to the equations.
+        Function that was applied to the equations, and is applied to the columns, too.
 
     """
     found = {}
@@ -119,7 +120,7 @@ def candidates(equations: Equations, fitted: Projected, context: Context, names:
 
 
 class _Tried(NamedTuple):
-    """A shape: its place among all, what it explains, and its columns beside and with the model."""
+    """A shape: its index, its gain, and its columns outside of the model and as a whole."""
 
     place: int
     gain: float
@@ -129,7 +130,7 @@ class _Tried(NamedTuple):
 
 def _best_shape(name: str, equations: Equations, fitted: Projected, context: Context,
                 whiten: Callable[[Floats], Floats] | None) -> Candidate | None:
-    """Return the candidate in its best shape; None if the model spans it."""
+    """Return the candidate with its best shape, or None if the model spans it."""
     effect = effect_named(name)
     shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(context))
     if not shapes:
@@ -159,14 +160,14 @@ def _best_shape(name: str, equations: Equations, fitted: Projected, context: Con
 
 
 def fall(gain: float, rss: float, count: int, parameters: float, tried: float = 1.0) -> float:
-    """Return the decrease of the criterion from the gain of a candidate; more is better."""
+    """Return the decrease of the criterion for the gain of a candidate; larger is better."""
     left = max(rss - gain, 1e-12 * rss, 1e-300)
     return float(count * np.log(max(rss, 1e-300) / left) - parameters * np.log(count)
                  - 2.0 * np.log(tried))
 
 
 def gain_of(columns: Floats, fitted: Projected) -> float:
-    """Return how much of the residual sum of squares orthonormal columns explain."""
+    """Return the part of the residual sum of squares that orthonormal columns explain."""
     return float(np.sum((columns.T @ fitted.residual) ** 2))
 
 
@@ -177,7 +178,7 @@ def fall_of(candidate: Candidate, fitted: Projected, count: int) -> float:
 
 
 def unusual(candidate: Candidate) -> float:
-    """Return how unusual the size of a candidate is, on the scale of the criterion."""
+    """Return a penalty for an unusual size of a candidate, on the scale of the criterion."""
     return (max(np.log(max(candidate.size, 1e-300)), 0.0) / _USUAL) ** 2
 
 
@@ -185,8 +186,9 @@ def best_of(found: dict[str, Candidate], fitted: Projected, count: int) -> Candi
     """
     Return the candidate with the largest decrease of the criterion.
 
-    Among rivals, which these data cannot tell apart, the size decides: one of a usual size is
-    taken before one that no accelerometer has, and one with fewer parameters if it is as good.
+    Among rivals, which these data cannot distinguish, an effect of a typical size is preferred to
+    an implausible one. Among equally good effects, the one with the fewest parameters is
+    preferred.
 
     """
     if not found:
@@ -208,11 +210,11 @@ def probability(candidate: Candidate, fitted: Projected, dof: int, among: int) -
     Parameters
     ----------
     candidate : Candidate
-        The best of them.
+        The best candidate.
     fitted : Projected
-        The model without it.
+        The equations with the model projected out, without the candidate.
     dof : int
-        Independent equations less parameters of the model.
+        Number of independent equations minus number of parameters of the model.
     among : int
         Number of candidates.
 
@@ -230,18 +232,18 @@ def probability(candidate: Candidate, fitted: Projected, dof: int, among: int) -
 
 
 def agrees(candidate: Candidate, fitted: Projected) -> bool:
-    """Return whether poses held out are predicted better with the candidate than without."""
+    """Return whether the candidate reduces the held-out residual."""
     with_it = fitted.plus(candidate.columns).held_out
     return bool(with_it @ with_it < fitted.held_out @ fitted.held_out)
 
 
 _PAIR_BETTER = 12.0
-"""By how much the criterion of a pair must be below that of the best two single steps."""
+"""Smallest difference of the criterion between a pair and the best two single steps."""
 
 
 def best_pair(found: dict[str, Candidate], fitted: Projected, count: int
               ) -> tuple[Candidate, Candidate] | None:
-    """Return the pair with the largest decrease of the criterion, the better one first."""
+    """Return the pair with the largest decrease of the criterion; the better effect is first."""
     best, most = None, -np.inf
     for first, second in combinations(found.values(), 2):
         onto = np.linalg.qr(np.hstack([first.columns, second.columns]))[0]
@@ -258,7 +260,7 @@ def best_pair(found: dict[str, Candidate], fitted: Projected, count: int
 
 def pair_is_better(pair: tuple[Candidate, Candidate], single: Candidate, fitted: Projected,
                    count: int, found: dict[str, Candidate]) -> bool:
-    """Return whether both of a pair are significant, and better than single steps."""
+    """Return whether both effects of a pair are significant and better than single steps."""
     if single.effect in (pair[0].effect, pair[1].effect):
         return False
     for one, other in (pair, pair[::-1]):

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Linear least squares with columns that come and go.
+Linear least squares with columns that are added and removed.
 
-`Projected` holds the residual of the equations with the columns of the model projected out. The
-gain of further columns is then one small regression: the joint refit of all values, to first
-order, at the cost of the candidate alone.
+`Projected` contains the residual of the equations with the columns of the model projected out. The
+gain of further columns is then one small regression. It is, to first order, the joint fit of all
+values at the cost of the candidate alone.
 
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from ..table import Floats
 
 _SEEN = 0.02
-"""A column of which less than this part is outside the model cannot be distinguished from it."""
+"""Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Projected:
     onto : (m, r) array
         Orthonormal columns that span the model.
     residual : (m,) array
-        What the model leaves.
+        Residual of the model.
 
     """
 
@@ -45,7 +45,7 @@ class Projected:
         return float(self.residual @ self.residual)
 
     def outside(self, columns: Floats) -> Floats:
-        """Return the part of (m, q) columns that the model does not span, orthonormal (m, r)."""
+        """Return the part of (m, q) columns outside of the model, orthonormal (m, r)."""
         left = columns - self.onto @ (self.onto.T @ columns)
         sizes = np.linalg.norm(columns, axis=0)
         kept = np.linalg.norm(left, axis=0) > _SEEN * np.maximum(sizes, 1e-300)
@@ -56,22 +56,22 @@ class Projected:
         return left_vectors[:, scales > _SEEN * max(scales[0], _SEEN)]
 
     def plus(self, orthonormal: Floats) -> Projected:
-        """Return the equations with columns from `outside` projected out too."""
+        """Return the equations with columns from `outside` projected out, too."""
         return Projected(np.hstack([self.onto, orthonormal]),
                          self.residual - orthonormal @ (orthonormal.T @ self.residual))
 
     def with_columns(self, columns: Floats) -> Projected:
-        """Return the equations with (m, q) columns projected out too."""
+        """Return the equations with (m, q) columns projected out, too."""
         return self.plus(self.outside(columns))
 
     @property
     def held_out(self) -> Floats:
-        """(m,) array, each residual when its own equation is left out (PRESS)."""
+        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
         own = 1.0 - np.sum(self.onto ** 2, axis=1)
         return self.residual / np.maximum(own, 0.02)
 
 
 def projected(residual: Floats, columns: Floats) -> Projected:
-    """Project (m, q) columns out of the (m,) residual."""
+    """Return the (m,) residual with (m, q) columns projected out."""
     start = Projected(np.zeros((len(residual), 0)), residual)
     return start.with_columns(columns) if columns.shape[1] else start

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Effects of the output: readings that end at a limit, or lie on a grid.
+Effects of the output: readings clipped at a limit, or on a grid.
 
-Both act on the whole reading and are no columns beside the others; they show in the readings
-themselves. Where the samples of a pose hardly scatter on an axis at its extreme, the sensor clips:
-that pose, and the others so near the limit that some samples reach it, are left out of the fit.
-Where pose means are multiples of a step that is coarse against the noise, the step q adds a
-variance of q²/12 that no averaging removes.
+Both effects act on the whole reading, so they are not columns of the equations. They are detected
+in the readings themselves. If the samples of a pose hardly scatter on an axis with an extreme
+reading, the sensor clips. This pose, and the poses so near the limit that some samples reach it,
+are left out of the fit. If pose means are multiples of a step that is coarse compared with the
+noise, the step q adds a variance of q²/12 that averaging does not remove.
 
 """
 
@@ -25,43 +25,51 @@ from ..model import Model
 from ..table import Floats, Poses
 
 _LEAST_CLIPPED = 2
+"""Smallest number of poses at the limit."""
+
 _QUIET = 0.25
-"""Largest scatter of clipped samples over that of others."""
+"""Largest scatter of clipped samples, relative to the median scatter."""
 
 _REACH = 2.0
-"""Standard deviations from the limit within which samples reach it."""
+"""Distance from the limit, in standard deviations, within which samples reach it."""
 
 _LEAST_CONSTANT = 0.2
-"""Share of readings from which those whose samples do not scatter define the grid alone."""
+"""Share of readings without scatter above which only these readings define the grid."""
 
 _ON_GRID = 0.6
+"""Smallest share of readings on the grid."""
+
 _OFF_GRID = 0.05
-"""Distance from a multiple of the step, in steps, within which a reading is on the grid."""
+"""Largest distance of a reading on the grid from a multiple of the step, in steps."""
 
 _COARSEST_G = 0.1
+"""Coarsest step of a sensor [g]."""
+
 _LEAST_STEPS = 12
-"""Coarsest step of a sensor [g]; readings that differ, at least, to see a grid in them."""
+"""Smallest number of different readings in which a grid is detected."""
 
 _LEAST_KEPT = 6
+"""Smallest number of poses that are not at the limit."""
+
 _CLEARLY = 10.0
-"""Decrease of the criterion for poses at the limit to be left out."""
+"""Smallest decrease of the criterion if the poses at the limit are left out."""
 
 _LEAST_OF_GRID = 0.25
-"""Least variance of the residuals of readings on a grid, over that of the grid."""
+"""Smallest variance of the residuals of readings on a grid, relative to that of the grid."""
 
 _COARSE = 1.0
-"""Least q/√12 over the noise of a pose mean for a grid to matter."""
+"""Smallest ratio of q/√12 to the noise of a pose mean for a relevant grid."""
 
 
 @dataclass(frozen=True)
 class Clipped:
     """
-    Poses at the limit of the sensor.
+    The limit of the sensor, and the poses at the limit.
 
     Parameters
     ----------
     limit_g : float
-        Where readings end.
+        The limit of the readings [g].
     poses : (d,) array of int
         Indices of the poses.
 
@@ -72,7 +80,7 @@ class Clipped:
 
 
 def clipped(poses_g: Poses) -> Clipped | None:
-    """Return the poses that end at a limit, from the scatter of their samples, or None."""
+    """Return the poses at a limit, detected by the scatter of their samples, or None."""
     if 'std' not in poses_g:
         return None
     size, scatter = np.abs(poses_g.reading), float(np.median(poses_g['std']))
@@ -87,12 +95,12 @@ def clipped(poses_g: Poses) -> Clipped | None:
 
 def grid_step(poses_g: Poses) -> float | None:
     """
-    Find the step of a grid on which the pose means lie.
+    Return the step of a grid that contains the pose means.
 
     Returns
     -------
     float or None
-        The step [g]; None if there is none that is coarse against the noise.
+        The step [g]; None without a grid that is coarse compared with the noise.
 
     """
     values = _constant(poses_g)
@@ -111,7 +119,7 @@ def grid_step(poses_g: Poses) -> float | None:
 
 
 def _constant(poses_g: Poses) -> list[Floats]:
-    """Return the readings of each axis whose samples do not scatter; all, if few are so."""
+    """Return the readings of each axis whose samples do not scatter, or all if these are few."""
     reading = poses_g.reading
     if 'std' in poses_g:
         still = poses_g['std'] < 1e-9
@@ -121,7 +129,7 @@ def _constant(poses_g: Poses) -> list[Floats]:
 
 
 def _steps(apart: Floats) -> Floats:
-    """Return the steps to try: typical smallest distances and their simple parts."""
+    """Return the steps to try: typical smallest distances, and 1/2 and 1/3 of them."""
     smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
     return np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
 
@@ -133,18 +141,18 @@ def _on_grid(values: Floats, step: float) -> float:
 
 
 def with_grid(poses_g: Poses, step: float) -> Poses:
-    """Return the poses with the variance of the grid in their noise."""
+    """Return the poses with the variance of the grid added to their noise."""
     noise = np.zeros_like(poses_g.reading) if poses_g.noise is None else poses_g.noise
     std = np.sqrt(noise ** 2 + step ** 2 / 12.0)
     return poses_g.with_columns(std=std, count=np.ones(len(poses_g)))
 
 
 def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None]:
-    """Return the poses at the limit of the sensor, if leaving them out closes a gap."""
+    """Return the fit with the poses at the limit, and these poses, if they cause a gap."""
     clip = clipped(poses_g)
     if clip is None or len(poses_g) - len(clip.poses) < _LEAST_KEPT:
         return None, None
-    # Clipped samples hardly scatter, so their noise means nothing: all weigh the same here.
+    # Clipped samples hardly scatter, so their noise is meaningless: all weights are equal here.
     plain = Poses({key: values for key, values in poses_g.columns.items() if key != 'std'},
                   poses_g.row)
     whole, kept = beginning(plain, base), beginning(
@@ -155,16 +163,16 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
 
 
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
-    """Return the poses with the noise of a coarse grid, if that is what their noise leaves out."""
+    """Return the poses with the noise of a coarse grid, and its step, if their noise lacks it."""
     step = grid_step(poses_g)
     if step is None or beginning(poses_g, base).is_down_to_noise:
         return poses_g, None
     on_grid = with_grid(poses_g, step)
-    if poses_g.noise is None and not _all_of_it(beginning(on_grid, base)):
-        return poses_g, None  # the digits of the file, perhaps: the noise is another one
+    if poses_g.noise is None and not _is_all_noise(beginning(on_grid, base)):
+        return poses_g, None  # perhaps only the digits of the file; the noise is different
     return on_grid, step
 
 
-def _all_of_it(state: State) -> bool:
-    """Return whether the noise of the grid is what the residuals show, no less and no more."""
+def _is_all_noise(state: State) -> bool:
+    """Return whether the residuals match the noise of the grid, neither larger nor smaller."""
     return state.is_noise and state.fitted.rss > _LEAST_OF_GRID * state.dof

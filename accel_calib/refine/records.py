@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a refinement, as records."""
+"""The records of a refinement."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ Verdict = Literal['no_gap', 'explained', 'unexplained']
 @dataclass(frozen=True)
 class Step:
     """
-    One effect that was added.
+    One added effect.
 
     Parameters
     ----------
     effect : str
-        Its name in the catalogue.
+        Name in the catalogue.
     rivals : tuple of str
         Effects that these data cannot distinguish from it.
     parameters : dict
-        Its values, by name; for a change of a stored calibration, by how much they changed.
+        Values by name. For a change of a stored calibration: the changes of the values.
     gap_before_mg, gap_after_mg : float
-        Residual without and with it [mg].
+        Residual without and with the effect [mg].
     held_out_before_mg, held_out_after_mg : float
-        The same over poses held out [mg].
+        Held-out residual without and with the effect [mg].
     p_value : float
         Probability that noise alone makes one of all candidates this good.
     where : str
-        Where the disagreement was.
+        Directions, range or poses of the disagreement.
 
     """
 
@@ -54,14 +54,14 @@ class Step:
 @dataclass(frozen=True)
 class Stage:
     """
-    What was left at one stage, for figures.
+    The residuals at one stage, for figures.
 
     Parameters
     ----------
     name : str
-        ``base`` or the effect added.
+        ``base``, or the effect that was added.
     residual_mg : (n,) array
-        Of each pose kept, signed where only |force| is known.
+        Residual of each pose kept, signed if only |force| is known.
 
     """
 
@@ -77,27 +77,27 @@ class Refinement:
     Parameters
     ----------
     verdict : {'no_gap', 'explained', 'unexplained'}
-        Nothing beyond the noise; named, and the rest is noise; or a gap remains.
+        No gap beyond the noise; the effects are named and the rest is noise; or a gap remains.
     noise_floor_mg : float or None
-        What the gap would be if the model were right [mg]; None if the noise is not known.
+        Expected residual of a correct model [mg]; None if the noise is not known.
     gap_mg, remaining_gap_mg : float
         Residual of the base and of the refined model [mg].
     steps : tuple of Step
-        What was added, in order.
+        The added effects, in order.
     disturbed_poses : tuple of int
         Rows of the poses left out.
     not_testable : tuple of (str, str)
-        Effects that these data cannot show, and what to record.
+        Effects that these data cannot show, and the data to record for them.
     advice : tuple of str
-        What to do.
+        Advice for the user.
     calibration : Calibration
         The refined calibration.
     refusal : tuple of str
-        Why the calibration must not be stored or used, and what to do; empty if it may.
+        Reason why the calibration must not be stored or used, and advice; empty if it is usable.
     poses_g : Poses
         The poses kept, in g.
     force : (n, 3) array
-        Unit force of each, in the sensor axes.
+        Unit force of each pose kept, in the sensor axes.
     stages : tuple of Stage
         Residuals of the base and after each step.
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The refinement: a calibration in, a larger one and how it was found out.
+The refinement of a calibration: the entry point and the record of the result.
 
-See `accel_calib.refine.search` for the method, `.stored` for a stored calibration as the base.
+See `accel_calib.refine.search` for the method, and `.stored` for a stored calibration as the base.
 
 """
 
@@ -25,12 +25,13 @@ from .state import is_noise, State
 from .stored import beside_stored, with_changes, with_stored
 from .untestable import not_testable
 from .where import where
-from ..calibrate import Calibration, check_units, FLAT, gated, in_g, Rejected
+from ..calibrate import Calibration, check_sensor, check_units, FLAT, gated, in_g, Rejected
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.previous_pose import with_previous
 from ..calibrate.quality import fit_warnings, other_warnings, quality_of
+from ..calibrate.refusal import refuse_if_unfit
 from ..effects import CHANGES, effect_named, LADDER, WANDER
-from ..errors import RefusedFitError
+from ..errors import counted, listed, RefusedFitError
 from ..estimate.fit import judge
 from ..estimate.geometry import LARGEST_DILUTION
 from ..estimate.noise import variance_factor
@@ -47,50 +48,54 @@ _NAMED = 4
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
            date: str = '') -> Refinement:
     """
-    Find what a model lacks, name it, add it, and show how the residual shrinks.
+    Find effects that a model lacks, and add them to it.
 
     Parameters
     ----------
     poses : Poses
-        In the unit of the readings; of known, shared or unknown orientation.
+        Poses of known, shared or unknown orientation, in the unit of the readings.
     units : Units
-        That unit.
+        Unit of the readings.
     base : Calibration or {'auto', 'ideal', '4', '7', '10', '12'}
-        The model to begin with. A Calibration is compared as it is stored: first how the sensor
-        has changed since then, then what the calibration lacks.
+        The model to start from. A Calibration is compared as it is stored; the search first finds
+        changes of the sensor since then, and then further effects.
     sensor, date : str
-        Kept in the refined calibration.
+        Name of the sensor and date for the refined calibration.
 
     Returns
     -------
     Refinement
-        The verdict, the steps and the refined calibration.
+        The verdict, the added effects and the refined calibration.
 
     Raises
     ------
     RefusedFitError
-        If the poses do not determine the base, or leave nothing to find an effect with.
+        If the poses do not determine the base, or are too few to find an effect.
     InputError
-        If the readings are clearly not in that unit.
+        If the readings are clearly in another unit.
+    StoredCalibrationError
+        If the calibration belongs to another sensor.
 
     """
     check_units(poses, units)
+    if isinstance(base, Calibration):
+        check_sensor(base, sensor or poses.sensor)
     sure, doubts = sure_rows(poses)
     if doubts:
         try:
             return _refine(poses, sure, doubts, units, base, sensor, date)
         except RefusedFitError:
-            pass  # the doubtful poses are needed
+            pass  # the fit needs the doubtful poses
     return _refine(poses, poses, (), units, base, sensor, date)
 
 
 def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
             base: str | Calibration, sensor: str, date: str) -> Refinement:
-    """Refine with some of the poses; the others are rejected already."""
+    """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
     if len(sound) < _LEAST_POSES:
-        raise RefusedFitError(f'{len(sound)} poses are too few to find an effect',
-                              'take at least 4, better 24')
+        raise RefusedFitError(f'found {counted(len(sound), "sound pose")}, expected at least '
+                              f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(sound, units, str(base))
     poses_g = with_previous(in_g(sound, calibration.units), calibration.model)
@@ -100,19 +105,21 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     try:
         found = search(poses_g, model)
     except NotConvergedError:
-        raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses',
-                              'check the poses for mistakes, or begin with another base') from None
+        raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses, '
+                              'expected a fit that converges', 'check the poses for mistakes, or '
+                              'use another base') from None
     if found.base.dof < 1:
         raise RefusedFitError(
-            f'{len(sound)} poses for {found.base.fitted.onto.shape[1]} parameters of the base '
-            'leave nothing to find an effect with', 'take 12 poses or more, better 24')
+            f'found {counted(len(sound), "pose")} for '
+            f'{counted(found.base.fitted.onto.shape[1], "parameter")} of the base, expected more '
+            'poses to find an effect', 'take 24 poses or more')
     given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound))
-    return _told(calibration, found, given, sensor or poses.sensor, date)
+    return _record(calibration, found, given, sensor or poses.sensor, date)
 
 
 @dataclass(frozen=True)
 class _Given:
-    """The poses as given, all poses used [g], whether the base is stored, and unsound rows."""
+    """The input poses, all poses used [g], whether the base is stored, and rejected rows."""
 
     poses: Poses
     poses_g: Poses
@@ -121,12 +128,12 @@ class _Given:
 
     @property
     def joint(self) -> bool:
-        """Whether the poses of the stored calibration are among those used."""
+        """Whether the poses of the stored calibration are used, too."""
         return 'new' in self.poses_g
 
 
-def _told(calibration: Calibration, found: Found, given: _Given, sensor: str, date: str
-          ) -> Refinement:
+def _record(calibration: Calibration, found: Found, given: _Given, sensor: str, date: str
+            ) -> Refinement:
     """Return the record of a search."""
     start = _as_stored(calibration, found) if given.stored else found.base
     states = _sequence(found, start)
@@ -136,32 +143,35 @@ def _told(calibration: Calibration, found: Found, given: _Given, sensor: str, da
     remaining, noise = _remaining(found)
     verdict: Verdict = 'unexplained' if not noise else 'explained' if steps else 'no_gap'
     rejected = _rejected(found, given)
+    clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
+    outliers = tuple(each.row for each in rejected if each.row not in clipped)
     refined, refusal = _refined(calibration, found, given, rejected)
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
     untestable = _untestable(found, steps)
     return Refinement(
         verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
-        tuple(each.row for each in rejected), untestable,
-        advice_for(verdict, found, steps, untestable, len(rejected)), refined, refusal,
+        outliers, untestable, advice_for(verdict, found, steps, untestable, len(outliers)),
+        refined, refusal,
         found.final.poses_g, found.final.fit.equations.force, _stages(states, steps))
 
 
 def _as_stored(calibration: Calibration, found: Found) -> State:
-    """Return a stored calibration at the poses kept, as it is."""
+    """Return the state of a stored calibration at the poses kept, without a fit."""
     kept = calibration.held(found.base.poses_g)
     return State(judge(Model(calibration.model.values), kept))
 
 
 def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
-    """Return the rows of the table that were left out, and why."""
+    """Return the rows of the table that were left out, with the reason."""
     out = given.poses_g.take(found.outliers)
     force = found.final.model.at(out.columns).force(out.reading)
     away = np.linalg.norm(force, axis=1) - 1.0
-    rejected = [Rejected(int(row), f'outlier: |force| is {error * MG:+.2f} mg off what the other '
-                         'poses say') for row, error in zip(out.row, away, strict=True)]
+    rejected = [Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g in '
+                         'the fit of the others')
+                for row, error in zip(out.row, away, strict=True)]
     if found.clipped is not None:
-        rejected += [Rejected(int(row), 'it ends at the limit of the sensor')
+        rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor')
                      for row in given.poses_g.row[found.clipped.poses]]
     return tuple(sorted((*given.rejected, *(each for each in rejected
                                             if each.row in given.poses.row)),
@@ -169,7 +179,7 @@ def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
 
 
 def _sequence(found: Found, start: State) -> list[State]:
-    """Return the states from the start on, one for each effect added."""
+    """Return the initial state and the state after each added effect."""
     states, state = [start], found.base
     for name in found.added:
         if name == WANDER:
@@ -184,7 +194,7 @@ def _sequence(found: Found, start: State) -> list[State]:
 
 def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
           ) -> Step:
-    """Return the record of one step; `unseen` if the model before it never saw the poses."""
+    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
     before, after = states
     if name == WANDER:
         return _wander_step(before)
@@ -203,29 +213,29 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
 
 
 def _output_steps(found: Found) -> tuple[Step, ...]:
-    """Return the steps of readings that end at a limit or lie on a grid."""
+    """Return the steps for readings clipped at a limit or on a grid."""
     steps = []
     base = found.base
     gap, held_out = base.gap_mg(base.fitted.residual), base.gap_mg(base.fitted.held_out)
     if found.clipped is not None and found.with_clipped is not None:
         whole = found.with_clipped
-        rows = ', '.join(str(row) for row in whole.poses_g.row[found.clipped.poses])
+        rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
         steps.append(Step('saturation', (), {'limit': found.clipped.limit_g},
                           whole.gap_mg(whole.fitted.residual), gap,
                           whole.gap_mg(whole.fitted.held_out), held_out, 0.0,
-                          f'rows {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
+                          f'in {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
                           'samples hardly scatter'))
     if found.grid_g is not None:
         steps.append(Step('quantisation', (), {'step': found.grid_g}, gap, gap, held_out, held_out,
-                          0.0, f'pose means are multiples of {found.grid_g * MG:.3g} mg: that '
-                          f'alone is {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS per axis'))
+                          0.0, f'pose means are multiples of {found.grid_g * MG:.3g} mg, which '
+                          f'causes {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS per axis'))
     return tuple(steps)
 
 
 def _wander_step(before: State) -> Step:
     walk = before.wander
     if walk is None:
-        raise ValueError('a walk was named without one')
+        raise ValueError('the state has no random walk')
     p_value = float(np.exp(-walk.likelihood_ratio / 2.0))
     return Step(WANDER, (), {}, before.gap_mg(before.fitted.residual),
                 before.gap_mg(walk.residual), before.gap_mg(before.fitted.held_out),
@@ -233,7 +243,7 @@ def _wander_step(before: State) -> Step:
 
 
 def _rivals(name: str, found: Found) -> tuple[str, ...]:
-    """Return the effects that would do about as well in the place of this one."""
+    """Return the effects that would explain the data about as well as this one."""
     final = found.final
     if name not in final.model.values or name in found.base.model.values:
         return ()
@@ -254,7 +264,7 @@ def _rivals(name: str, found: Found) -> tuple[str, ...]:
 
 
 def _remaining(found: Found) -> tuple[float, bool]:
-    """Return the residual that remains, and whether it is no more than noise."""
+    """Return the remaining residual, and whether noise explains it."""
     final = found.final
     if found.added[-1:] != (WANDER,) or final.wander is None:
         return final.gap_mg(final.fitted.residual), final.is_noise
@@ -285,7 +295,7 @@ def _stages(states: list[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
 
 def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rejected, ...]
              ) -> tuple[Calibration, tuple[str, ...]]:
-    """Return the refined calibration, and why it must not be used, if so."""
+    """Return the refined calibration, and the refusal if it must not be used."""
     final = found.final
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
@@ -314,17 +324,19 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
 
 
 def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration with a warning, or with a refusal, if its poses leave much open."""
+    """Return a calibration with warnings, or a refusal if the poses do not determine it."""
     fit = final.fit
+    if refined.name == 'ideal':  # an offset that was not fitted is not zero
+        refuse_if_unfit('4', unit(fit.equations.force))
     if fit.undetermined:
         return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
                          f'{", …" if len(fit.undetermined) > _NAMED else ""}',
                          'take poses with each side of the sensor up and down, and some edges')
     factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
-    stretched = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
-    if stretched > LARGEST_DILUTION:
+    dilution = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
+    if dilution > LARGEST_DILUTION:
         return refined, ('the poses do not determine the refined calibration: the error of |a| '
-                         f'is up to {stretched:.3g} times that of a pose, expected less than '
+                         f'is up to {dilution:.3g} times that of a pose, expected less than '
                          f'{LARGEST_DILUTION:.0f} times',
                          'take poses with each side of the sensor up and down, and some edges')
-    return replace(refined, warnings=(*refined.warnings, *fit_warnings(fit, stretched))), ()
+    return replace(refined, warnings=(*refined.warnings, *fit_warnings(fit, dilution))), ()

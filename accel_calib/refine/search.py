@@ -4,15 +4,16 @@
 """
 The search for missing effects.
 
-First the ladder: offset, gain, gain by axis, cross-axis, as far as the base lacks them, always the
-one that lowers the criterion most. Then, in turn: outliers are left out, if that lowers the
-criterion more than any effect; otherwise the best effect is added, or the best pair if that is
-better still, and everything is fitted again; then earlier names are tested again, each against
-being left out and against every other effect. At the end, names that explain no more than a part
-of what lies above the noise are taken back: the rest then comes from something that is not in the
-catalogue, and so may they.
+1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
+   added, always the one that reduces the criterion most.
+2. Outliers are left out, if this reduces the criterion more than any effect.
+3. The best effect is added, or the best pair if it is clearly better, and all values are fitted
+   again. Then every named effect is tested again, against its removal and against every other
+   effect. This step is repeated.
+4. If the named effects explain only a small part of the residual above the noise, they are
+   removed: the residual then has a cause outside of the catalogue.
 
-A step is kept only if its fit converged, the cost fell and its values are plausible.
+An effect is kept only if its fit converged, the cost decreased and its values are plausible.
 
 """
 
@@ -45,16 +46,16 @@ from ..model import Model
 from ..table import Poses
 
 _LARGEST = 5
-"""Most effects that are added."""
+"""Largest number of added effects."""
 
 _OUTLIERS_BETTER = 2.0
-"""Outliers go first if they explain this many times more than any effect."""
+"""Outliers are left out first if they explain this many times more than any effect."""
 
 _WALK_SIGNIFICANT = 8.0
-"""Twice the logarithm of the likelihood ratio of a walk that is named: p = 0.002."""
+"""Twice the logarithm of the likelihood ratio above which a walk is named: p = 0.002."""
 
 _LEAST_SHARE = 0.6
-"""Part of what lies above the noise that the names must explain, if something else is left."""
+"""Part of the residual above the noise that the named effects must explain."""
 
 
 @dataclass(frozen=True)
@@ -65,19 +66,19 @@ class Found:
     Parameters
     ----------
     base, final : State
-        Before and after; the same poses are kept in both.
+        State before and after the search, with the same poses.
     added : tuple of str
-        Effects added, in order; `WANDER` last if the rest is a random walk of the offset.
+        Added effects, in order; `WANDER` is last if the rest is a random walk of the offset.
     outliers : (d,) array of int
         Indices of the outliers.
     taken_back : tuple of str
-        Names that did not explain enough.
+        Effects that were removed because they did not explain enough.
     clipped : Clipped or None
-        Poses at the limit of the sensor; left out, too.
+        Poses at the limit of the sensor, which are left out.
     grid_g : float or None
-        Step of the grid on which readings lie [g], if it matters.
+        Step of the grid of the readings [g], if it is relevant.
     with_clipped : State or None
-        The base fitted to the clipped poses as well.
+        The base fitted to all poses, including the clipped ones.
 
     """
 
@@ -93,19 +94,19 @@ class Found:
 
 def search(poses_g: Poses, base: Model) -> Found:
     """
-    Search for what a base model lacks.
+    Search for the effects that a base model lacks.
 
     Parameters
     ----------
     poses_g : Poses
-        In g.
+        Poses in g.
     base : Model
-        With ΔR = I.
+        The base model, with ΔR = I.
 
     Raises
     ------
     NotConvergedError
-        If the base cannot be fitted.
+        If the fit of the base does not converge.
 
     """
     everyone = np.arange(len(poses_g))
@@ -125,29 +126,29 @@ def search(poses_g: Poses, base: Model) -> Found:
 
 def _search(poses_g: Poses, base: Model, patience: float) -> Found:
     """
-    Search among the effects that are columns beside the model.
+    Search among the effects that are columns of the equations.
 
-    Outliers go first if they explain more than `patience` times any effect.
+    Outliers are left out first if they explain more than `patience` times any effect.
 
     """
     start = beginning(poses_g, base)
-    state, ladder = _climb(start)
-    state, out = _settle(state, patience)
+    state, ladder = _with_ladder(start)
+    state, out = _without_outliers(state, patience)
     begun, added = state, ladder
     names: tuple[str, ...] = ()
-    been: set[frozenset[str]] = set()  # a name may go when another comes, but not for ever
+    tried: set[frozenset[str]] = set()  # effects may replace each other, but not in a cycle
     while len(names) < _LARGEST and not (names and state.is_down_to_noise):
-        if frozenset(names) in been:
+        if frozenset(names) in tried:
             break
-        been.add(frozenset(names))
+        tried.add(frozenset(names))
         after, new = _next(state)
         if not new:
             break
-        state, more = _climb(after)  # what was missing may have hidden a rung
+        state, more = _with_ladder(after)  # the missing effect may have hidden an effect of V or W
         names, added = (*names, *new), (*added, *more)
         state, names = _tested_again(state, names)
     if out.size or names:
-        state, out, begun = _settled_again(start, begun, state)
+        state, out, begun = _outliers_again(start, begun, state)
     names, state, back = _judged(begun, state, names)
     if _walks(state):
         state, names = _significant_beside_walk(state, names)
@@ -161,30 +162,30 @@ def _end(start: State, state: State, added: tuple[str, ...], out: NDArray[np.int
          back: tuple[str, ...]) -> Found:
     there = {*state.model.values, WANDER}
     if 'axis_gain' in there:
-        there.add('gain')  # a rung below it
+        there.add('gain')  # axis_gain includes it
     base = start.without(out) if out.size else start
     return Found(base or start, state, tuple(name for name in added if name in there), out, back)
 
 
-def _climb(state: State) -> tuple[State, tuple[str, ...]]:
-    """Add the effects of V and W that the base lacks and the poses call for."""
+def _with_ladder(state: State) -> tuple[State, tuple[str, ...]]:
+    """Add the effects of V and W that the base lacks and the poses support."""
     added: tuple[str, ...] = ()
     while True:
-        found = state.candidates_among(_rungs(state))
+        found = state.candidates_among(_ladder_effects(state))
         best = best_of(found, state.fitted, state.dof)
-        if best is None or not _called_for(best, found, state):
+        if best is None or not _is_supported(best, found, state):
             return state, added
         if best.effect == 'axis_gain' and 'gain' in found and probability(
                 found['gain'], state.fitted, state.dof, len(found)) < LEVEL:
-            best = found['gain']  # one rung at a time
+            best = found['gain']  # the smaller model first
         after = state.plus(best)
         if after is None:
             return state, added
         state, added = after, (*added, best.effect)
 
 
-def _called_for(best: Candidate, found: dict[str, Candidate], state: State) -> bool:
-    """Return whether a rung is significant, alone or with all others: one may hide another."""
+def _is_supported(best: Candidate, found: dict[str, Candidate], state: State) -> bool:
+    """Return whether an effect is significant, alone or with all others that it may hide."""
     columns = projected(np.zeros(len(state.fit.residual)), state.fitted.onto[:, :0])
     for candidate in found.values():
         columns = columns.with_columns(candidate.columns)
@@ -193,19 +194,19 @@ def _called_for(best: Candidate, found: dict[str, Candidate], state: State) -> b
                for candidate in (best, together))
 
 
-def _rungs(state: State) -> tuple[str, ...]:
-    """Return the effects of the ladder that may come next."""
+def _ladder_effects(state: State) -> tuple[str, ...]:
+    """Return the effects of the ladder that can be added next."""
     present = state.model.values
-    rungs = ['offset', 'cross_axis']
+    possible = ['offset', 'cross_axis']
     if 'axis_gain' not in present:
-        rungs += ['gain', 'axis_gain']
+        possible += ['gain', 'axis_gain']
     if len(kinds(state.poses_g)[0]):
-        rungs.append('misalignment')
-    return tuple(name for name in LADDER if name in rungs and name not in present)
+        possible.append('misalignment')
+    return tuple(name for name in LADDER if name in possible and name not in present)
 
 
-def _settle(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
-    """Leave outliers out, if that explains more than any effect."""
+def _without_outliers(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
+    """Leave out outliers, if this explains more than any effect."""
     none = np.zeros(0, np.intp)
     out = outliers(state.fit, len(state.poses_g))
     if not out.poses.size:
@@ -215,7 +216,7 @@ def _settle(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
     if state.wander is not None:
         rival = max(rival, state.wander.fall)
     rows = np.isin(state.fit.equations.pose, out.poses)
-    # 2 log n for each outlier is for its choice among all.
+    # 2 log n per outlier is the cost of its selection among n poses.
     falls = (fall(max(state.fitted.rss - out.chi2, 0.0), state.fitted.rss, state.dof,
                   float(np.sum(rows)))
              - 2.0 * len(out.poses) * np.log(len(state.poses_g)))
@@ -223,10 +224,10 @@ def _settle(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
     return (state, none) if after is None else (after, out.poses)
 
 
-def _settled_again(start: State, begun: State, state: State
-                   ) -> tuple[State, NDArray[np.intp], State]:
-    """Look for outliers among all poses in the model that was found."""
-    # Near the model of the good poses: one that the outliers shaped bends the equations.
+def _outliers_again(start: State, begun: State, state: State
+                    ) -> tuple[State, NDArray[np.intp], State]:
+    """Find the outliers among all poses again, with the model of the search."""
+    # Linearised at the model of the good poses, because outliers distort other models.
     whole = State(judge(state.model, start.poses_g))
     out = outliers(whole.fit, len(start.poses_g)).poses
     again = whole.without(out)
@@ -238,7 +239,7 @@ def _settled_again(start: State, begun: State, state: State
 
 
 def _next(state: State) -> tuple[State, tuple[str, ...]]:
-    """Return the state with the effect, or the pair of effects, to add; no names: none."""
+    """Return the state with one more effect or pair of effects, and their names; () if none."""
     found = dict(state.found)
     while found:
         new = _admitted(state, found)
@@ -247,12 +248,12 @@ def _next(state: State) -> tuple[State, tuple[str, ...]]:
         after = _with(state, new)
         if after is not None:
             return after, tuple(candidate.effect for candidate in new)
-        del found[new[0].effect]  # it has no sound fit: the next best
+        del found[new[0].effect]  # it has no sound fit, so try the next one
     return state, ()
 
 
 def _with(state: State, new: tuple[Candidate, ...]) -> State | None:
-    """Return the state with these candidates in the model; None if one has no sound fit."""
+    """Return the state with these candidates in the model, or None without a sound fit."""
     for candidate in new:
         among = state.candidates_among((candidate.effect,))
         after = state.plus(among[candidate.effect]) if among else None
@@ -263,7 +264,7 @@ def _with(state: State, new: tuple[Candidate, ...]) -> State | None:
 
 
 def _admitted(state: State, found: dict[str, Candidate]) -> tuple[Candidate, ...]:
-    """Return the best of these effects, or the best pair, if it is significant."""
+    """Return the best effect, or the best pair of effects, if it is significant."""
     fitted, dof = state.fitted, state.dof
     single = best_of(found, fitted, dof)
     if single is None:
@@ -280,7 +281,7 @@ def _admitted(state: State, found: dict[str, Candidate]) -> tuple[Candidate, ...
 
 
 def _admitted_beside_walk(state: State, among: dict[str, Candidate]) -> tuple[Candidate, ...]:
-    """Return the one of these effects that is significant although the offset wanders, if any."""
+    """Return the best effect if it is significant in addition to a walk of the offset."""
     found = {name: each for name, each in state.found_beside_walk().items() if name in among}
     single = best_of(found, state.beside_walk, state.dof)
     if single is None or probability(single, state.beside_walk, state.dof, len(found)) > LEVEL:
@@ -289,7 +290,7 @@ def _admitted_beside_walk(state: State, among: dict[str, Candidate]) -> tuple[Ca
 
 
 def _tested_again(state: State, names: tuple[str, ...]) -> tuple[State, tuple[str, ...]]:
-    """Test each name against being left out, and against every other effect."""
+    """Test each effect against its removal, and against every other effect."""
     for name in names:
         without = state.without_effect(name) if name in state.model.values else None
         if without is None or name not in without.found:
@@ -309,7 +310,7 @@ def _tested_again(state: State, names: tuple[str, ...]) -> tuple[State, tuple[st
 
 def _judged(begun: State, state: State, names: tuple[str, ...]
             ) -> tuple[tuple[str, ...], State, tuple[str, ...]]:
-    """Take the names back if something else is left and they explain too little of the whole."""
+    """Remove all effects if a gap remains and they explain too little of the residual."""
     if not names or not state.fit.noise_known or state.is_noise:
         return names, state, ()
     above = begun.fitted.rss - begun.dof
@@ -321,7 +322,7 @@ def _judged(begun: State, state: State, names: tuple[str, ...]
 
 def _significant_beside_walk(state: State, names: tuple[str, ...]
                              ) -> tuple[State, tuple[str, ...]]:
-    """Keep the names that are significant although the offset wanders."""
+    """Keep the effects that are significant in addition to a walk of the offset."""
     for name in names:
         without = state.without_effect(name)
         if without is None:
@@ -334,7 +335,7 @@ def _significant_beside_walk(state: State, names: tuple[str, ...]
 
 
 def _walks(state: State) -> bool:
-    """Return whether what is left is a random walk of the offset."""
+    """Return whether the remaining residual is a random walk of the offset."""
     walk = state.wander
     if walk is None or walk.likelihood_ratio < _WALK_SIGNIFICANT or state.is_noise:
         return False

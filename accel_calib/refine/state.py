@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The state of a search: the model so far, fitted to the poses kept, and what it leaves."""
+"""The state of a search: a model fitted to the poses kept, with its residuals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from .wander import Wander, wander
 from ..calibrate.previous_pose import with_previous
 from ..effects import CHANGES, effect_named, EFFECTS, LADDER
 from ..estimate.fit import estimate, Fit
-from ..estimate.outliers import by_pose
 from ..estimate.solve import NotConvergedError
 from ..model import FITTED_SHAPES, Model
 from ..table import Floats, Poses
@@ -25,7 +24,7 @@ from ..units import MG
 
 _CHI2_LEVEL = 1e-3
 _CHI2_RATIO = 1.3
-"""Poses repeat somewhat worse than their samples say; this ratio is still noise."""
+"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class State:
     Parameters
     ----------
     fit : Fit
-        The fit.
+        Fit of the model to the poses.
 
     """
 
@@ -49,7 +48,7 @@ class State:
 
     @property
     def poses_g(self) -> Poses:
-        """Return the poses kept, in g, with the pose before each."""
+        """Return the poses kept, in g, with the column ``previous``."""
         return self.fit.poses_g
 
     @cached_property
@@ -59,23 +58,23 @@ class State:
 
     @property
     def dof(self) -> int:
-        """Return the number of independent equations less that of fitted values."""
+        """Return the number of independent equations minus that of fitted values."""
         return self.fit.equations.count - self.fitted.onto.shape[1]
 
     @cached_property
     def found(self) -> dict[str, Candidate]:
-        """Return the candidates, without the ladder."""
+        """Return the candidates, without the effects of the ladder."""
         return self.candidates_among((*(name for name in EFFECTS if name not in LADDER),
                                       *changes_beside(self.model)))
 
     def candidates_among(self, names: tuple[str, ...]) -> dict[str, Candidate]:
-        """Return those of these effects that the poses distinguish from the model."""
+        """Return the candidates among these effects that the poses distinguish from the model."""
         absent = tuple(name for name in names if name not in self.model.values)
         return candidates(self.fit.equations, self.fitted, self.poses_g.columns, absent)
 
     @cached_property
     def wander(self) -> Wander | None:
-        """Return the random walk of the offset, if there are times."""
+        """Return the random walk of the offset, or None if the times are not known."""
         if 'time' not in self.poses_g:
             return None
         time = self.poses_g['time']
@@ -85,30 +84,30 @@ class State:
 
     @cached_property
     def beside_walk(self) -> Projected:
-        """Return the equations, the walk of the offset whitened, the model projected out."""
+        """Return the equations whitened for a walk, with the model projected out."""
         if self.wander is None:
             return self.fitted
         return projected(self.wander.whitened(self.fit.residual),
                          self.wander.whitened(self.fit.columns))
 
     def found_beside_walk(self) -> dict[str, Candidate]:
-        """Return the candidates as they are seen beside a walk of the offset."""
+        """Return the candidates in the equations whitened for a walk of the offset."""
         return candidates(self.fit.equations, self.beside_walk, self.poses_g.columns,
                           tuple(self.found),
                           None if self.wander is None else self.wander.whitened)
 
     @property
     def is_noise(self) -> bool:
-        """Return whether what is left may be noise alone; true if the noise is not known."""
+        """Whether noise may explain the residual; True if the noise is not known."""
         return not self.fit.noise_known or is_noise(self.fitted.rss, self.dof)
 
     @property
     def is_down_to_noise(self) -> bool:
-        """Return whether measured noise explains all that is left; nothing more is named then."""
+        """Whether measured noise explains the residual; then no further effect is named."""
         return self.fit.noise_known and self.is_noise
 
     def gap_mg(self, residual: Floats) -> float:
-        """Return the RMS over the new poses of residuals of the equations [mg]."""
+        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
         of_poses = self.fit.equations.of_poses(residual)
         if 'new' in self.poses_g:
             of_poses = of_poses[self.poses_g['new'] > 0.0]
@@ -116,24 +115,24 @@ class State:
 
     @property
     def floor_mg(self) -> float | None:
-        """Return the gap if the model were right [mg]; None if the noise is not known."""
+        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
         if not self.fit.noise_known:
             return None
-        rows = by_pose(self.fit).rows[self.fit.equations.pose]
+        rows = self.fit.by_pose.rows[self.fit.equations.pose]
         share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
         return self.gap_mg(share)
 
     def with_effects(self, values: dict[str, Floats]) -> State | None:
-        """Return the state of the model with these effects, fitted; None: no sound fit."""
+        """Return the state with these effects, fitted, or None without a sound fit."""
         return _state(Model(values), self.poses_g)
 
     def without_effect(self, name: str) -> State | None:
-        """Return the state of the model without an effect, fitted; None: no sound fit."""
+        """Return the state without an effect, fitted, or None without a sound fit."""
         return self.with_effects({key: part for key, part in self.model.values.items()
                                   if key != name})
 
     def without(self, poses: NDArray[np.intp]) -> State | None:
-        """Return the state without these poses, fitted; None: no sound fit."""
+        """Return the state without these poses, fitted, or None without a sound fit."""
         kept = np.delete(np.arange(len(self.poses_g)), poses)
         return _state(self.model, self.poses_g.take(kept))
 
@@ -144,8 +143,8 @@ class State:
         Returns
         -------
         State or None
-            None if the fit did not converge, the cost did not fall, or a value is at the bound of
-            what is plausible.
+            None if the fit did not converge, the cost did not decrease, or a value is at the bound
+            of its plausible range.
 
         """
         effect = effect_named(candidate.effect)
@@ -162,7 +161,7 @@ class State:
         return after
 
     def _started(self, values: dict[str, Floats], candidate: Candidate) -> dict[str, Floats]:
-        """Return the values with the amplitudes that belong to a fitted shape constant."""
+        """Return start values with amplitudes, for a candidate with a fitted shape constant."""
         effect = effect_named(candidate.effect)
         if not set(FITTED_SHAPES) & set(effect.shape):
             return values
@@ -175,14 +174,14 @@ class State:
 
 
 def is_noise(rss: float, dof: float) -> bool:
-    """Return whether measured noise leaves a weighted sum of squares like this."""
+    """Return whether measured noise explains a weighted sum of squares."""
     from scipy.special import chdtrc
 
     return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
 
 
 def changes_beside(model: Model) -> tuple[str, ...]:
-    """Return the changes since a stored calibration that a model may have."""
+    """Return the changes since a stored calibration that can be added to a model."""
     present = set(model.values)
     if 'axis_gain_change' in present:
         present.add('gain_change')
@@ -191,7 +190,7 @@ def changes_beside(model: Model) -> tuple[str, ...]:
 
 def beginning(poses_g: Poses, model: Model) -> State:
     """
-    Return the state of a model before anything is added, fitted to all poses.
+    Return the state of a base model, fitted to all poses.
 
     Raises
     ------

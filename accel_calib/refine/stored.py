@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A stored calibration as the base: it is the simulation, the new poses are the measurement.
+A stored calibration as the base of a refinement.
 
-The poses that the calibration was fitted to stand beside the new ones, with the time of the stored
-ones left out, for clocks of two recordings need not agree. How the sensor has changed since then
-are effects that act on the new poses alone (`accel_calib.effects.CHANGES`). Where one of its
-conditions differs between the two sets, an effect of that condition competes with them.
+The calibration is the simulation, and the new poses are the measurement. The poses of the
+calibration are added to the new poses, without their times, because the clocks of two recordings
+can differ. If the file was edited by hand, or the new poses are partly those of the calibration
+and contradict it, the readings that the calibration predicts replace its measured ones. Changes of
+the sensor since the calibration are effects that act only on the new poses
+(`accel_calib.effects.CHANGES`). If the context differs between the two sets, effects of the
+context compete with these changes.
 
 """
 
@@ -15,22 +18,28 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
-from ..calibrate import Calibration, in_g
+from ..calibrate import Calibration, EDITED, in_g
 from ..effects import CHANGES, effect_named
+from ..estimate.fit import estimate, judge
 from ..model import Model, parameter_names
+from ..sphere import unit
 from ..table import COLUMNS, Floats, Poses
 
 _DIGITS = 7
-"""Decimals [g] to which two readings of the same pose agree."""
+"""Number of decimals [g] in which two readings of the same pose are equal."""
+
+_SAME = 0.999
+"""Quantile of chi² below which a stored calibration agrees with poses of its fit."""
 
 _EITHER = ('temperature', 'supply_voltage', 'rate', 'previous')
-"""Context that counts as not known for a set of poses that lacks it."""
+"""Context that is set to NaN if the stored poses do not have it."""
 
 
 def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     """
-    Return new poses with those of a stored calibration behind them.
+    Return new poses followed by those of a stored calibration.
 
     Parameters
     ----------
@@ -42,18 +51,26 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     Returns
     -------
     Poses
-        With the column ``new``; the poses alone, without it, if the calibration has none of its
-        own, was fitted to some of these, or has effects of time.
+        All poses, with the column ``new``. Only the new poses, without this column, if the
+        calibration has no poses, or was fitted to some of the new poses and still agrees with
+        them.
 
     """
     stored = in_g(calibration.used_poses, calibration.units)
-    timed = 'time' in calibration.model.needs
-    if not len(stored) or timed or _shares(poses_g, stored):
+    if not len(stored):
         return poses_g
+    shared = _shares(poses_g, stored)
+    if shared and EDITED not in calibration.warnings and _agrees(calibration, poses_g):
+        return poses_g
+    if shared or EDITED in calibration.warnings:
+        stored = _as_calibrated(stored, calibration)
     count = (len(poses_g), len(stored))
     columns = {key: _joined(key, poses_g, stored) for key in COLUMNS
                if (key in poses_g and key in stored) or (key in _EITHER and key in poses_g)}
-    if 'time' in poses_g:
+    if 'time' in calibration.model.needs:  # limited to the range of the calibration
+        held = np.clip(poses_g['time'], *calibration.ranges['time'])
+        columns['time'] = np.concatenate([held, stored['time']])
+    elif 'time' in poses_g:
         columns['time'] = np.concatenate([poses_g['time'], np.full(count[1], np.nan)])
     if 'orientation' in poses_g:
         least = float(np.min(poses_g['orientation']))
@@ -66,7 +83,7 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
 
 
 def with_stored(poses: Poses, calibration: Calibration) -> Poses:
-    """Return poses with those of a stored calibration behind them, in the unit of the readings."""
+    """Return poses followed by those of a stored calibration, in the unit of the readings."""
     stored = calibration.used_poses
     columns = {key: np.concatenate([poses[key], stored[key]]) for key in poses.columns
                if key in stored}
@@ -78,10 +95,25 @@ def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
 
 
 def _shares(poses_g: Poses, stored: Poses) -> bool:
-    """Return whether any of these poses is one of the stored ones."""
+    """Return whether a pose is in both tables."""
     one, other = ({tuple(row) for row in each.reading.round(_DIGITS).tolist()}
                   for each in (poses_g, stored))
     return not one.isdisjoint(other)
+
+
+def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
+    """Return whether a fit to the poses is no better than the calibration as stored."""
+    model = Model(calibration.model.values)
+    fit = estimate(model, poses_g)
+    excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
+    worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
+    return bool(excess / worse < chdtri(len(model.vector), 1.0 - _SAME))
+
+
+def _as_calibrated(stored: Poses, calibration: Calibration) -> Poses:
+    """Return the poses with the readings that the calibration predicts in their directions."""
+    here = calibration.model.at(stored.columns)
+    return stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
 
 
 def _joined(key: str, poses_g: Poses, stored: Poses) -> Floats:
@@ -92,17 +124,17 @@ def _joined(key: str, poses_g: Poses, stored: Poses) -> Floats:
 
 def with_changes(model: Model) -> tuple[Model, Floats]:
     """
-    Return a model with the changes since the stored calibration added to its own effects.
+    Return a model with the changes since the stored calibration included in its effects.
 
     Parameters
     ----------
     model : Model
-        With effects of `accel_calib.effects.CHANGES`, or without.
+        A model with or without effects of `accel_calib.effects.CHANGES`.
 
     Returns
     -------
     Model, (q, p) array
-        The model as it is now, and the matrix from the values of the given one to its values.
+        The model without changes, and the matrix from the values of `model` to its values.
 
     """
     effects = [name for name in model.effects if name not in CHANGES]

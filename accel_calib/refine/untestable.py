@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Effects that the poses cannot show, and what to record to see them."""
+"""Effects that the poses cannot show, and the data to record for them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from ..effects import EFFECTS, PROCESSES
 from ..estimate.equations import kinds
 from ..table import COLUMNS, Poses
 
-
 _LEAST_VISIBLE = 0.1
-"""Change of the residuals by an effect of typical size, over their noise, that poses can show."""
+"""Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
 
 
 def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tuple[str, ...]
                  ) -> list[tuple[str, str]]:
     """
-    Return the effects that these poses cannot show, with what to record.
+    Return the effects that these poses cannot show, with the data to record.
 
     Parameters
     ----------
     poses_g : Poses
-        In g.
+        Poses in g.
     testable : mapping of str to Candidate
-        Effects that they distinguish from the model.
+        Effects that the poses distinguish from the model.
     present : tuple of str
-        Effects of the model, and their rivals.
+        Effects of the model and their rivals.
 
     """
     missing = []
@@ -49,7 +48,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
         elif name in PROCESSES:
             continue
         elif effect.needs:
-            missing.append((name, 'poses between which this changes more: '
+            missing.append((name, 'poses with a larger change of this quantity: '
                             f'{COLUMNS[effect.needs[0]].meaning}'))
         else:
             missing.append((name, 'more poses in more directions'))

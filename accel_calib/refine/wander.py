@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-`offset_wander`: an offset that changes slowly, without a known form.
+The effect `offset_wander`: an offset that changes slowly without a known form.
 
 The offset is a random walk w(t), expanded in its Karhunen-Loève modes
 
     w(t) = Σ_k a_k sin((k - ½) π τ) / ((k - ½) π),   τ from 0 to 1 over the poses
 
-with independent amplitudes a_k of equal variance for each axis. The equations see it through the
-same columns as an offset. Its size is found by restricted maximum likelihood (Patterson and
-Thompson 1971): with the model projected out, along the singular vectors of the modes, the residual
-z has the variances s² (1 + λ Λ_i). With a fixed number of modes the cost is linear in the poses.
+with independent amplitudes a_k of equal variance for each axis. It enters the equations through
+the same columns as an offset. Its size is estimated by restricted maximum likelihood (Patterson
+and Thompson 1971): with the model projected out, the residual z along the singular vectors of the
+modes has the variances s² (1 + λ Λ_i). With a fixed number of modes the cost is linear in the
+number of poses.
 
 """
 
@@ -32,7 +33,7 @@ _MODES = 60
 _RATIOS = np.geomspace(1e-4, 1e6, 81)
 _LARGEST_RATIO = 1e3
 _LEAST_WHITE = 0.5
-"""Part of the measured variance that is left to the poses themselves."""
+"""Smallest part of the measured variance that remains for the noise of the poses."""
 
 _NO_CHANGE = 1e-9
 """Directions that are shrunk by less than this part are left out."""
@@ -52,9 +53,9 @@ class Wander:
     likelihood_ratio : float
         Twice the logarithm of the likelihood ratio against no walk.
     residual : (m,) array
-        What is left without the estimated walk.
+        Residual minus the estimated walk.
     held_out : (m,) array
-        The same, each equation estimated from the others.
+        The same, with each equation predicted from the others.
     axes, shrink : (m, r) array, (r,) array
         Directions of the walk among the equations, and the factor that whitens each.
 
@@ -68,7 +69,7 @@ class Wander:
     shrink: Floats
 
     def whitened(self, columns: Floats) -> Floats:
-        """Return (m,) or (m, q) columns on which the walk and the noise have unit variance."""
+        """Return (m,) or (m, q) columns, whitened for the sum of walk and noise."""
         along = self.axes.T @ columns
         return columns - self.axes @ ((1.0 - self.shrink) * along.T).T
 
@@ -80,11 +81,11 @@ def wander(equations: Equations, fitted: Projected, time: Floats) -> Wander:
     Parameters
     ----------
     equations : Equations
-        Near the model.
+        Equations near the model.
     fitted : Projected
-        With the model projected out.
+        The equations with the model projected out.
     time : (n,) array
-        Of the poses [s]; NaN for poses before the walk begins.
+        Times of the poses [s]; NaN for poses before the walk begins.
 
     """
     modes = _modes(equations, time)

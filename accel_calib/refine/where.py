@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where simulation and measurement disagree: directions, ranges or poses, with numbers."""
+"""Description of where simulation and measurement disagree: directions, ranges or poses."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _NEAR = np.cos(np.radians(30.0))
 
 def where(effect: str, before: State, after: Floats) -> str:
     """
-    Return where the disagreement is that an effect explains.
+    Return a description of where an effect explains the disagreement.
 
     Parameters
     ----------
     effect : str
         The effect.
     before : State
-        Without it.
+        State without the effect.
     after : (m,) array
-        Residuals of the equations with it.
+        Residuals of the equations with the effect.
 
     """
     share = (before.fit.equations.of_poses(before.fit.residual - after)) * MG
@@ -41,7 +41,7 @@ def where(effect: str, before: State, after: Floats) -> str:
 
 
 def _instant(before: State, share: Floats) -> str:
-    """Return the instant at which successive poses differ most."""
+    """Return a text about the instant of the largest change between successive poses."""
     time = before.poses_g['time']
     order = np.argsort(time, kind='stable')[:int(np.sum(np.isfinite(time)))]
     time, moved = time[order], share[order]
@@ -53,7 +53,7 @@ def _instant(before: State, share: Floats) -> str:
 
 
 def _range(column: str, before: State, share: Floats) -> str:
-    """Return the range of a quantity and the disagreement at its ends."""
+    """Return a text about the range of a quantity and the disagreement at both ends."""
     known = np.isfinite(before.poses_g[column].reshape(len(share), -1)).all(axis=1)
     values, share = before.poses_g[column][known], share[known]
     if values.ndim > 1:
@@ -64,11 +64,11 @@ def _range(column: str, before: State, share: Floats) -> str:
     name = column.replace('_', ' ')
     unit = COLUMNS[column].unit if column != 'std' else 'g'
     return (f'over {name} {values[order[0]]:.4g} to {values[order[-1]]:.4g} {unit}: '
-            f'{low:.2g} mg RMS in its lowest fifth, {high:.2g} mg in its highest')
+            f'{low:.2g} mg RMS in the lowest fifth of the poses, {high:.2g} mg in the highest')
 
 
 def _directions(force: Floats, share: Floats) -> str:
-    """Return the directions in which the disagreement is largest."""
+    """Return a text about the directions with the largest disagreement."""
     signs = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)
                       if i or j or k], float)
     units = signs / np.linalg.norm(signs, axis=1, keepdims=True)

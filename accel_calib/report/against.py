@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals against the variable of an effect, such as force along an axis or time."""
+"""Figures of residuals against a variable, such as force along an axis or time."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 @dataclass(frozen=True)
 class Variable:
     """
-    A variable on the horizontal axis.
+    A variable for the horizontal axis.
 
     Parameters
     ----------
     label : str
-        Its name, with the unit.
+        Name and unit.
     values : (n,) array
         One value per pose.
     unit_range : bool
-        Whether its range is -1 to 1 by definition.
+        Whether the range is -1 to 1 by definition.
 
     """
 
@@ -44,7 +44,7 @@ class Variable:
 
 
 def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
-    """Return what an effect depends on: one variable, or three by axis."""
+    """Return the variables that an effect depends on: one variable, or one per axis."""
     key = next((name for name in effect_named(effect).needs if name in poses_g), None)
     if key == 'previous':
         return [Variable(f'from the previous pose, {axis}', poses_g[key][:, k], True)
@@ -56,7 +56,7 @@ def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
 
 
 def recorded(poses_g: Poses) -> list[Variable]:
-    """Return what was recorded beside the readings and changes between poses."""
+    """Return the variables of the context that change between poses."""
     found = [_variable(key, poses_g) for key in _CONTEXT if key in poses_g]
     return [variable for variable in found if np.ptp(variable.values) > 0.0]
 
@@ -86,20 +86,20 @@ def _time(seconds: Floats) -> Variable:
 def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
                  limit_mg: float, *, signed: bool, colour: str) -> Figure:
     """
-    Draw residuals against variables, one panel each.
+    Draw residuals against variables, with one panel per variable.
 
     Parameters
     ----------
     title : str
         Title of the figure.
     variables : sequence of Variable
-        One panel each.
+        Variable of each panel.
     residual_mg : (n,) array
         Residual of each pose [mg].
     limit_mg : float
-        End of the residual axis [mg].
+        Limit of the residual axis [mg].
     signed : bool
-        Whether residuals have a sign.
+        Whether the residuals are signed.
     colour : str
         Colour of the poses.
 

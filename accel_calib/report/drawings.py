@@ -37,9 +37,9 @@ class Drawing:
     Parameters
     ----------
     name : str
-        Name of its file, without suffix.
+        Name of the file, without suffix.
     title : str
-        What it shows.
+        Title.
     figure : Figure
         The figure.
 
@@ -51,7 +51,7 @@ class Drawing:
 
 
 def ladder(result: Refinement) -> Drawing:
-    """Draw the residual step by step."""
+    """Draw the residual of the base and after each step."""
     after = ', '.join(short(step.gap_after_mg) for step in result.steps)
     title = f'Residual of the base {short(result.gap_mg)} mg' + (
         f', then {after} mg' if after else '')
@@ -59,7 +59,7 @@ def ladder(result: Refinement) -> Drawing:
 
 
 def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
-    """Draw the residuals before and after a step, with the same scale."""
+    """Yield figures of the residuals before and after a step, with equal scales."""
     before, after = result.stages[step], result.stages[step + 1]
     limit_mg = _limit_mg(before, after)
     name = f'step{step + 1}_{after.name}'
@@ -76,7 +76,7 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
 
 
 def of_remainder(result: Refinement) -> Iterator[Drawing]:
-    """Draw the final residuals over the sphere and against all that was recorded."""
+    """Yield figures of the final residuals, over the sphere and against the context."""
     stage = result.stages[-1]
     limit_mg = _limit_mg(stage)
     if _spread(result):
@@ -89,7 +89,7 @@ def of_remainder(result: Refinement) -> Iterator[Drawing]:
 
 
 def all_drawings(result: Refinement) -> Iterator[Drawing]:
-    """Draw all figures of the report."""
+    """Yield all figures of the report."""
     yield ladder(result)
     for step in range(len(result.steps)):
         yield from of_step(result, step)
@@ -98,7 +98,7 @@ def all_drawings(result: Refinement) -> Iterator[Drawing]:
 
 def write_figures(folder: Path, result: Refinement) -> list[Path]:
     """
-    Write all figures as SVG and PNG.
+    Write all figures as SVG and PNG, and return the paths.
 
     Raises
     ------
@@ -116,12 +116,12 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
 
 
 def _signed(result: Refinement) -> bool:
-    """Return whether residuals have a sign: they have if only |force| is known."""
+    """Return whether the residuals are signed, because only |force| is known."""
     return any(bool(np.any(stage.residual_mg < 0.0)) for stage in result.stages)
 
 
 def _spread(result: Refinement) -> bool:
-    """Return whether the poses have enough directions for a map."""
+    """Return whether the poses have enough different directions for a map."""
     return len(np.unique(np.round(result.force, 1), axis=0)) >= _FEW_DIRECTIONS
 
 
@@ -149,7 +149,7 @@ def _against(result: Refinement, stage: Stage, variables: list[Variable], name: 
 
 
 def _left_out(result: Refinement) -> tuple[Floats, tuple[int, ...]]:
-    """Return directions and rows of the poses that were left out."""
+    """Return directions and rows of the poses left out."""
     calibration = result.calibration
     which = np.isin(calibration.poses.row, result.disturbed_poses)
     poses = calibration.poses.take(which)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The residual from the base down to the noise floor, step by step."""
+"""Figure of the residual of each step, from the base to the noise floor."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ if TYPE_CHECKING:
     from ..refine import Refinement
 
 _WIDTH_INCHES = 4.9
-_RUNG_INCHES = 0.52
+_LEVEL_INCHES = 0.52
 
 
 def draw_ladder(result: Refinement) -> Figure:
-    """Draw the residual of the base and after each step, fitted and held out."""
-    rungs = _rungs(result)
+    """Draw the residual and the held-out residual of the base and after each step."""
+    levels = _levels(result)
     with styled():
-        figure = new_figure(1.25 + _RUNG_INCHES * len(rungs), _WIDTH_INCHES)
+        figure = new_figure(1.25 + _LEVEL_INCHES * len(levels), _WIDTH_INCHES)
         axes = figure.subplots()
-        _draw_rungs(axes, rungs)
+        _draw_levels(axes, levels)
         if result.noise_floor_mg:
             axes.axvline(result.noise_floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),
                          label=f'noise floor {short(result.noise_floor_mg)} mg', zorder=1)
-        _scale(axes, *_limits(result, rungs))
+        _scale(axes, *_limits(result, levels))
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, handletextpad=0.2,
                     columnspacing=0.9, handlelength=1.6, borderaxespad=0.0)
     return figure
 
 
 def _scale(axes: Any, least: float, largest: float) -> None:
-    """Make the axis of residuals logarithmic, with legible ticks."""
+    """Set a logarithmic axis of residuals with legible ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     few = largest / least > 300.0
@@ -52,22 +52,22 @@ def _scale(axes: Any, least: float, largest: float) -> None:
     axes.grid(visible=True, axis='x')
 
 
-def _rungs(result: Refinement) -> list[tuple[str, float, float | None]]:
-    """Return name, residual and held-out residual [mg] of the base and of each step."""
+def _levels(result: Refinement) -> list[tuple[str, float, float | None]]:
+    """Return name, residual and held-out residual [mg] of the base and after each step."""
     held_out = (result.steps[0].held_out_before_mg if result.steps
                 else result.calibration.quality.held_out_rms_mg)
-    rungs = [(base_words(result), result.gap_mg, held_out)]
-    rungs += [(f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg)
-              for step in result.steps]
-    return rungs
+    levels = [(base_words(result), result.gap_mg, held_out)]
+    levels += [(f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg)
+               for step in result.steps]
+    return levels
 
 
-def _draw_rungs(axes: Any, rungs: list[tuple[str, float, float | None]]) -> None:
-    height = np.arange(len(rungs))
-    residuals = np.array([residual for _, residual, _ in rungs])
+def _draw_levels(axes: Any, levels: list[tuple[str, float, float | None]]) -> None:
+    height = np.arange(len(levels))
+    residuals = np.array([residual for _, residual, _ in levels])
     axes.step(residuals, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
     axes.plot(residuals, height, 'o', color=AFTER, markersize=9, label='all poses used', zorder=3)
-    held_out = np.array([np.nan if out is None else out for _, _, out in rungs])
+    held_out = np.array([np.nan if out is None else out for _, _, out in levels])
     if np.any(np.isfinite(held_out)):
         axes.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
                   markeredgewidth=1.6, label='held out', zorder=3)
@@ -77,18 +77,18 @@ def _draw_rungs(axes: Any, rungs: list[tuple[str, float, float | None]]) -> None
         axes.annotate(words, (np.nanmax([residual, out]), at), (9, 0), va='center',
                       textcoords='offset points', fontsize=9.0,
                       bbox=white)
-    for at, (name, _, _) in zip(height, rungs, strict=True):
+    for at, (name, _, _) in zip(height, levels, strict=True):
         axes.text(0.005, at - 0.36, name, transform=axes.get_yaxis_transform(), va='center',
                   fontweight='bold', fontsize=9.5, bbox=white)
-    axes.set_ylim(len(rungs) - 0.55, -0.65)
+    axes.set_ylim(len(levels) - 0.55, -0.65)
     axes.yaxis.set_visible(False)
     axes.spines['left'].set_visible(False)
 
 
-def _limits(result: Refinement, rungs: list[tuple[str, float, float | None]]
+def _limits(result: Refinement, levels: list[tuple[str, float, float | None]]
             ) -> tuple[float, float]:
-    """Return the limits of the axis, with room for the numbers."""
-    values = [value for rung in rungs for value in rung[1:] if value]
+    """Return the limits of the axis, with space for the numbers."""
+    values = [value for level in levels for value in level[1:] if value]
     values += [result.noise_floor_mg] if result.noise_floor_mg else []
     least, largest = min(values, default=1.0), max(values, default=1.0)
     room = max(float(np.log10(largest / least)), 0.5)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One HTML page about a refinement, which loads nothing from outside."""
+"""The report of a refinement: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from .sheet import SHEET
 from .style import inline_svg
 from .. import __version__
 from ..effects import effect_named
+from ..errors import listed
 from ..files.atomic import write_atomically
 from ..html_table import table
 from ..words import base_words, chance, short, values_of, verdict_words
@@ -25,24 +26,24 @@ if TYPE_CHECKING:
 _TITLE = 'What the calibration lacks'
 _HOW_TO_READ = (
     'The residual is the RMS of |corrected| − 1 g over the poses, or of the vector error if the '
-    'orientation is known or shared. The noise floor is the residual of a perfect model.',
-    'Held out: each pose is predicted by a fit of the others. If the held-out residual falls too, '
-    'the effect is in the sensor and not in the fit.',
+    'orientation is known or shared. The noise floor is the expected residual of a correct model.',
+    'Held out: each pose is predicted from a fit of the others. If the held-out residual '
+    'decreases, too, the effect is in the sensor and not an artefact of the fit.',
     'p is the probability that noise alone makes one of all candidates this good.',
-    'Rivals are effects that these poses cannot distinguish from the one named.',
-    'Maps are equal-area and seen from above each pole. They show the direction of up in the '
-    'sensor axes. A hollow square is a pose that was left out.',
+    'Rivals are effects that these poses cannot distinguish from the named effect.',
+    'Maps have equal areas and show each hemisphere from above its pole: the direction of up in '
+    'the sensor axes. A hollow square is a pose that was left out.',
 )
 
 
 def write_page(path: Path, result: Refinement, source: str) -> None:
     """
-    Write the page.
+    Write the report.
 
     Raises
     ------
     OSError
-        If it cannot be written; an earlier file is then unchanged.
+        If the file cannot be written. An earlier file is then unchanged.
 
     """
     text = page(result, source)
@@ -51,19 +52,19 @@ def write_page(path: Path, result: Refinement, source: str) -> None:
 
 def page(result: Refinement, source: str) -> str:
     """
-    Return the page as text.
+    Return the report as HTML.
 
     Parameters
     ----------
     result : Refinement
         The refinement.
     source : str
-        File of the poses.
+        Name of the file of the poses.
 
     """
     title = f'{_TITLE}: {Path(source).name}'
     body = ''.join([*_head(result, source), *_steps(result), *_remainder(result), *_notes(result),
-                    *_reading()])
+                    *_how_to_read()])
     return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
             f'<title>{escape(title)}</title>\n<style>{SHEET}</style>\n</head>\n'
@@ -94,7 +95,7 @@ def _numbers(result: Refinement) -> Iterator[tuple[str, str]]:
     floor = result.noise_floor_mg
     yield 'noise floor', 'not known' if floor is None else f'{short(floor)} mg'
     yield 'poses used', str(len(result.poses_g))
-    yield 'left out', str(len(result.disturbed_poses))
+    yield 'poses left out', str(len(result.disturbed_poses))
 
 
 def _overview(result: Refinement) -> str:
@@ -120,13 +121,13 @@ def _steps(result: Refinement) -> Iterator[str]:
 
 
 def _story(step: Step) -> str:
-    """Return where the disagreement was and how the effect reduced it."""
+    """Return a text about the location of the disagreement, and the effect on the residual."""
     rivals = f' These poses cannot distinguish it from {", ".join(map(_code, step.rivals))}.' if (
         step.rivals) else ''
     return (f'{_code(step.effect)} ({escape(effect_named(step.effect).term)}). Found '
-            f'{escape(step.where)}. With this effect the residual falls from '
+            f'{escape(step.where)}. With this effect the residual decreases from '
             f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
-            f'over held-out poses from {short(step.held_out_before_mg)} to '
+            f'and the held-out residual from {short(step.held_out_before_mg)} to '
             f'{short(step.held_out_after_mg)} mg; '
             f'<span class="whole">{escape(chance(step.p_value))}</span>.{rivals}')
 
@@ -138,7 +139,7 @@ def _remainder(result: Refinement) -> Iterator[str]:
 
 
 def _notes(result: Refinement) -> Iterator[str]:
-    """Yield warnings, advice, the poses left out and what could not be tested."""
+    """Yield warnings, advice, the poses left out and the effects that could not be tested."""
     if result.refusal or result.calibration.warnings:
         yield '<section>\n<h2>Warnings</h2>\n'
         yield _list([*_refusal(result), *result.calibration.warnings])
@@ -148,8 +149,8 @@ def _notes(result: Refinement) -> Iterator[str]:
         yield _list(result.advice)
         yield '</section>\n'
     if result.disturbed_poses:
-        rows = ', '.join(str(row) for row in result.disturbed_poses)
-        yield f'<section>\n<h2>Outliers</h2>\n<p>Left out: rows {rows}.</p>\n</section>\n'
+        rows = listed('row', result.disturbed_poses)
+        yield f'<section>\n<h2>Poses left out</h2>\n<p>Left out: {rows}.</p>\n</section>\n'
     if result.not_testable:
         yield '<section>\n<h2>What these data cannot show</h2>\n'
         yield _table(('effect', 'to see it, record'),
@@ -159,14 +160,14 @@ def _notes(result: Refinement) -> Iterator[str]:
 
 
 def _refusal(result: Refinement) -> list[str]:
-    """Return why the calibration must not be used, in a line, if so."""
+    """Return the reason why the calibration must not be used, if there is one."""
     if not result.refusal:
         return []
     found, advice = result.refusal
     return [f'the refined calibration must not be used: {found}; {advice}']
 
 
-def _reading() -> Iterator[str]:
+def _how_to_read() -> Iterator[str]:
     yield '<section class="reading">\n<h2>How to read this</h2>\n'
     yield _list(_HOW_TO_READ)
     yield '</section>\n'

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The style sheet of the page: legible on a desk, on a phone and on paper."""
+"""The style sheet of the report, for desktops, phones and paper."""
 
 SHEET = """
 html { font: 17px/1.5 "DejaVu Sans", Verdana, "Segoe UI", sans-serif; color: #222;

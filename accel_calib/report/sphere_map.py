@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Residuals over the sphere: two hemispheres in Lambert's equal-area projection.
+Figures of residuals over the sphere: two hemispheres in Lambert's equal-area projection.
 
-A direction u is seen from above its pole, at radius √(1 - |u_z|). Equal areas of the sphere have
-equal areas on the map.
+A direction u is at the radius √(1 - |u_z|) from the pole. Equal areas of the sphere have equal
+areas on the map.
 
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _HEIGHT_INCHES = 3.3
 _INK_PER_POSE = 3500.0
-"""Area of all markers together [points²]; fewer poses get larger ones."""
+"""Total area of the markers [points²]; markers are larger for fewer poses."""
 
 
 def equal_area(force: Floats) -> Floats:
@@ -49,13 +49,13 @@ def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
     residual_mg : (n,) array
         Residual of each pose [mg].
     limit_mg : float
-        Residual with the strongest colour [mg].
+        Residual at the end of the colour scale [mg].
     signed : bool
-        Whether residuals have a sign.
+        Whether the residuals are signed.
     left_out : (d, 3) array
-        Directions of the poses that were left out.
+        Directions of the poses left out.
     rows : tuple of int
-        Their rows.
+        Rows of the poses left out.
 
     """
     with styled():
@@ -76,7 +76,7 @@ def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
 
 
 def _draw_disc(disc: Any, *, up: bool) -> None:
-    """Draw the hemisphere of +z or -z with the sensor axes."""
+    """Draw the map of the hemisphere +z or -z with the sensor axes."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     disc.fill(np.cos(angle), np.sin(angle), facecolor='#fafafa', edgecolor='#888888', zorder=0)
     middle = np.sqrt(1.0 - np.sqrt(0.5))
@@ -101,7 +101,7 @@ def _draw_poses(disc: Any, force: Floats, residual_mg: Floats, limit_mg: float, 
 
 
 def _draw_left_out(disc: Any, left_out: Floats, rows: tuple[int, ...], *, up: bool) -> None:
-    """Draw the poses that were left out as hollow squares, with their rows."""
+    """Draw the poses left out as hollow squares with their rows."""
     for place, z, row in zip(equal_area(left_out), left_out[:, 2], rows, strict=True):
         if (z >= 0.0) == up:
             disc.plot(*place, marker='s', markersize=8, fillstyle='none', color=ACCENT, zorder=4)

@@ -4,9 +4,9 @@
 """
 Style of the figures, and their output as SVG and PNG.
 
-Figures are half a page wide: a phone shows one column of them, a desktop two, with text of the
-same size. Colours are from Okabe and Ito's palette and from RdBu, which people with colour
-blindness can distinguish. matplotlib is imported only when a figure is drawn.
+A figure has half the width of the page: a phone shows one column, a desktop two columns, with the
+same text size. The colours are from Okabe and Ito's palette and from RdBu, which people with
+colour blindness can distinguish. matplotlib is imported only when a figure is drawn.
 
 """
 
@@ -55,12 +55,12 @@ def check_matplotlib() -> None:
 
     """
     if find_spec('matplotlib') is None:
-        raise InputError('figures need matplotlib, which is not installed',
-                         "pip install 'accel_calib[report]'")
+        raise InputError('matplotlib is not installed, but figures need it',
+                         "run pip install 'accel_calib[report]'")
 
 
 def styled() -> Any:
-    """Return the context in which figures are drawn and saved."""
+    """Return the context manager for drawing and saving figures."""
     from matplotlib import rc_context
 
     return rc_context(_STYLE)
@@ -87,7 +87,7 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
     figure : Figure
         The figure.
     prefix : str
-        Put before its ids, which must be unique on the page.
+        Prefix of the ids, which must be unique on the page.
     title : str
         Description for screen readers, already escaped.
 
@@ -106,6 +106,6 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure to a file; its suffix sets the format."""
+    """Write a figure to a file; the suffix sets the format."""
     with styled():
         figure.savefig(path, dpi=_PNG_DPI, facecolor='white')

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The nodes: convert, call, publish.
+The ROS nodes. They only convert messages, call other parts, and publish the results.
 
-`calibrator` and `simulator` are the executables, `calibrator_node` and `simulator_node` the nodes;
-`run` starts, spins and ends them. Of the calibrator, `stream` is the way of an Imu message,
-`services` answers, `worker` runs jobs, `diagnostics` and `markers` make messages, `declare`
-declares parameters. `demo` shows both nodes at work.
+`calibrator` and `simulator` are the executables, and `calibrator_node` and `simulator_node` the
+nodes; `run` starts, spins and ends them. In the calibrator, `stream` processes Imu messages,
+`services` answers service calls, `worker` runs jobs, `diagnostics` and `markers` make messages,
+and `declare` declares parameters. `demo` runs both nodes as a demonstration.
 
-All callbacks run in one thread, and only they use the session.
+All callbacks run in one thread, and only callbacks use the session.
 
 """

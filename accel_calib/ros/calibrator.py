@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibrator: Imu in, corrected Imu out; see `calibrator_node`."""
+"""The executable ``calibrator``; see `calibrator_node`."""
 
 from __future__ import annotations
 

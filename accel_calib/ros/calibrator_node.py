@@ -4,8 +4,8 @@
 """
 The calibrator node: it converts messages, calls the session, and publishes its events.
 
-`accel_calib.session` holds the state; `stream` is the way of an Imu message. Diagnostics are timed
-by a steady clock, so they come without ``/clock`` too.
+`accel_calib.session` contains the state, and `stream` processes Imu messages. Diagnostics use a
+steady clock, so they are also published without ``/clock``.
 
 """
 
@@ -47,7 +47,7 @@ class CalibratorNode(Node):
                                self.resolve_topic_name('imu/data_raw'))
         follow(self, lambda: self.session.settings, self._set_settings)
         self._worker = Worker(self, self._handle_events)
-        self._said: dict[str, float] = {}
+        self._last_logged: dict[str, float] = {}
         self._still = self.create_publisher(Bool, '~/still', qos.LATCHED)
         self._poses = self.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -58,23 +58,23 @@ class CalibratorNode(Node):
         self._still.publish(Bool(data=False))
         services = Services(self, self._worker, self._handle_events)
         for name in _TRIGGERS:
-            services.serve(name, self._up_to_date(name))
+            services.serve(name, self._command(name))
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(SelfTest, '~/self_test', self._on_self_test)
 
     def start(self) -> None:
-        """Begin, once there is an executor."""
+        """Start; to be called when the node has an executor."""
         self._handle_events()
         self.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True)
         self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
         self.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _up_to_date(self, name: str) -> Any:
-        """Return a command of the session that first sees all messages so far."""
+    def _command(self, name: str) -> Any:
+        """Return a command of the session that first processes all messages so far."""
         command = getattr(self.session, name)
 
         def call() -> str | Job:
-            self.stream.take_in()
+            self.stream.flush()
             found: str | Job = command()
             return found
 
@@ -88,14 +88,14 @@ class CalibratorNode(Node):
             self.stream.on_message(data)
         except RuntimeError:
             if self.context.ok():
-                raise  # otherwise it was publishing while a signal came
+                raise  # otherwise a signal came during publishing
 
     def _on_temperature(self, message: Temperature) -> None:
         self.stream.set_temperature(message.temperature)
 
     def _on_tick(self) -> None:
         """Publish the diagnostics."""
-        self.stream.take_in()
+        self.stream.flush()
         self.session.tick()
         self._handle_events()
         array = DiagnosticArray(status=[status_of(self.session.health())])
@@ -107,7 +107,7 @@ class CalibratorNode(Node):
         return response
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
-        self.stream.take_in()
+        self.stream.flush()
         health = self.session.health()
         response.id = health.sensor
         response.status = self_test_of(health)
@@ -136,10 +136,10 @@ class CalibratorNode(Node):
             return
         if line.once_in:
             kind, now = line.words[:20], monotonic()
-            if now - self._said.get(kind, -line.once_in) < line.once_in:
+            if now - self._last_logged.get(kind, -line.once_in) < line.once_in:
                 return
-            self._said[kind] = now
-        log = self.get_logger()  # which wants a line of code for each severity
+            self._last_logged[kind] = now
+        log = self.get_logger()  # rclpy needs a separate line of code for each severity
         if line.severity == 'error':
             log.error(line.words)
         elif line.severity == 'warning':
@@ -148,6 +148,6 @@ class CalibratorNode(Node):
             log.info(line.words)
 
     def close(self) -> None:
-        """Finish what is being written."""
+        """Finish writing, and release the files."""
         self._worker.close()
         self.session.close()

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Declare parameters in a node."""
+"""Declaration of parameters in a node."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def declared(node: Node, kind: type[Settings]) -> Settings:
             parameter.name, default_of(parameter), _descriptor(parameter)).value
             for parameter in fields(kind)}
     except InvalidParameterValueException as error:
-        raise InputError(str(error), 'give such a value') from error
+        raise InputError(str(error), 'correct the value') from error
     return changed(kind(), values)
 
 
 def follow(node: Node, settings: Callable[[], Settings],
            adopt: Callable[[Settings], None]) -> None:
-    """Adopt new settings when parameters are set, and refuse bad values."""
+    """Pass new settings to `adopt` when parameters are set; refuse invalid values."""
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         values = {parameter.name: parameter.value for parameter in parameters}
         try:

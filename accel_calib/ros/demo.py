@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The main job without hardware: simulator and calibrator in processes of their own, over DDS.
+A demonstration without hardware: simulator and calibrator in separate processes, over DDS.
 
-This process is their user: it waits for the poses, calls ``~/fit`` and ``~/set_level``, and then
-compares raw and corrected messages with the truth of the simulator while the sensor is turned
+This process acts as the user. It waits for the poses and calls ``~/fit`` and ``~/set_level``. Then
+it compares raw and corrected messages with the truth of the simulator while the sensor turns
 again.
 
 """
@@ -37,7 +37,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from . import qos
-from ..errors import AccelCalibError
+from ..errors import AccelCalibError, counted
 from ..table import Floats
 from ..units import MG, STANDARD_GRAVITY
 
@@ -51,24 +51,24 @@ _PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
 
 
 _Spin = Callable[[Callable[[], bool], str], None]
-"""Spins until a condition holds; the error names what was waited for."""
+"""Function that spins until a condition is true; the text names the condition in errors."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """
-    Raw and corrected messages against the truth, over rests in several orientations.
+    Errors of raw and corrected messages, over rests in several orientations.
 
     Parameters
     ----------
     rests : int
-        Number of orientations.
+        Number of rests.
     rms_before_mg, rms_after_mg : float
         RMS of |a| - 1 g [mg].
     max_before_mg, max_after_mg : float
-        Largest of them [mg].
+        Largest | |a| - 1 g | [mg].
     tilt_before_deg, tilt_after_deg : float
-        RMS angle between the measured and the true direction of up [°].
+        RMS angle between measured and true direction of up [°].
     seconds : float
         Duration of the demonstration.
 
@@ -85,7 +85,7 @@ class Outcome:
 
 
 class _User(Node):
-    """Listen to both nodes, and call the calibrator."""
+    """A node that receives the messages of both nodes and calls the calibrator."""
 
     def __init__(self) -> None:
         super().__init__('demo')
@@ -112,7 +112,7 @@ class _User(Node):
         return keep
 
     def is_flat(self) -> bool:
-        """Return whether the robot lies flat now."""
+        """Return whether the robot is flat now."""
         truth = self.messages['truth']
         return bool(truth) and truth[max(truth)] == (0.0, 0.0, STANDARD_GRAVITY)
 
@@ -126,17 +126,17 @@ def _at_least(user: _User, count: int) -> bool:
 
 
 class DemoError(AccelCalibError):
-    """The demonstration did not reach its end."""
+    """The demonstration failed."""
 
 
-def demonstrate(tell: Callable[[str], None]) -> Outcome:
+def demonstrate(report: Callable[[str], None]) -> Outcome:
     """
-    Run the whole demonstration.
+    Run the demonstration.
 
     Parameters
     ----------
-    tell : callable
-        Called with a line for each step.
+    report : callable
+        Function that is called with a line for each step.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def demonstrate(tell: Callable[[str], None]) -> Outcome:
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
         _set_environment(Path(folder))
-        tell('starting a simulated Imu, turned by hand, and the calibrator node')
+        report('starting a simulated Imu, turned by hand, and the calibrator node')
         processes = [
             stack.enter_context(_process('node', {'sensor': 'demo'})),
             stack.enter_context(_process('simulator', {
@@ -162,10 +162,10 @@ def demonstrate(tell: Callable[[str], None]) -> Outcome:
         spin(lambda: user.poses > 0, 'the first pose')
         for count in range(4, POSES + 1, 4):
             spin(partial(_at_least, user, count), f'{count} poses')
-            tell(f'{count} still poses captured')
-        tell(f'~/fit: {_call(user, spin, "fit")}')
+            report(f'captured {count} poses')
+        report(f'~/fit: {_call(user, spin, "fit")}')
         spin(user.is_flat, 'the flat pose')
-        tell(f'~/set_level: {_call_patiently(user, spin, "set_level")}')
+        report(f'~/set_level: {_call_patiently(user, spin, "set_level")}')
         for messages in user.messages.values():
             messages.clear()
         spin(lambda: len(_rests(user)) > _CHECKED, f'{_CHECKED} more rests')
@@ -173,7 +173,7 @@ def demonstrate(tell: Callable[[str], None]) -> Outcome:
 
 
 def _set_environment(folder: Path) -> None:
-    """Isolate this demonstration: a domain of its own, this machine only, files of its own."""
+    """Isolate the demonstration: own domain, local machine only, own files."""
     os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
                       ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
                       ROS_LOG_DIR=str(folder / 'log'))
@@ -182,7 +182,7 @@ def _set_environment(folder: Path) -> None:
 @contextmanager
 def _process(command: str, parameters: dict[str, Any]
              ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node as a user would, and end it."""
+    """Run a node in a process, and end it."""
     given = [part for name, value in parameters.items()
              for part in ('-p', f'{name}:={_in_yaml(value)}')]
     process = subprocess.Popen(
@@ -205,7 +205,7 @@ def _in_yaml(value: Any) -> str:
 
 @contextmanager
 def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User, _Spin]]:
-    """Yield the user of the nodes, and a function that spins until a condition holds."""
+    """Yield the user of the nodes, and a function that spins until a condition is true."""
     rclpy.init(args=[])
     user = _User()
     executor = SingleThreadedExecutor()
@@ -215,10 +215,10 @@ def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User,
         ends = time.monotonic() + _PATIENCE
         while not until():
             if any(process.poll() is not None for process in processes):
-                raise DemoError('a node has ended', 'see its output above')
+                raise DemoError('a node has ended unexpectedly', 'see its output above')
             if time.monotonic() > ends:
-                raise DemoError(f'{what} did not come within {_PATIENCE:.0f} s, '
-                                f'{user.poses} poses so far',
+                raise DemoError(f'{what}: not available within {_PATIENCE:.0f} s, '
+                                f'{counted(user.poses, "pose")} so far',
                                 'check whether a firewall blocks DDS on this machine')
             look_again = time.monotonic() + _LOOK_EVERY
             while time.monotonic() < look_again:
@@ -242,7 +242,7 @@ def _request(user: _User, spin: _Spin, name: str) -> Trigger.Response:
 
 
 def _call(user: _User, spin: _Spin, name: str) -> str:
-    """Call a service of the calibrator that must succeed."""
+    """Call a service of the calibrator; raise DemoError if it fails."""
     answer = _request(user, spin, name)
     if not answer.success:
         raise DemoError(f'~/{name} answered: {answer.message}', 'run the demonstration again')
@@ -250,7 +250,7 @@ def _call(user: _User, spin: _Spin, name: str) -> str:
 
 
 def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
-    """Call a service until the sensor has been still for long enough."""
+    """Call a service repeatedly until the sensor has been still for long enough."""
     while user.is_flat():
         answer = _request(user, spin, name)
         if answer.success:
@@ -260,7 +260,7 @@ def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
 
 
 def _rests(user: _User) -> list[dict[str, Floats]]:
-    """Return the means of raw, corrected and true acceleration over each whole rest, in g."""
+    """Return the means of raw, corrected and true acceleration over each complete rest [g]."""
     common = sorted(set.intersection(*(set(kept) for kept in user.messages.values())))
     if len(common) < 2:
         return []

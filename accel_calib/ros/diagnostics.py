@@ -12,14 +12,14 @@ from ..session.health import figures
 
 
 def status_of(health: Health) -> DiagnosticStatus:
-    """Return the diagnostics: the most severe finding, and the figures."""
+    """Return the diagnostics: the most severe finding, and the values."""
     status = _status(worst(health), 'calibrator', health)
     status.values = [KeyValue(key=key, value=value) for key, value in figures(health)]
     return status
 
 
 def self_test_of(health: Health) -> list[DiagnosticStatus]:
-    """Return one status for each finding; all must be OK to pass."""
+    """Return one status for each finding; the test passes if all are OK."""
     return [_status(finding, finding.name, health) for finding in findings(health)]
 
 

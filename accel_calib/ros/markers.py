@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses on the unit sphere, for rviz: the captured ones and the next one."""
+"""Markers for rviz: captured poses and the next pose on the unit sphere."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerArray:
     """
-    Draw poses.
+    Return the markers of poses.
 
     Parameters
     ----------
@@ -41,7 +41,8 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     Returns
     -------
     MarkerArray
-        It replaces what was drawn before: namespaces ``sphere``, ``poses``, ``numbers``, ``next``.
+        Markers in the namespaces ``sphere``, ``poses``, ``numbers`` and ``next``; they replace all
+        earlier markers.
 
     """
     markers = [Marker(action=Marker.DELETEALL),

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start, spin and end a node cleanly, however the user ends it."""
+"""Start, spin and shut down a node, also after Ctrl-C and other signals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOOK_EVERY = 0.25
 """Interval at which the shutdown of ROS is checked [s]."""
 
 _SWITCH = 1e-4
-"""Time after which another thread gives the interpreter to a message [s]."""
+"""Switch interval of the interpreter [s]; the longest wait of a message for another thread."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
@@ -36,12 +36,12 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     node : str
         ``module:class`` of the node, in this package.
     args : sequence of str, optional
-        Command line with the name of the program first; default: that of the process.
+        Command line, starting with the program name; by default that of the process.
 
     Returns
     -------
     int
-        Exit status: 0, or 2 if the input or ROS itself is missing or wrong.
+        Exit status: 0, or 2 if the input is invalid or ROS is not available.
 
     """
     try:
@@ -51,7 +51,7 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
 
 
 def _run(node: str, args: Sequence[str] | None) -> int:
-    """Start ROS, run the node, end ROS."""
+    """Start ROS, run the node, and shut down ROS."""
     try:
         import rclpy
     except ImportError as error:
@@ -70,7 +70,7 @@ def _run(node: str, args: Sequence[str] | None) -> int:
     except AccelCalibError as error:
         return _refuse(str(error))
     finally:
-        # Under launch a Ctrl-C comes twice, and the second would cut the shutdown short.
+        # Under launch, Ctrl-C arrives twice; the second one would interrupt the shutdown.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         rclpy.try_shutdown()
     return _OK
@@ -85,17 +85,17 @@ def _spin(node: str) -> None:
     executor = _executor()
     executor.add_node(instance)
     sys.setswitchinterval(_SWITCH)
-    gc.freeze()  # what exists now stays; to scan it again would take tens of ms
+    gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
     try:
         instance.start()
         while instance.context.ok():
-            # EventsExecutor.spin() ignores signals, and one future would keep each of these calls.
+            # EventsExecutor.spin() ignores signals. A new future per call avoids a memory leak.
             executor.spin_until_future_complete(Future(), timeout_sec=_LOOK_EVERY)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except RuntimeError:
         if instance.context.ok():
-            raise  # otherwise a callback was publishing while a signal came
+            raise  # otherwise a signal came while a callback was publishing
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         instance.close()
@@ -104,7 +104,7 @@ def _spin(node: str) -> None:
 
 
 def _executor() -> Executor:
-    """Return the executor that costs least."""
+    """Return the executor with the least overhead."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:

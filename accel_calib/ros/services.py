@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Services that answer with the result of a command.
+Services that respond with the result of a command.
 
-A command returns an answer or a `Job`, or raises an error: the response is then ``success: false``
-with what was found and what to do. The response to a job is sent when the job is done, so that no
-callback waits. This works with every executor; coroutines as service callbacks, which rclpy has
-for this, do not work with EventsExecutor.
+A command returns an answer or a `Job`, or raises an error. For an error the response is ``success:
+false`` with the message of the error. For a job the response is sent when the job is done, so that
+no callback waits. This works with every executor. Coroutines as service callbacks, which rclpy
+offers for this purpose, do not work with EventsExecutor.
 
 """
 
@@ -36,9 +36,9 @@ class Services:
     node : Node
         The node.
     worker : Worker
-        Runs the jobs.
+        Worker that runs the jobs.
     on_events : callable
-        Called after each command.
+        Function that is called after each command.
 
     """
 
@@ -46,7 +46,7 @@ class Services:
         self._node, self._worker, self._on_events = node, worker, on_events
 
     def serve(self, name: str, command: Callable[[], str | Job]) -> None:
-        """Make the service ``~/name``."""
+        """Create the service ``~/name``."""
         def callback(request: Trigger.Request, response: Trigger.Response) -> Any:
             try:
                 found = command()
@@ -59,7 +59,7 @@ class Services:
         self._answer_later(self._node.create_service(Trigger, f'~/{name}', callback))
 
     def _answer_later(self, service: Service) -> None:
-        """Let the callback of this service return a job."""
+        """Change this service so that its callback can return a job."""
         send = service.send_response
 
         def send_response(response: Any, header: Any) -> None:
@@ -72,7 +72,7 @@ class Services:
         service.send_response = send_response
 
     def _response(self, success: bool, words: str) -> Trigger.Response:
-        """Return a response, and log it."""
+        """Log a response, and return it."""
         log = self._node.get_logger()
         if success:
             log.info(words)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The simulator: an Imu that turns through poses; see `simulator_node`."""
+"""The executable ``simulator``; see `simulator_node`."""
 
 from __future__ import annotations
 

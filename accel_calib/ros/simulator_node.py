@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The simulator node: an Imu, and its temperature, that turns through poses.
+The simulator node: it publishes an Imu that turns through poses, and its temperature.
 
-All samples are simulated before the first is sent, by `accel_calib.simulate`; a timer sends those
-that are due, with stamps exactly 1/rate apart. Acceleration is in m/s². ``~/truth`` is the
-specific force of the robot, without any effect, noise or mounting.
+`accel_calib.simulate` simulates all samples before the first message. A timer then publishes the
+samples that are due, with stamps at intervals of exactly 1/rate. The acceleration is in m/s².
+``~/truth`` is the specific force of the robot, without effects, noise and mounting.
 
 """
 
@@ -33,10 +33,10 @@ from ..units import STANDARD_GRAVITY
 
 _FLAT = np.array([[0.0, 0.0, 1.0]])
 _TEMPERATURE_EVERY = 0.1
-"""Time between messages of temperature [s]."""
+"""Interval between temperature messages [s]."""
 
 _LONGEST_TICK = 0.005
-"""Longest time between checks of the clock [s]."""
+"""Longest interval between checks of the clock [s]."""
 
 
 @dataclass(frozen=True)
@@ -44,29 +44,30 @@ class SimulatorSettings:
     """Parameters of the simulator."""
 
     frame_id: str = parameter('imu', 'frame_id of the messages')
-    rate: float = parameter(200.0, 'Messages a second [Hz]', limits=(1.0, 10000.0))
-    poses: int = parameter(12, 'Poses, spread evenly over the sphere', limits=(1, 1000))
-    dwell: float = parameter(3.0, 'Time in each pose [s]', limits=(0.01, 3600.0))
-    turn: float = parameter(1.0, 'Time of the turn between poses [s]', limits=(0.01, 3600.0))
+    rate: float = parameter(200.0, 'Messages per second [Hz]', limits=(1.0, 10000.0))
+    poses: int = parameter(12, 'Number of poses, spread evenly over the sphere', limits=(1, 1000))
+    dwell: float = parameter(3.0, 'Duration of each pose [s]', limits=(0.01, 3600.0))
+    turn: float = parameter(1.0, 'Duration of each turn between poses [s]', limits=(0.01, 3600.0))
     wait: float = parameter(
-        0.0, 'Before the first pose, wait this long for listeners [s]. 0: start at once',
+        0.0, 'Longest time to wait for subscribers before the first pose [s]. 0: start at once',
         limits=(0.0, 3600.0))
-    listeners: int = parameter(1, 'Listeners to wait for', limits=(1, 100))
+    listeners: int = parameter(1, 'Number of subscribers to wait for', limits=(1, 100))
     loop: bool = parameter(False, 'Start again after the last pose')
-    hold: bool = parameter(True, 'Hold the last pose; otherwise the node ends after it')
-    flat_first: bool = parameter(False, 'Lie flat (z of the robot up) before the poses')
-    flat_last: bool = parameter(True, 'Lie flat (z of the robot up) after the poses')
+    hold: bool = parameter(True, 'Stay in the last pose; otherwise the node ends after it')
+    flat_first: bool = parameter(False, 'Add a flat pose (z of the robot up) before the poses')
+    flat_last: bool = parameter(True, 'Add a flat pose (z of the robot up) after the poses')
     mounting: list[float] = parameter(
         [0.0, 0.0, 0.0], 'Roll, pitch and yaw of the sensor on the robot [°]')
     effects: list[str] = parameter(
-        [''], "What is wrong with the sensor, as 'offset=0.1,-0.2,0.3' in the units of the "
-        'catalogue (g)')
-    noise: float = parameter(0.02, 'Standard deviation of a sample [m/s²]', limits=(0.0, 10.0))
-    gyro_noise: float = parameter(0.002, 'Standard deviation of a sample [rad/s]',
+        [''], "Effects of the sensor, such as 'offset=0.1,-0.2,0.3' in the units of the catalogue "
+        '(g)')
+    noise: float = parameter(0.02, 'Standard deviation of an acceleration sample [m/s²]',
+                             limits=(0.0, 10.0))
+    gyro_noise: float = parameter(0.002, 'Standard deviation of an angular rate sample [rad/s]',
                                   limits=(0.0, 10.0))
     gravity: float = parameter(STANDARD_GRAVITY, 'Local gravity [m/s²]', limits=(1.0, 30.0))
     temperature: list[float] = parameter(
-        [25.0, 25.0], 'Temperature at the first and the last sample [°C]')
+        [25.0, 25.0], 'Temperature of the first and of the last sample [°C]')
     seed: int = parameter(1, 'Seed of the noise', limits=(0, 2 ** 31 - 1))
 
 
@@ -86,13 +87,13 @@ class SimulatorNode(Node):
         self._began_steady = 0.0
 
     def start(self) -> None:
-        """Begin, once there is an executor."""
+        """Start; to be called when the node has an executor."""
         self._patience_ends = time.monotonic() + self.settings.wait
         self.create_timer(min(1.0 / self.settings.rate, _LONGEST_TICK), self._on_tick,
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_tick(self) -> None:
-        """Send the samples that are due."""
+        """Publish the samples that are due."""
         now = time.monotonic()
         if self._sent == 0:
             listeners = self._imu.get_subscription_count()
@@ -109,7 +110,7 @@ class SimulatorNode(Node):
             self._sent += 1
 
     def _row(self, number: int) -> int | None:
-        """Return the row of the n-th sample; None after the last one."""
+        """Return the row of the n-th sample, or None after the last sample."""
         count = len(self._recording)
         if number < count or self.settings.loop:
             return number % count
@@ -132,17 +133,17 @@ class SimulatorNode(Node):
                 header=header, temperature=float(recording['temperature'][row])))
 
     def close(self) -> None:
-        """Do nothing: there is nothing to finish."""
+        """Do nothing, because there is nothing to finish."""
 
 
 def recording_of(settings: SimulatorSettings) -> Recording:
     """
-    Simulate all samples.
+    Return all simulated samples.
 
     Returns
     -------
     Recording
-        In g.
+        The samples, in g.
 
     Raises
     ------
@@ -150,7 +151,7 @@ def recording_of(settings: SimulatorSettings) -> Recording:
         If an effect is not in the catalogue.
 
     """
-    # The URDF of the sensor takes its axes to the robot's, ΔR the robot's to its axes.
+    # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = rotation_from_rpy(*np.radians(settings.mounting)).T
     effects = dict(parse_effect(text) for text in settings.effects if text)
     flat = [_FLAT] * settings.flat_first, [_FLAT] * settings.flat_last
@@ -163,7 +164,7 @@ def recording_of(settings: SimulatorSettings) -> Recording:
 
 
 def _empty_message(settings: SimulatorSettings) -> Imu:
-    """Return a message with the fields that stay the same."""
+    """Return a message with the fields that do not change."""
     message = Imu()
     message.orientation_covariance[0] = -1.0
     message.angular_velocity_covariance = (np.eye(3) * settings.gyro_noise ** 2).ravel()

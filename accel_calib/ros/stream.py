@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The way of an Imu message, from imu/data_raw to imu/data_calibrated.
+Processing of Imu messages, from imu/data_raw to imu/data_calibrated.
 
-Messages stay serialized. Each is corrected and published at once; the session gets them later,
-several as one array, which is cheaper and delays no message. A message in another encoding (byte
-order) is serialized again in the usual one and then goes the same way.
+Messages remain serialized. Each message is corrected and published at once. The session receives
+several messages as one array later, which is cheaper and does not delay a message. A message in
+another encoding (byte order) is serialized again in the usual encoding and then processed in the
+same way.
 
 """
 
@@ -38,10 +39,10 @@ from ..session import CalibratorSettings, Session
 
 _TOGETHER = 0.3
 """
-Batch interval of the session [s]; listeners are counted as often.
+Batch interval of the session [s], and interval between counts of the subscribers.
 
-A batch takes some ms on a slow machine, and the message that comes meanwhile waits: at 3 batches a
-second that is less than 1 message in 100 from 1 kHz on.
+A batch takes several ms on a slow machine, and messages that arrive in this time wait. At 1 kHz
+and 3 batches per second, these are less than 1 % of the messages.
 
 """
 
@@ -55,11 +56,11 @@ class Stream:
     Parameters
     ----------
     session : Session
-        Gets the samples and has the calibration.
+        The session; it receives the samples and contains the calibration.
     calibrated, motion : Publisher
-        Of corrected messages, and of the acceleration without gravity.
+        Publishers of corrected messages, and of the acceleration without gravity.
     on_events : callable
-        Called after the session got samples.
+        Function that is called after the session received samples.
 
     """
 
@@ -79,13 +80,13 @@ class Stream:
         self._settings: CalibratorSettings | None = None
 
     def set_temperature(self, temperature: float) -> None:
-        """Set the temperature of the messages that follow [°C]; NaN is ignored."""
+        """Set the temperature of the following messages [°C]; NaN is ignored."""
         if math.isfinite(temperature):
             self._temperature = temperature
             self._session.set_temperature(temperature)
 
     def on_message(self, data: bytes) -> None:
-        """Correct and publish a serialized Imu."""
+        """Correct and publish a serialized Imu message."""
         now = monotonic()
         due = now >= self._due
         if due:
@@ -105,18 +106,18 @@ class Stream:
         self._arrived = now
         if due:
             self._due = now + _TOGETHER
-            self.take_in()
+            self.flush()
 
     def _count_listeners(self) -> None:
-        """Count who listens: what nobody listens to is not made."""
+        """Count the subscribers; messages without subscribers are not computed."""
         self._listeners = self._calibrated.get_subscription_count()
         self._motion_listeners = self._motion.get_subscription_count()
 
     def _adopted(self, data: bytes) -> bytes | None:
         """
-        Return a message that differs from the one before, in the usual encoding.
+        Return a message with a new layout, in the usual encoding.
 
-        None if it cannot be read, or is of another sensor.
+        The result is None if the message cannot be read, or is from another sensor.
 
         """
         layout = layout_of(data)
@@ -127,14 +128,14 @@ class Stream:
             self._session.drop_unreadable(len(data))
             return None
         if layout != self._layout:
-            self.take_in()
+            self.flush()
             if not self._session.accepts(layout.frame_id):
                 return None
             self._layout, self._settings = layout, None
         return data
 
     def _send(self, data: bytes) -> None:
-        """Publish the corrected message, or the raw one if that is asked for."""
+        """Publish the corrected message, or the raw message if so configured."""
         session = self._session
         active, settings = session.active, session.settings
         if not session.publishes:
@@ -152,7 +153,7 @@ class Stream:
             self._rewrite(data, self._rewriter)
 
     def _rewrite(self, data: bytes, rewriter: Rewriter) -> None:
-        """Publish the corrected message, and its motion."""
+        """Publish the corrected message, and the acceleration without gravity."""
         try:
             corrected = rewriter(data, self._temperature)
         except AccelCalibError as error:
@@ -166,8 +167,8 @@ class Stream:
         if self._motion_listeners and gravity is not None:
             self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
 
-    def take_in(self) -> None:
-        """Give the session the messages that wait for it."""
+    def flush(self) -> None:
+        """Pass the waiting messages to the session."""
         if self._waiting:
             waiting, self._waiting = self._waiting, []
             temperatures, self._temperatures = self._temperatures, []
@@ -180,8 +181,8 @@ class Stream:
 
 
 def _usual(data: bytes) -> bytes:
-    """Return an Imu in the usual encoding; nothing if the middleware cannot read it."""
+    """Return an Imu message in the usual encoding; empty if the middleware cannot read it."""
     try:
         return bytes(serialize_message(deserialize_message(data, Imu)))
-    except Exception:  # each middleware has errors of its own; the caller reports the message
+    except Exception:  # each middleware has its own errors; the caller reports the message
         return b''

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The thread of a node for jobs: files, and waiting for the worker process.
+The thread of a node for jobs, which use files and wait for the worker process.
 
-Jobs run in that thread, in the order given, and finish as callbacks in the thread of the executor,
-so that only callbacks change the session.
+Jobs run in this thread one after the other, and finish as callbacks in the thread of the executor.
+Only callbacks therefore change the session.
 
 """
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
 Answer = Callable[[bool, str], object]
-"""Takes whether a job succeeded, and its result in words."""
+"""Function of the success of a job, and of a text about its result."""
 
 
 class Worker:
     """
-    A thread beside the executor of a node.
+    The thread for the jobs of a node.
 
     Parameters
     ----------
     node : Node
         The node.
     on_events : callable
-        Called after each job, in the thread of the executor.
+        Function that is called after each job, in the thread of the executor.
 
     """
 
@@ -48,7 +48,7 @@ class Worker:
         self._process = WorkerProcess()
 
     def run(self, job: Job, answer: Answer) -> None:
-        """Run a job in the thread, finish it in the executor, and answer."""
+        """Run a job in the thread, finish it in the executor, and call `answer`."""
         future = self._pool.submit(job.run, self._process.call)
         future.add_done_callback(lambda done: self._call_back(job, answer, done))
 
@@ -56,11 +56,11 @@ class Worker:
         self._done.put(lambda: self._finish(job, answer, done))
         executor = self._node.executor
         if executor is not None:
-            # The executor may run tasks in any order; the queue keeps that of the jobs.
+            # The executor may run tasks in any order; the queue keeps the order of the jobs.
             executor.create_task(lambda: self._done.get()())
 
     def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
-        """Finish a job and answer; a fault of the program is logged, and the stream goes on."""
+        """Finish a job and call `answer`; unexpected errors are logged, and the node continues."""
         try:
             words, success = job.finish(done.result()), True
         except AccelCalibError as error:
@@ -69,13 +69,13 @@ class Worker:
             words = f'{error}; correct the permissions, or set calibration_file'
             success = False
         except Exception as error:
-            self._node.get_logger().error(f'a fault in accel_calib:\n{format_exc()}')
-            words = f'a fault in accel_calib ({error!r}); please report it with the log'
+            self._node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+            words = f'unexpected error in accel_calib ({error!r}); please report it with the log'
             success = False
         answer(success, words)
         self._on_events()
 
     def close(self) -> None:
-        """End what is being computed, and finish what is being written."""
+        """Stop the computation, and finish writing."""
         self._process.close()
         self._pool.shutdown(wait=True)

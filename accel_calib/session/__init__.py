@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibrator without ROS: samples and commands in, answers and events out.
+The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the way in. `live_capture` and `pose_book` capture poses, `active_calibration` holds
-the calibration in use, `store` and `sensor_files` are about files, `work` computes, in the process
-of `worker_process`; `statistics` and `health` describe the state; `settings` and `parameters` are
-the parameters.
+`session` is the entry point. `live_capture` and `pose_book` capture poses. `active_calibration`
+contains the calibration in use. `store` and `sensor_files` manage files. `work` contains the
+computations, which run in the process of `worker_process`. `stream_statistics` and `health`
+describe the state. `settings` and `parameters` define the parameters.
 
 """
 
 from .events import Event, Job, Log, ShowPoses, Still
-from .health import Finding, findings, Health, Level, worst
+from .health import Finding, findings, Health, worst
 from .session import Session
 from .settings import CalibratorSettings
 
-__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Level', 'Log', 'Session',
+__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'Session',
            'ShowPoses', 'Still', 'findings', 'worst']

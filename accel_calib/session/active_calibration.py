@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibration in use, and its agreement with the rests since.
+The calibration in use, and its comparison with the rests since the fit.
 
-Gravity is the mean corrected force of the last rest, held and subtracted while the sensor moves
-(Intan RHD2000 application note): good for motion near the attitude of that rest.
+Gravity is the mean corrected force of the last rest. It is subtracted while the sensor moves
+(Intan RHD2000 application note). This is accurate for motion near the orientation of that rest.
 
-Every rest is compared with 1 g (`accel_calib.monitor`) as soon as it counts; its final average
-replaces that. A robot may stand for weeks: each `LONG_REST` of a long rest counts as one rest.
+Every rest is compared with 1 g (`accel_calib.monitor`) as soon as it is long enough. The final
+average replaces this first comparison. A robot can stand for weeks, so each interval `LONG_REST`
+of a long rest counts as one rest.
 
 """
 
@@ -30,14 +31,14 @@ from ..table import Floats
 from ..units import Units
 
 _SHORT_REST = 30.0
-"""The remainder of a rest of which a part was counted is ignored if it is shorter [s]."""
+"""Shortest remainder of a partly counted rest that counts [s]."""
 
 _NONE = np.zeros((1, 3))
 
 
 class ActiveCalibration:
     """
-    A calibration, whether it is switched on, and the last rest.
+    The calibration in use, its drift, and the last rest.
 
     Parameters
     ----------
@@ -47,11 +48,11 @@ class ActiveCalibration:
     Attributes
     ----------
     calibration : Calibration or None
-        The one in use.
+        The calibration in use.
     drift : Drift or None
-        What the rests show; None without a calibration.
+        State of the drift monitor; None without a calibration.
     scale : float
-        m/s² in one unit of corrected force.
+        m/s² per unit of corrected force.
     gravity : (3,) array or None
         Corrected force of the last rest [m/s²].
 
@@ -69,7 +70,7 @@ class ActiveCalibration:
         self.gravity: Floats | None = None
 
     def adopt(self, calibration: Calibration | None) -> None:
-        """Use this calibration from now on; drift begins anew, unless it is only levelled."""
+        """Use this calibration; the drift monitor restarts unless only the mounting differs."""
         if not _only_levelled(self.calibration, calibration):
             self._past = None if calibration is None else monitor(calibration)
             self._counted = self.rest
@@ -84,14 +85,14 @@ class ActiveCalibration:
 
     def update(self, rest: Dwell, least: float) -> None:
         """
-        Compare an ongoing rest.
+        Compare an ongoing rest with 1 g.
 
         Parameters
         ----------
         rest : Dwell
-            The latest rest, as it is known so far.
+            The ongoing rest.
         least : float
-            Smaller changes are ignored [g].
+            Smallest change to report [g].
 
         """
         self.rest = rest
@@ -102,26 +103,26 @@ class ActiveCalibration:
         self._compare(least)
 
     def end(self, rest: Dwell, least: float) -> None:
-        """Compare a rest that ended; arguments as `update`."""
+        """Compare a rest that ended with 1 g; parameters as in `update`."""
         part = self._uncounted(rest)
         self._past = self._past if part is None else self._with(part, least)
         self._counted = rest
         self._compare(least)
 
     def _compare(self, least: float) -> None:
-        """Set the drift with the ongoing rest."""
+        """Update the drift with the ongoing rest."""
         part = None if self.rest is None else self._uncounted(self.rest)
         self.drift = self._past if part is None else self._with(part, least)
 
     def _uncounted(self, rest: Dwell) -> Dwell | None:
-        """Return the part of a rest that was not counted yet; None if it is too short."""
+        """Return the part of a rest that was not counted yet, or None if it is too short."""
         before = self._counted
         if before is None or not overlap(before, rest) or rest.samples < before.samples:
             return rest
         return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
-        """Return the drift with one more rest."""
+        """Return the state of the drift monitor after one more rest."""
         context = self._context(rest)
         if self._past is None or self.calibration is None or context is None:
             return self._past
@@ -133,14 +134,14 @@ class ActiveCalibration:
         self.gravity = None if self.rest is None else self._force(self.rest)
 
     def _force(self, rest: Dwell) -> Floats | None:
-        """Return the corrected force of a rest [m/s²]; None if it cannot be corrected."""
+        """Return the corrected force of a rest [m/s²], or None if it cannot be corrected."""
         context = self._context(rest)
         if self.calibration is None or context is None:
             return None
         return self.calibration.correct(rest.mean[np.newaxis], context)[0] * self.scale
 
     def _context(self, rest: Dwell) -> Context | None:
-        """Return the context of a rest; None if the calibration needs more."""
+        """Return the context of a rest, or None if the calibration needs more context."""
         if self.calibration is None:
             return None
         context = context_of_rest(rest, self.calibration.units)
@@ -149,21 +150,21 @@ class ActiveCalibration:
 
     @property
     def residual(self) -> float:
-        """Return |a| - 1 g at the last rest [g]; NaN if it is not known."""
+        """Return |a| - 1 g at the last rest [g]; NaN if not known."""
         if self.gravity is None:
             return math.nan
         return float(np.linalg.norm(self.gravity)) / self._g - 1.0
 
 
 def context_of_rest(rest: Dwell, units: Units) -> Context:
-    """Return the context of a rest as one row; from which pose it came is taken as none."""
+    """Return the context of a rest as one row, without a previous pose."""
     known = {key: np.array([value]) for key, value in rest.context.items()}
     return {'previous': _NONE, 'rate': _NONE, **known, 'time': np.array([rest.time]),
             'std': units.to_g(rest.std)[np.newaxis]}
 
 
 def output_scale(calibration: Calibration, gravity: float) -> float:
-    """Return m/s² in one unit of corrected force; `gravity` is the local gravity [m/s²]."""
+    """Return m/s² per unit of corrected force; `gravity` is the local gravity [m/s²]."""
     return 1.0 if calibration.units.name == 'm/s2' else gravity / calibration.force_per_g
 
 
@@ -188,7 +189,7 @@ def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
 
 
 def _only_levelled(before: Calibration | None, after: Calibration | None) -> bool:
-    """Return whether two calibrations differ in the mounting alone."""
+    """Return whether two calibrations differ only in the mounting."""
     return (before is not None and after is not None
             and before.model.effects == after.model.effects
             and np.array_equal(before.model.vector, after.model.vector)

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session tells the node."""
+"""The events that a session reports to the node."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..calibrate import NextPose
 from ..table import Floats
 
 Compute = Callable[..., Any]
-"""Function and its arguments -> its result, as `worker_process.WorkerProcess.call`."""
+"""Function and its arguments -> result, as in `worker_process.WorkerProcess.call`."""
 
 Severity = Literal['info', 'warning', 'error']
 
@@ -21,15 +21,16 @@ Severity = Literal['info', 'warning', 'error']
 @dataclass(frozen=True)
 class Job:
     """
-    Work beside the stream.
+    Long work that must not delay the stream.
 
     Parameters
     ----------
     run : callable
-        Takes `Compute`; uses nothing of the session, and may raise AccelCalibError or OSError.
+        Function of a `Compute`. It does not use the session, and can raise AccelCalibError or
+        OSError.
     finish : callable
-        Takes the result of `run`, in the thread of the session, and returns an answer; it may
-        raise AccelCalibError. An empty answer is not logged.
+        Function of the result of `run`, called in the thread of the session. It returns an answer
+        and can raise AccelCalibError. An empty answer is not logged.
 
     """
 
@@ -39,7 +40,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Log:
-    """A line for the log; if `once_in` is not 0, at most once in this time [s]."""
+    """A log line; if `once_in` is not 0, it is logged at most once in this time [s]."""
 
     severity: Severity
     words: str
@@ -48,14 +49,14 @@ class Log:
 
 @dataclass(frozen=True)
 class Still:
-    """Whether the sensor is still, from now on."""
+    """A change of whether the sensor is still."""
 
     still: bool
 
 
 @dataclass(frozen=True)
 class ShowPoses:
-    """The poses to draw: (n, 3) directions of up in the frame of the sensor, and the next one."""
+    """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
 
     up: Floats
     asked: NextPose

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The state of the calibrator, judged in one place.
+The state of the calibrator and its evaluation.
 
-`Health` is shown on ``/diagnostics`` and answers ``~/self_test``.
+``/diagnostics`` and ``~/self_test`` report `Health`.
 
 """
 
@@ -16,14 +16,15 @@ from enum import IntEnum
 import math
 
 from .stream_statistics import StreamStatistics
+from ..errors import counted
 from ..monitor import Drift, status
 from ..units import MG
 
 _DROPPED_SHOWN_FOR = 60.0
-"""Time for which dropped messages are warned of [s]."""
+"""Duration of the warning after a dropped message [s]."""
 
 _LIKELY_G = (0.2, 5.0)
-"""Range of |a| outside of which the unit is probably wrong [g]."""
+"""Range of |a| [g]; outside of it the unit is probably wrong."""
 
 
 class Level(IntEnum):
@@ -42,35 +43,35 @@ class Health:
     Parameters
     ----------
     sensor, state, problem : str
-        Name; what it does now; why it does not correct, or empty.
+        Name of the sensor; current state; reason why messages are not corrected, or empty.
     calibration : str
         Model and date, or empty.
     outside : str
-        Which conditions are outside of what the calibration has seen, or empty.
+        Context outside of the ranges of the calibration, or empty.
     file : str
         File of the calibration.
     writable : bool
-        Whether it can be written.
+        Whether the file can be written.
     statistics : StreamStatistics
-        Counts of the stream.
+        Statistics of the stream.
     length : float
         |a| of the last message [g]; NaN: not known.
     rest_ago : float
-        Time since the last rest, by the header stamps [s]; NaN: there was none.
+        Time since the last rest, by header stamps [s]; NaN: no rest yet.
     residual : float
         |a| - 1 g at the last rest [g]; NaN: not known.
     drift : Drift or None
-        What the rests show; None without a calibration.
+        State of the drift monitor; None without a calibration.
     poses, doubtful : int
-        Poses captured; of these doubtful.
+        Number of captured poses, and of doubtful poses among them.
     interruptions : int
-        Interruptions of the header stamps.
+        Number of interruptions of the header stamps.
     last_interruption : str
-        The last of them, or empty.
+        The last interruption, or empty.
     threshold : float
         Largest standard deviation of a still axis [m/s², or native].
     next_pose : str
-        Which pose helps most next, or that more no longer help.
+        The next pose, or that more poses no longer help.
 
     """
 
@@ -96,7 +97,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was checked: its name, its severity, and the result in words."""
+    """The result of one check: name, severity and text."""
 
     name: str
     level: Level
@@ -104,13 +105,13 @@ class Finding:
 
 
 def findings(health: Health) -> list[Finding]:
-    """Return one finding for each thing checked."""
+    """Return the findings of all checks."""
     return [_messages(health), _values(health), _calibration(health), _drift(health),
             _storage(health)]
 
 
 def worst(health: Health) -> Finding:
-    """Return the most severe finding, or the state if all is well."""
+    """Return the most severe finding, or the state if all findings are OK."""
     found = max(findings(health), key=lambda finding: finding.level)
     return Finding('state', Level.OK, health.state) if found.level == Level.OK else found
 
@@ -125,12 +126,12 @@ def _messages(health: Health) -> Finding:
 def _values(health: Health) -> Finding:
     counts = health.statistics
     dropped = [words for count, words in (
-        (counts.not_finite, f'{counts.not_finite} readings were NaN or infinite and were dropped: '
-                            'check the driver'),
-        (counts.foreign, f'{counts.foreign} messages were of another sensor and were dropped: '
-                         'give each sensor a topic of its own'),
-        (counts.implausible, f'{counts.implausible} corrected messages were not plausible and '
-                             'were dropped: check the calibration')) if count]
+        (counts.not_finite, f'dropped {counted(counts.not_finite, "message")} with NaN or '
+                            'infinite readings: check the driver'),
+        (counts.foreign, f'dropped {counted(counts.foreign, "message")} of another sensor: use a '
+                         'separate topic for each sensor'),
+        (counts.implausible, f'dropped {counted(counts.implausible, "corrected message")} with '
+                             'implausible values: check the calibration')) if count]
     if dropped and counts.dropped_ago < _DROPPED_SHOWN_FOR:
         return Finding('values', Level.WARN, '; '.join(dropped))
     if health.length < _LIKELY_G[0] or health.length > _LIKELY_G[1]:
@@ -143,11 +144,11 @@ def _calibration(health: Health) -> Finding:
     if health.problem:
         return Finding('calibration', Level.ERROR, health.problem)
     if not health.calibration:
-        return Finding('calibration', Level.WARN, f'no calibration yet, {health.poses} poses '
-                       f'captured: {health.next_pose or "turn the sensor"}')
+        return Finding('calibration', Level.WARN, 'no calibration yet, captured '
+                       f'{counted(health.poses, "pose")}: {health.next_pose or "turn the sensor"}')
     if health.outside:
-        return Finding('calibration', Level.WARN, f'{health.outside}: the correction is held at '
-                       'that limit; capture poses there and call ~/refine')
+        return Finding('calibration', Level.WARN, f'{health.outside}: the correction uses the '
+                       'limit of the range; capture poses there and call ~/refine')
     return Finding('calibration', Level.OK, health.calibration)
 
 
@@ -166,7 +167,7 @@ def _storage(health: Health) -> Finding:
 
 
 def figures(health: Health) -> Iterable[tuple[str, str]]:
-    """Yield names and values of the figures."""
+    """Yield names and values for the diagnostics."""
     counts = health.statistics
     yield 'state', health.state
     yield 'sensor', health.sensor

@@ -4,10 +4,10 @@
 """
 Capture of poses while samples arrive.
 
-A rest counts as soon as it is `min_dwell` long, for the person who turns the sensor. Its average
-is computed again each time its length has doubled, every `LONG_REST` of a long rest, and when it
-ends. The detector reports an end only when it is sure that the rest does not continue after a
-knock; the next rest may have begun by then.
+A rest becomes a provisional pose as soon as its length is `min_dwell`, so that the user can turn
+the sensor to the next pose. Its average is updated each time its length has doubled, at intervals
+of `LONG_REST` during a long rest, and at its end. The detector reports an end only when it is
+certain that the rest does not continue after a knock. The next rest may have started by then.
 
 """
 
@@ -29,30 +29,30 @@ _LOOK_EVERY = 0.1
 """Interval at which an ongoing rest is checked [s]."""
 
 _PIECE = 0.35
-"""Samples that come together are processed in pieces of this length, by their stamps [s]."""
+"""Length, by the stamps, of the pieces into which a block of samples is divided [s]."""
 
 _NOISE_FELL = 0.9
-"""Fall of the threshold at which earlier poses are judged again, as a factor."""
+"""Relative decrease of the threshold after which earlier poses are tested again."""
 
 _SURELY_OVER = (4.0, 40.0)
-"""Time after which a rest is surely over: in windows and in samples, whichever is longer."""
+"""Time after which a rest has certainly ended: in windows and in samples, the longer one."""
 
 
 @dataclass(frozen=True)
 class Change:
     """
-    What samples changed.
+    The changes that samples caused.
 
     Parameters
     ----------
     rest : Dwell or None
-        The latest rest, if it is new or its average is.
+        The latest rest, if it is new or has a new average.
     ended : tuple of Dwell
         Rests that ended.
     poses : bool
         Whether the poses changed.
     doubted : int
-        Poses that are doubtful from now on.
+        Number of poses newly marked as doubtful.
 
     """
 
@@ -64,12 +64,12 @@ class Change:
 
 class LiveCapture:
     """
-    Detector and poses of one sensor.
+    The stillness detector and the poses of one sensor.
 
     Parameters
     ----------
     settings : CaptureSettings
-        What is still, and which poses to keep.
+        Settings of the detector and of the poses.
     units : Units
         Unit of the readings.
 
@@ -91,14 +91,14 @@ class LiveCapture:
         Parameters
         ----------
         samples : (n, 9) array
-            As `StillDetector.push`.
+            As in `StillDetector.push`.
         capture : bool
             Whether every rest becomes a pose.
 
         Returns
         -------
         list of Change
-            Empty for nearly all blocks.
+            The changes; empty for most blocks.
 
         """
         found = [self._after(self.detector.push(piece), float(piece[-1, 0]), capture)
@@ -106,12 +106,12 @@ class LiveCapture:
         return [change for change in found if change is not None]
 
     def interrupt(self, capture: bool) -> list[Change]:
-        """End the ongoing rest, because the next sample does not follow; arguments as `push`."""
+        """End the ongoing rest, because the stream is interrupted; parameters as in `push`."""
         ended = self.detector.close()
         return [self._end(ended, capture)] if ended else []
 
     def _after(self, ended: list[Dwell], time: float, capture: bool) -> Change | None:
-        """Return what changed with the samples up to this time."""
+        """Return the changes by the samples up to this time."""
         if ended:
             return self._end(ended, capture)
         still = self.detector.still
@@ -124,7 +124,7 @@ class LiveCapture:
         return self._look(capture) if still else self._doubt_held(time)
 
     def capture_now(self) -> Dwell | None:
-        """Capture the ongoing rest as a pose; None if there is none."""
+        """Capture the ongoing rest as a pose, and return it; None if there is no rest."""
         dwell = self.detector.current()
         if dwell is not None:
             self.book.hold(dwell)
@@ -138,7 +138,7 @@ class LiveCapture:
             self.book.hold(dwell)
 
     def undo(self) -> bool:
-        """Remove the last pose and do not capture it again; return whether there was one."""
+        """Remove the last pose and do not capture it again; return whether a pose was removed."""
         self._declined = self._rest
         return self.book.undo()
 
@@ -148,7 +148,7 @@ class LiveCapture:
         self.book.clear()
 
     def _look(self, capture: bool) -> Change | None:
-        """Return what changed in the ongoing rest."""
+        """Return the changes of the ongoing rest."""
         dwell = self.detector.current()
         if dwell is None or _length(dwell) < _due(_length(self._rest, dwell)):
             return None
@@ -160,7 +160,7 @@ class LiveCapture:
         return Change(rest=dwell, poses=held)
 
     def _is_captured(self, dwell: Dwell, capture: bool) -> bool:
-        """Return whether a rest is a pose: it is held already, or every rest becomes one."""
+        """Return whether a rest is a pose: already provisional, or every rest becomes a pose."""
         declined = self._declined is not None and overlap(self._declined, dwell)
         return self.book.holds(dwell) or (capture and not declined)
 
@@ -173,13 +173,13 @@ class LiveCapture:
         latest = rest is None or overlap(rest, last) or not rest.start > last.end
         if latest:
             self._rest = last
-        # Rests end in order: one that is held from before the last has no average of its own.
+        # Rests end in order: an older provisional pose will not get a final average.
         doubted = self.book.doubt_held(lambda dwell: dwell.end < last.start)
         doubted += self._judge_again()
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
 
     def _doubt_held(self, time: float) -> Change | None:
-        """Mark the poses of rests that were held too early and have no final average."""
+        """Mark provisional poses as doubtful that will not get a final average."""
         def is_over(dwell: Dwell) -> bool:
             windows, samples = _SURELY_OVER
             period = _length(dwell) / dwell.samples
@@ -190,7 +190,7 @@ class LiveCapture:
         return Change(poses=True, doubted=count) if count else None
 
     def _judge_again(self) -> int:
-        """Mark the poses that are not still by the noise that is known now."""
+        """Mark poses as doubtful that are not still according to the noise known now."""
         threshold = self.detector.threshold
         if threshold > _NOISE_FELL * self._judged_at:
             return 0
@@ -212,7 +212,7 @@ def _due(length: float) -> float:
 
 
 def _length(dwell: Dwell | None, same_as: Dwell | None = None) -> float:
-    """Return the length of a rest [s]; 0 if there is none, or it is another one."""
+    """Return the length of a rest [s]; 0 without a rest, or for another rest than `same_as`."""
     if dwell is None or (same_as is not None and not overlap(dwell, same_as)):
         return 0.0
     return dwell.end - dwell.start

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameters of a node as fields of a dataclass, and back as a parameter file.
+Parameters of a node as fields of a dataclass, and as a parameter file.
 
-Types are checked here and not by rclpy, which refuses ``5`` for ``5.0`` and ``model:=10`` for
-``'10'``, and ends a node with a traceback.
+Types are checked here and not by rclpy. rclpy refuses ``5`` for ``5.0`` and ``model:=10`` for
+``'10'``, and ends the node with a traceback.
 
 """
 
@@ -36,15 +36,15 @@ def parameter(default: Any, words: str, *, limits: tuple[float, float] | None = 
     Parameters
     ----------
     default : bool, int, float, str or list of them
-        Its type is the type of the parameter.
+        Default value; it defines the type of the parameter.
     words : str
         Description, with the unit.
     limits : (float, float), optional
         Least and largest value.
     choices : tuple of str
-        Values of a text; empty: any.
+        Possible values of a text; empty: any text.
     live : bool
-        Whether it can be set while the node runs.
+        Whether the parameter can be set while the node runs.
 
     """
     about = {'words': words, 'limits': limits, 'choices': choices, 'live': live}
@@ -60,7 +60,7 @@ def default_of(given: Field[Any]) -> Any:
 
 
 def _converted(given: Field[Any], value: Any) -> Any:
-    """Return a value in the type of the default; None if it is of another type."""
+    """Return a value converted to the type of the default, or None if that is not possible."""
     default = default_of(given)
     if isinstance(default, bool) or isinstance(value, bool):
         return value if isinstance(value, bool) and isinstance(default, bool) else None
@@ -74,7 +74,7 @@ def _converted(given: Field[Any], value: Any) -> Any:
 
 
 def _converted_list(default: list[Any], value: Any) -> list[Any] | None:
-    """Return a list in the type of the first default; rclpy gives arrays and bytes for lists."""
+    """Return a list converted to the type of the default; rclpy passes arrays and bytes."""
     try:
         items = [type(default[0])(item) for item in value]
     except (TypeError, ValueError):
@@ -84,7 +84,7 @@ def _converted_list(default: list[Any], value: Any) -> list[Any] | None:
 
 
 def expected(given: Field[Any]) -> str:
-    """Return in words which values a parameter accepts."""
+    """Return a text about the values that a parameter accepts."""
     if given.metadata['choices']:
         return 'one of ' + ', '.join(given.metadata['choices'])
     default = default_of(given)
@@ -99,7 +99,7 @@ def expected(given: Field[Any]) -> str:
 
 def checked(given: Field[Any], value: Any) -> Any:
     """
-    Return a value of a parameter in its own type.
+    Return a value converted to the type of a parameter.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def checked(given: Field[Any], value: Any) -> Any:
     if (converted is None or (choices and converted not in choices)
             or (limits is not None and not limits[0] <= converted <= limits[1])):
         raise InputError(f'parameter {given.name} is {value!r}, expected {expected(given)}',
-                         'give such a value')
+                         'correct the value')
     return converted
 
 
@@ -123,7 +123,7 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
     Raises
     ------
     InputError
-        As `checked`.
+        As in `checked`.
 
     """
     known = {each.name: each for each in fields(settings)}
@@ -132,9 +132,9 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
 
 
 def yaml_lines(settings: type[Any]) -> Iterable[str]:
-    """Yield the parameter file with all defaults, line by line, for any node name."""
-    yield '# Parameters of the calibrator with their defaults; made from'
-    yield '# accel_calib/session/settings.py. Those marked * can be set while the node runs.'
+    """Yield the lines of a parameter file with all defaults, for any node name."""
+    yield '# Parameters of the calibrator with their defaults; generated from'
+    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
     yield '/**:'
     yield '  ros__parameters:'
     for each in fields(settings):

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The poses captured so far, as dwells, so that repeated poses can be merged and the last one undone.
+The captured poses, stored as dwells, so that poses can be merged and the last pose undone.
 
-An ongoing rest is held as it is known so far, and replaced by its final average: the dwell that
-overlaps it in time. No pose is ever removed but by the user. If it turns out later that the sensor
-may have moved in a pose, the pose is marked as doubtful, and the fit leaves it out if it can.
+The pose of an ongoing rest is provisional. The final average replaces it: the dwell that overlaps
+it in time. Only the user removes poses. If later rests show that the sensor may have moved during
+a pose, the pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
@@ -22,13 +22,13 @@ from ..table import Poses
 from ..units import Units
 
 _SEPARATE = 64
-"""Dwells that can be undone one by one; older ones are merged for good."""
+"""Number of dwells that can be undone one by one; older dwells are merged permanently."""
 
 _SAME_TEMPERATURE = 120.0
-"""Rests within this time have the same temperature [s]."""
+"""Rests within this time are assumed to have the same temperature [s]."""
 
 _BAND = 5.0
-"""Poses that differ more in temperature are not repeated [°C]: ~/refine needs both."""
+"""Poses with a larger difference of temperature are not merged [°C]; ~/refine needs both."""
 
 _CONTEXT = ('temperature', 'supply_voltage', 'rate')
 
@@ -68,24 +68,24 @@ class PoseBook:
                 for dwell in select(band, self._settings, self._units)]
 
     def add_stored(self, poses: Poses) -> None:
-        """Put stored poses in front of the others."""
+        """Insert stored poses before the others."""
         self._earlier = [*dwells_of(poses), *self._earlier]
 
     @property
     def holding(self) -> bool:
-        """Whether an ongoing rest is held."""
+        """Whether there is a provisional pose."""
         return bool(self._held)
 
     def holds(self, dwell: Dwell) -> bool:
-        """Return whether this rest is held."""
+        """Return whether this rest is a provisional pose."""
         return any(overlap(dwell, each) for each in self._held)
 
     def hold(self, dwell: Dwell) -> None:
-        """Hold an ongoing rest as it is known so far."""
+        """Add or update the provisional pose of an ongoing rest."""
         self._held = [*(each for each in self._held if not overlap(dwell, each)), dwell]
 
     def end(self, dwell: Dwell) -> None:
-        """Add a rest that ended, in place of the one held."""
+        """Add a rest that ended, in place of its provisional pose."""
         self._held = [each for each in self._held if not overlap(dwell, each)]
         self._add(dwell)
 
@@ -95,7 +95,7 @@ class PoseBook:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
 
     def doubt_held(self, is_over: Callable[[Dwell], bool]) -> int:
-        """Mark held rests that are over without an average; return their number."""
+        """Mark provisional poses without a final average as doubtful; return their number."""
         over = [each for each in self._held if is_over(each)]
         self._held = [each for each in self._held if not is_over(each)]
         for dwell in over:
@@ -103,7 +103,7 @@ class PoseBook:
         return len(over)
 
     def doubt(self, starts: Container[float]) -> int:
-        """Mark the dwells that began at these times; return the number of new marks."""
+        """Mark the dwells with these start times as doubtful; return the number of new marks."""
         new = [dwell for dwell in self._dwells if dwell.start in starts and not dwell.doubtful]
         self._dwells = [replace(dwell, doubtful=True) if dwell.start in starts else dwell
                         for dwell in self._dwells]
@@ -121,9 +121,9 @@ class PoseBook:
 
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     """
-    Return dwells, those before the first temperature message with that of the nearest dwell.
+    Return dwells with missing temperatures set to that of the nearest dwell.
 
-    One pose without a temperature would leave the whole table without it.
+    The pose table has temperatures only if all its poses have one.
 
     """
     known = [dwell for dwell in dwells if 'temperature' in dwell.context]
@@ -143,12 +143,12 @@ def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
 
 
 def overlap(one: Dwell, other: Dwell) -> bool:
-    """Return whether two dwells overlap in time, and so are the same rest."""
+    """Return whether two dwells overlap in time; they are then the same rest."""
     return one.start <= other.end and other.start <= one.end
 
 
 def dwells_of(poses: Poses) -> list[Dwell]:
-    """Return the poses of a table as dwells, each of its own orientation."""
+    """Return the poses of a table as dwells with different orientations."""
     return [_dwell_of(poses, k) for k in range(len(poses))]
 
 

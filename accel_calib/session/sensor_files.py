@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files that a session uses: those of its sensor, as long as no other node uses them."""
+"""The files of the sensor of a session, which only one node can use at a time."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class SensorFiles:
     Parameters
     ----------
     settings : CalibratorSettings
-        What the user says about sensor and files.
+        Parameters for sensor and files.
     topic : str
         Topic of the messages, with namespace.
 
     Attributes
     ----------
     store : Store or None
-        None until the sensor is known.
+        The store; None until the sensor is known.
     problem : str
-        Why the files cannot be used, or empty.
+        Reason why the files cannot be used, or empty.
 
     """
 
@@ -38,11 +38,11 @@ class SensorFiles:
 
     @property
     def locked(self) -> bool:
-        """Return whether this node has the files."""
+        """Whether this node has locked the files."""
         return self._lock is not None
 
     def take(self, sensor: str) -> Store | None:
-        """Find and lock the files of a sensor; None, and a problem, if another node has them."""
+        """Lock the files of a sensor and return the store; None if another node uses them."""
         identity = Identity(sensor, self._topic, bool(self._settings.sensor))
         before, self.store = self.store, store_of(self._settings.calibration_file, identity,
                                                   self._settings.units)
@@ -51,7 +51,7 @@ class SensorFiles:
         return self.store if self.locked else self.try_again()
 
     def try_again(self) -> Store | None:
-        """Lock the files if they have become free; return the store if so."""
+        """Lock the files if they have become free; return the store, or otherwise None."""
         if self.store is None or self.locked:
             return None
         try:
@@ -63,23 +63,23 @@ class SensorFiles:
 
     def usable(self) -> Store:
         """
-        Return the store.
+        Return the locked store.
 
         Raises
         ------
         InputError
-            If the sensor is not known yet, or another node has the files.
+            If the sensor is not known yet, or another node uses the files.
 
         """
         if self.store is None:
-            raise InputError('the name of the sensor is not known, because no Imu message has '
-                             'come yet', 'start the driver, or set the parameter sensor')
+            raise InputError('the name of the sensor is not known, because there is no Imu '
+                             'message yet', 'start the driver, or set the parameter sensor')
         if not self.locked:
             raise InputError(self.problem, 'this node stores nothing')
         return self.store
 
     def release(self) -> None:
-        """Leave the files to other nodes."""
+        """Unlock the files."""
         if self._lock is not None:
             self._lock.release()
         self._lock = None

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibrator without ROS: samples and commands in, answers and events out.
+The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-One thread uses a session. What takes long (fits, files) is returned as a `Job`, whose `run` may be
-called in any thread and whose `finish` belongs to the thread of the session. Header stamps are the
-clock of all that is measured, so that a bag or a simulation may run at any speed; only how old the
-last message is goes by a steady clock.
+Only one thread may use a session. Long work (fits, files) is returned as a `Job`: its `run` can be
+called in any thread, and its `finish` must be called in the thread of the session. All durations
+of the measurement use header stamps, so that a bag or a simulation can run at any speed. Only the
+age of the last message uses a steady clock.
 
 """
 
@@ -31,33 +31,38 @@ from .stream_statistics import StreamStatistics
 from .work import (
     asked_for,
     fitted,
-    poses_in_words,
+    next_action,
     poses_up,
     refined,
     story,
     summary,
-    then,
     title,
 )
 from ..calibrate import Calibration, FLAT, level, NextPose, set_heading
 from ..capture import Dwell
 from ..effects import Context
-from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
+from ..errors import (
+    AccelCalibError,
+    counted,
+    InputError,
+    RefusedFitError,
+    StoredCalibrationError,
+)
 from ..monitor import status
 from ..refine import Refinement
 from ..table import Floats, Poses
 from ..units import units_of
 
 _OLD = 0.5
-"""Age of the last message from which nothing is captured from it [s]."""
+"""Largest age of the last message for a capture [s]."""
 
 _SILENT = 2.0
-"""Silence of the sensor after which messages of another one are accepted [s]."""
+"""Time without messages after which messages of another sensor are accepted [s]."""
 
 _AGAIN = 10.0
-"""Least time between two equal lines of the log about single messages [s]."""
+"""Shortest time between two equal log lines about single messages [s]."""
 
-_NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and call ~/fit first')
+_NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
 
 
 class Session:
@@ -67,7 +72,7 @@ class Session:
     Parameters
     ----------
     settings : CalibratorSettings
-        The parameters; may be replaced later.
+        The parameters; they can be replaced later.
     topic : str
         Topic of the messages, with namespace.
     clock : callable
@@ -105,16 +110,16 @@ class Session:
 
     @property
     def sensor(self) -> str:
-        """Name of the sensor; empty if it is not known yet."""
+        """Name of the sensor; empty if not known yet."""
         return self.settings.sensor or self.frame_id or ''
 
     @property
     def publishes(self) -> bool:
-        """Whether messages may go out: not while another node has the files."""
+        """Whether messages may be published: not while another node uses the files."""
         return self.files.store is None or self.files.locked
 
     def events(self) -> list[Event]:
-        """Return what happened since the last call, in order."""
+        """Return the events since the last call, in order."""
         found, self._events = self._events, []
         return found
 
@@ -122,10 +127,10 @@ class Session:
 
     def accepts(self, frame_id: str) -> bool:
         """
-        Return whether messages with this frame_id are of the sensor, and learn the first one.
+        Return whether messages with this frame_id belong to the sensor.
 
-        A message of another sensor ends the ongoing rest. Once the sensor has been silent, the
-        session is for the other sensor.
+        The first message defines the sensor. A message of another sensor ends the ongoing rest.
+        After a time without messages of the sensor, the session switches to the other sensor.
 
         """
         if frame_id == self.frame_id:
@@ -135,13 +140,14 @@ class Session:
             return True
         if self._clock() - self.statistics.arrived > _SILENT:
             self._log('warning', f'the messages now have frame_id {frame_id!r} instead of '
-                                 f'{self.frame_id!r}: this is another sensor')
+                                 f'{self.frame_id!r}: switching to this sensor')
             self._switch_to(frame_id)
             return True
         self.statistics.drop('foreign')
         self._change(self.live.interrupt(self.settings.auto_capture))
-        self._log('error', f'an Imu has frame_id {frame_id!r}, those before it {self.frame_id!r}; '
-                  'it is dropped: give each sensor a topic of its own', once_in=_AGAIN)
+        self._log('error', f'an Imu message has frame_id {frame_id!r}, expected '
+                  f'{self.frame_id!r}; it is dropped: use a separate topic for each sensor',
+                  once_in=_AGAIN)
         return False
 
     def push(self, samples: Floats, arrived: float) -> None:
@@ -151,39 +157,39 @@ class Session:
         Parameters
         ----------
         samples : (n, 9) array
-            As `accel_calib.capture.StillDetector.push`.
+            As in `accel_calib.capture.StillDetector.push`.
         arrived : float
-            When the last of them arrived, by the steady clock [s].
+            Arrival time of the last sample, by the steady clock [s].
 
         """
         good = np.isfinite(samples[:, 1:4]).all(axis=1)
         if not np.all(good):
             reading = tuple(samples[~good][0, 1:4].tolist())
             self.statistics.drop('not_finite', int(np.sum(~good)))
-            self._log('warning', f'an Imu has the linear_acceleration {reading}, expected three '
-                      'finite numbers; it is dropped: check the driver', once_in=_AGAIN)
+            self._log('warning', f'an Imu message has the linear_acceleration {reading}, expected '
+                      'three finite numbers; it is dropped: check the driver', once_in=_AGAIN)
             samples = samples[good]
         if len(samples):
             self.statistics.add(samples, arrived)
             self._change(self.live.push(samples, self.settings.auto_capture))
 
     def drop_unreadable(self, size: int) -> None:
-        """Count a message of this size [bytes] that cannot be read."""
+        """Count an unreadable message of this size [bytes]."""
         self.statistics.drop('not_finite')
-        self._log('warning', f'an Imu of {size} bytes cannot be read; it is dropped: check the '
-                             'driver', once_in=_AGAIN)
+        self._log('warning', f'an Imu message of {size} bytes cannot be read; it is dropped: '
+                  'check the driver', once_in=_AGAIN)
 
     def drop_corrected(self, error: AccelCalibError) -> None:
-        """Count a message that is not published because of an error."""
+        """Count a corrected message that is not published because of an error."""
         self.statistics.drop('implausible')
         self._log('error', f'messages are not corrected: {error}', once_in=_AGAIN)
 
     def set_temperature(self, temperature: float) -> None:
-        """Set the temperature of the messages that follow [°C]."""
+        """Set the temperature of the following messages [°C]."""
         self.statistics.temperature = temperature
 
     def _change(self, changes: list[Change]) -> None:
-        """Process what samples changed."""
+        """Process the changes that samples caused."""
         if self.live.detector.still is not self._still:
             self._still = not self._still
             self._events.append(Still(self._still))
@@ -197,16 +203,16 @@ class Session:
             if self.active.drift is not None and self.active.has_changed is not before:
                 self._log('warning', status(self.active.drift))
             if change.doubted:
-                self._log('warning', f'{poses_in_words(change.doubted)} may have been captured '
-                          'while the sensor moved, as later rests show; a fit leaves them out if '
-                          'the others suffice')
+                self._log('warning', f'the sensor may have moved during '
+                          f'{counted(change.doubted, "pose")}, according to later rests; a fit '
+                          'leaves out such poses if the others are sufficient')
             if change.poses:
                 self._poses_changed(ended=bool(change.ended))
 
     # The sensor and its files
 
     def _bind(self, frame_id: str) -> None:
-        """Learn from the first message which sensor this is."""
+        """Set the sensor from the first message."""
         self.frame_id = frame_id
         if self.files.store is None or self._loaded - {self.sensor}:
             self._begin_again()
@@ -214,14 +220,14 @@ class Session:
             self.files.take(self.sensor)
 
     def _switch_to(self, frame_id: str) -> None:
-        """Continue with another sensor."""
+        """Switch to another sensor."""
         self._change(self.live.interrupt(self.settings.auto_capture))
         self.frame_id = frame_id
-        if not self.settings.sensor:  # otherwise the user says which sensor it is
+        if not self.settings.sensor:  # otherwise the user has set the sensor
             self._begin_again()
 
     def _begin_again(self) -> None:
-        """Forget poses and calibration of another sensor, and load those of this one."""
+        """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.live = LiveCapture(capture_settings(self.settings), self.units)
         self.active = ActiveCalibration(self.settings.gravity)
         self._fitted_poses = 0
@@ -231,18 +237,18 @@ class Session:
             self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
 
     def _check_lock(self) -> None:
-        """Report that another node uses the files."""
+        """Report it if another node uses the files."""
         if self.files.problem:
             self.problem = self.files.problem
             self._log('error', self.problem)
 
     def _adopt_loaded(self, loaded: Loaded) -> str:
-        """Continue with what was stored."""
+        """Use the stored poses and calibration."""
         self._loaded = {each.sensor for each in (loaded.calibration, loaded.poses)
                         if each is not None and each.sensor}
         if loaded.poses is not None:
             self.live.book.add_stored(loaded.poses)
-            self._log('info', f'{poses_in_words(len(loaded.poses))} read from the store')
+            self._log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
         if loaded.calibration is not None:
             self._adopt(loaded.calibration)
         self.problem = loaded.problem
@@ -252,7 +258,7 @@ class Session:
         return ''
 
     def _adopt(self, calibration: Calibration | None) -> None:
-        """Correct with this calibration from now on."""
+        """Use this calibration for the correction."""
         self.active.adopt(calibration)
         self.problem = ''
         if calibration is not None:
@@ -261,14 +267,14 @@ class Session:
                 self._log('warning', line)
 
     def tick(self) -> None:
-        """Compute rates, and try again to lock the files; call it about once a second."""
+        """Update rates and try to lock the files; to be called about once per second."""
         self.statistics.tick()
         store = self.files.try_again()
         if store is not None:
             self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
 
     def close(self) -> None:
-        """Leave the files to others."""
+        """Unlock the files."""
         self.files.release()
 
     # Commands
@@ -282,18 +288,19 @@ class Session:
         self._poses_changed(ended=False)
         poses = self.live.book.poses()
         asked = asked_for(poses, self.units, self.settings.model)
-        return (f'{poses_in_words(len(poses))}: the sensor has been still for '
-                f'{dwell.end - dwell.start:.1f} s; {then(asked)}')
+        return (f'{counted(len(poses), "pose")}: the sensor has been still for '
+                f'{dwell.end - dwell.start:.1f} s; {next_action(asked)}')
 
     def undo_pose(self) -> str:
         """Remove the last pose."""
         if not self.live.undo():
-            raise InputError('there are no poses', 'capture one first')
+            raise InputError('there are no poses to remove', 'capture a pose first')
         self._poses_changed(ended=False)
-        return f'the last pose is removed; left: {poses_in_words(len(self.live.book.poses()))}'
+        count = len(self.live.book.poses())
+        return f'the last pose is removed; remaining: {counted(count, "pose")}'
 
     def fit(self) -> Job:
-        """Fit the poses, use and store the calibration."""
+        """Fit the poses; use and store the calibration."""
         store, before = self.files.usable(), self.active.calibration
         self.live.refresh()
         given = (self.live.book.poses(), self.units, self.settings, self.sensor, before,
@@ -310,7 +317,7 @@ class Session:
         return Job(run, finish)
 
     def refine(self) -> Job:
-        """Find what the calibration lacks, use and store the refined one."""
+        """Refine the calibration; use and store the refined calibration."""
         store, before = self.files.usable(), self.active.calibration
         self.live.refresh()
         given = self.live.book.poses(), self.units, self.sensor, before
@@ -336,19 +343,19 @@ class Session:
         calibration, rest = self._calibration_and_rest()
         levelled = level(calibration, rest.mean, self.settings.frame,
                          context_of_rest(rest, self.units))
-        return self._job_to_use(levelled, 'this pose is flat now')
+        return self._job_to_use(levelled, 'the mounting is levelled by this pose')
 
     def set_heading(self) -> Job:
-        """Find the heading of the mounting from the ongoing rest, with the nose down."""
+        """Set the heading of the mounting from the ongoing rest, with the nose down."""
         calibration, rest = self._calibration_and_rest()
         if not calibration.is_levelled:
-            raise InputError('the mounting is not levelled', 'lay the robot flat and call '
+            raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
         headed = set_heading(calibration, rest.mean, context_of_rest(rest, self.units))
-        return self._job_to_use(headed, 'the nose is down in this pose')
+        return self._job_to_use(headed, 'the heading is set by this pose')
 
     def _calibration_and_rest(self) -> tuple[Calibration, Dwell]:
-        """Return what a mounting is found from."""
+        """Return the calibration in use and the ongoing rest."""
         if self.active.calibration is None:
             raise _NO_CALIBRATION
         self._check_fresh()
@@ -358,13 +365,13 @@ class Session:
         return self.active.calibration, rest
 
     def _job_to_use(self, calibration: Calibration, words: str) -> Job:
-        """Return the job that stores a calibration with another mounting, and uses it."""
+        """Return the job that stores and uses a calibration with a new mounting."""
         store = self.files.usable()
 
         def finish(not_stored: OSError | None) -> str:
             self._use(calibration, not_stored)
-            doubts = [each for each in calibration.warnings if each.startswith(FLAT)]
-            return '; '.join([f'{words}; stored in {store.calibration}', *doubts])
+            warnings = [each for each in calibration.warnings if each.startswith(FLAT)]
+            return '; '.join([f'{words}; stored in {store.calibration}', *warnings])
 
         return Job(lambda compute: _stored(store, calibration), finish)
 
@@ -382,20 +389,20 @@ class Session:
         return Job(run, lambda none: f'stored in {store.calibration} and {store.poses}')
 
     def load(self) -> Job:
-        """Read the stored calibration again; if it is refused, the one in use stays."""
+        """Read the stored calibration again; if it is refused, the calibration in use is kept."""
         store = self.files.usable()
 
         def finish(calibration: Calibration | None) -> str:
             if calibration is None:
-                raise StoredCalibrationError(f'there is no {store.calibration}',
-                                             'call ~/fit, or put a calibration there')
+                raise StoredCalibrationError(f'{store.calibration} does not exist',
+                                             'call ~/fit, or copy a calibration there')
             self._adopt(calibration)
             return f'read {store.calibration}'
 
         return Job(lambda compute: store.load_calibration(), finish)
 
     def reset(self) -> Job:
-        """Remove poses and calibration; the stored files are kept under other names."""
+        """Remove poses and calibration; the stored files are renamed."""
         store = self.files.usable()
 
         def finish(kept: list[Path]) -> str:
@@ -404,52 +411,52 @@ class Session:
             self._fitted_poses = 0
             self._poses_changed(ended=False)
             return 'poses and calibration are removed' + ''.join(
-                f'; {path.name} keeps what was stored' for path in kept)
+                f'; the stored file is kept as {path.name}' for path in kept)
 
         return Job(lambda compute: store.set_aside(), finish)
 
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
         self.active.enabled = on
-        return 'messages are corrected' if on else 'raw messages go out unchanged'
+        return 'messages are corrected' if on else 'raw messages are published unchanged'
 
     def _use(self, calibration: Calibration, not_stored: OSError | None) -> None:
-        """Use a calibration, stored or not."""
+        """Use a calibration, and report it if it could not be stored."""
         self._adopt(calibration)
         if not_stored is not None:
-            raise InputError(f'the calibration is in use, but cannot be stored: {not_stored}',
+            raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
                              'correct the permissions and call ~/save, or set calibration_file')
 
     def _present_context(self) -> Context:
-        """Return the temperature as one row, if it is known."""
+        """Return the temperature as one row of context, if known."""
         temperature = self.statistics.temperature
         return {} if math.isnan(temperature) else {'temperature': np.array([temperature])}
 
     def _check_fresh(self) -> None:
-        """Refuse to use readings that are old."""
+        """Check that the last message is recent."""
         age = self._clock() - self.statistics.arrived
         if not self.statistics.messages:
-            raise InputError('no Imu message has come yet', 'start the driver')
+            raise InputError('there is no Imu message yet', 'start the driver')
         if age > _OLD:
-            raise InputError(f'the last Imu message came {age:.1f} s ago, expected one in the '
-                             f'last {_OLD:g} s', 'check the driver and try again')
+            raise InputError(f'the last Imu message arrived {age:.1f} s ago, expected one within '
+                             f'{_OLD:g} s', 'check the driver and try again')
 
     def _not_still(self) -> InputError:
-        """Return why there is no rest."""
+        """Return the error for a sensor that is not at rest."""
         least, length = self.settings.min_dwell, self._length_g()
         if abs(length - 1.0) > self.settings.still_norm_tolerance:
             return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                              'hold the sensor still; if it is, set the parameter units')
+                              'hold the sensor still; if it is still, set the parameter units')
         if not self.live.detector.still:
             return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
-                              'watch ~/still')
+                              'check ~/still')
         return InputError(f'the sensor has been still for less than {least:g} s',
-                          'hold it still a little longer')
+                          'hold it still for longer')
 
     # Poses and state
 
     def _poses_changed(self, *, ended: bool) -> None:
-        """Show and store the poses, and fit if that is automatic."""
+        """Draw and store the poses, and fit if auto_fit is set."""
         self._show_poses(store=self.files.locked)
         count = len(self.live.book.poses())
         enough = self.settings.auto_fit and count >= self.settings.auto_fit_poses
@@ -458,7 +465,7 @@ class Session:
             self._events.append(self.fit())
 
     def _show_poses(self, *, store: bool) -> None:
-        """Have the poses drawn with the next one, and stored."""
+        """Add a job that draws the poses with the next pose, and stores them."""
         poses, units, model = self.live.book.poses(), self.units, self.settings.model
         where = self.files.store if store else None
 
@@ -475,29 +482,28 @@ class Session:
         def finish(found: tuple[OSError | None, NextPose]) -> str:
             not_stored, asked = found
             if not_stored is not None:
-                self._log('error', f'the poses cannot be stored: {not_stored}; correct the '
+                self._log('error', f'the poses could not be stored: {not_stored}; correct the '
                           'permissions, or set calibration_file', once_in=_AGAIN)
-            before, self.next_pose = self.next_pose, then(asked)
+            before, self.next_pose = self.next_pose, next_action(asked)
             if len(poses) and self.next_pose != before:
-                self._log('info', f'{poses_in_words(len(poses))}; {self.next_pose}')
+                self._log('info', f'{counted(len(poses), "pose")}; {self.next_pose}')
             self._events.append(ShowPoses(poses_up(poses, units), asked, self.frame_id or ''))
             return ''
 
         self._events.append(Job(run, finish))
 
-    def _log(self, severity: Severity, words: str, *,
-             once_in: float = 0.0) -> None:
+    def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:
         self._events.append(Log(severity, words, once_in))
 
     def _length_g(self) -> float:
-        """Return |a| of the last message [g]; NaN if it is not known."""
+        """Return |a| of the last message [g]; NaN if not known."""
         reading = self.statistics.reading
         if reading is None or self.units.name == 'native':
             return math.nan
         return float(np.linalg.norm(reading)) / self.units.per_g
 
     def health(self) -> Health:
-        """Return the state as it is now."""
+        """Return the current state."""
         active, detector, poses = self.active, self.live.detector, self.live.book.poses()
         store = self.files.store
         breaks = detector.interruptions
@@ -521,15 +527,15 @@ class Session:
 
     def _state(self) -> str:
         if not self.publishes:
-            return 'another node uses the files, nothing goes out'
+            return 'another node uses the files, nothing is published'
         if not self.active.enabled:
-            return 'correction switched off, raw messages go out'
+            return 'correction switched off, raw messages are published'
         if self.active.calibration is not None:
             return 'correcting'
         if not self.statistics.messages:
             return 'waiting for the first message'
-        return ('no calibration, raw messages go out' if self.settings.passthrough
-                else 'no calibration, nothing goes out')
+        return ('no calibration, raw messages are published' if self.settings.passthrough
+                else 'no calibration, nothing is published')
 
 
 def _stored(store: Store, calibration: Calibration) -> OSError | None:
@@ -546,10 +552,10 @@ def _doubtful(poses: Poses) -> int:
 
 
 def _outside(calibration: Calibration, now: dict[str, float]) -> str:
-    """Return which conditions are outside of the range of the calibration, or nothing."""
+    """Return a text about context outside of the ranges of the calibration; empty if none."""
     found = []
     for key, (low, high) in calibration.ranges.items():
         if key in now and not low <= now[key] <= high and math.isfinite(now[key]):
-            found.append(f'{key} is {now[key]:.4g}, the calibration has seen {low:.4g} to '
-                         f'{high:.4g}')
+            found.append(f'{key} is {now[key]:.4g}, but the range of the calibration is {low:.4g} '
+                         f'to {high:.4g}')
     return '; '.join(found)

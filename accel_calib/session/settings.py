@@ -4,8 +4,9 @@
 """
 The parameters of the calibrator.
 
-A field is a parameter: name, default, description and limits. It is declared in the node, checked
-(`accel_calib.session.parameters`), and listed in ``config/calibrator.yaml`` from here.
+Each field defines a parameter: name, default, description and limits. The node declares and checks
+the parameters (`accel_calib.session.parameters`), and ``config/calibrator.yaml`` is generated from
+them.
 
 """
 
@@ -29,37 +30,40 @@ class CalibratorSettings:
     """Parameters of the calibrator."""
 
     sensor: str = parameter(
-        '', 'Name of the sensor. It names the stored files, and a calibration of another sensor '
-        'is refused. Empty: the frame_id of the messages names the sensor, topic and frame_id '
-        'name the files')
+        '', 'Name of the sensor and of the stored files. A calibration of another sensor is '
+        'refused. Empty: the sensor is named by the frame_id of the messages, the files by topic '
+        'and frame_id')
     units: UnitName = parameter(
-        'm/s2', 'Unit of the incoming linear_acceleration; the outgoing one is in m/s²',
+        'm/s2', 'Unit of the incoming linear_acceleration; the unit of the output is m/s²',
         choices=UNIT_NAMES)
     gravity: float = parameter(STANDARD_GRAVITY, 'Local gravity [m/s²]', limits=(1.0, 30.0))
     model: str = parameter(
-        'auto', 'Model that ~/fit fits: its number of parameters, or auto for the smallest model '
-        'that the poses support', choices=_MODELS, live=True)
+        'auto', 'Model for ~/fit: its number of parameters, or auto for the smallest model that '
+        'the data support', choices=_MODELS, live=True)
     method: Method = parameter(
-        'ml', 'Fit by maximum likelihood (weighs poses by their noise, leaves out outliers), or '
-        'by the algebraic cost of AN5286', choices=METHODS, live=True)
+        'ml', 'Method of the fit: maximum likelihood, which weights poses by their noise and '
+        'leaves out outliers, or the algebraic cost function of AN5286', choices=METHODS,
+        live=True)
     frame: FrameName = parameter(
-        'ros', 'Levelled frame that ~/set_level turns to', choices=FRAMES)
+        'ros', 'Levelled frame for ~/set_level', choices=FRAMES)
     output_frame_id: str = parameter(
-        '', 'frame_id of corrected messages. Empty: that of the incoming ones', live=True)
+        '', 'frame_id of corrected messages. Empty: the frame_id of the incoming messages',
+        live=True)
     calibration_file: str = parameter(
-        '', 'File of the calibration; the poses are stored beside it. Empty: '
+        '', 'File of the calibration; the poses are stored in the same folder. Empty: '
         '$ROS_HOME/accel_calib/<topic>@<frame_id>.yaml, or <sensor>.yaml if sensor is set; '
         'ROS_HOME is ~/.ros by default')
     passthrough: bool = parameter(
         False, 'Publish raw messages unchanged until there is a calibration', live=True)
     auto_capture: bool = parameter(
-        True, 'Capture a pose whenever the sensor rests', live=True)
+        True, 'Capture a pose at each rest of the sensor', live=True)
     auto_fit: bool = parameter(
-        False, 'Fit automatically, at auto_fit_poses poses and at each later one', live=True)
-    auto_fit_poses: int = parameter(12, 'Number of poses at which auto_fit begins',
+        False, 'Fit automatically after auto_fit_poses poses and after each further pose',
+        live=True)
+    auto_fit_poses: int = parameter(12, 'Number of poses before the first automatic fit',
                                     limits=(4, 1000), live=True)
     still_window: float = parameter(
-        _CAPTURE.still_window, 'Length of the window that is judged to be still [s]',
+        _CAPTURE.still_window, 'Length of the window of the stillness test [s]',
         limits=(0.05, 10.0))
     still_std_max: float = parameter(
         _CAPTURE.still_std_max, 'Largest standard deviation of a still axis [m/s², or native '
@@ -68,32 +72,32 @@ class CalibratorSettings:
         _CAPTURE.still_gyro_max, 'Largest mean angular rate of a still sensor [rad/s]. 0: not '
         'checked, because gyros have biases', limits=(0.0, 10.0))
     still_norm_tolerance: float = parameter(
-        _CAPTURE.still_norm_tolerance, 'Largest distance of |a| of a still sensor from 1 g [g]',
+        _CAPTURE.still_norm_tolerance, 'Largest difference of |a| of a still sensor from 1 g [g]',
         limits=(0.01, 1.0))
     min_dwell: float = parameter(
-        _CAPTURE.min_dwell, 'Shortest rest that makes a pose [s]', limits=(0.1, 600.0))
+        _CAPTURE.min_dwell, 'Shortest rest that becomes a pose [s]', limits=(0.1, 600.0))
     max_dwell: float = parameter(
-        0.0, 'Longer rests are cut into several poses [s]. 0: never', limits=(0.0, 3600.0))
+        0.0, 'Longer rests are split into several poses [s]. 0: never', limits=(0.0, 3600.0))
     min_pose_angle: float = parameter(
-        _CAPTURE.min_pose_angle, 'Poses closer than this are repeated poses [rad]',
+        _CAPTURE.min_pose_angle, 'Poses within this angle count as repeated [rad]',
         limits=(0.0, 1.5))
     repeated: Repeated = parameter(
-        'merge', 'Repeated poses are kept, merged with the earlier one or refused: a robot that '
-        'parks repeats its pose. A pose at another temperature is not repeated',
+        'merge', 'Keep repeated poses, merge them with the earlier pose, or refuse them. A parked '
+        'robot repeats its pose. A pose at another temperature does not count as repeated',
         choices=REPEATED)
     drift_warn: float = parameter(
-        0.01, 'Smallest lasting change of |a| at rest that is warned of, if it also exceeds the '
+        0.01, 'Smallest lasting change of |a| at rest for a warning; it must also exceed the '
         'stated uncertainty of the calibration [m/s²]', limits=(0.0, 100.0), live=True)
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
     """
-    Return the settings of the capture, in its units.
+    Return the settings of the capture, in g if the unit is known.
 
     Raises
     ------
     InputError
-        If they contradict each other.
+        If the settings contradict each other.
 
     """
     std_max = settings.still_std_max
@@ -104,4 +108,5 @@ def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
             settings.still_gyro_max, settings.still_norm_tolerance, settings.min_dwell,
             settings.max_dwell or math.inf, settings.min_pose_angle, settings.repeated)
     except ValueError as error:
-        raise InputError(f'the parameters contradict each other: {error}', 'change one') from error
+        raise InputError(f'the parameters contradict each other: {error}',
+                         'change one of them') from error

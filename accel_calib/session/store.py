@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The files of a sensor: its calibration, its poses, and a lock.
+The files of a sensor: calibration, poses and a lock.
 
-A sensor is identified by its topic, with namespace, and the frame_id of its messages, or by the
-name that the user gives it; each has files of its own. Nothing stored is lost: files that cannot
-be used, or that belong to another sensor, are renamed and never overwritten.
+A sensor is identified by its topic (with namespace) and the frame_id of its messages, or by a name
+that the user sets. Each sensor has its own files. Stored data are never lost: files that cannot be
+used, or that belong to another sensor, are renamed and never overwritten.
 
 """
 
@@ -20,9 +20,9 @@ import os
 from pathlib import Path
 import re
 
-from ..calibrate import Calibration
+from ..calibrate import Calibration, check_sensor
 from ..errors import AccelCalibError, DamagedCalibrationError, StoredCalibrationError
-from ..files import check_sensor, read_calibration, read_poses, write_calibration, write_table
+from ..files import read_calibration, read_poses, write_calibration, write_table
 from ..table import Poses
 from ..units import UnitName
 
@@ -40,16 +40,16 @@ class StoreInUseError(AccelCalibError):
 @dataclass(frozen=True)
 class Identity:
     """
-    Which sensor files belong to.
+    The identity of a sensor, which determines its files.
 
     Parameters
     ----------
     sensor : str
-        frame_id of its messages, or the name that the user gave it.
+        frame_id of the messages, or the name set by the user.
     topic : str
-        Topic of its messages, with namespace.
+        Topic of the messages, with namespace.
     named : bool
-        Whether the user gave the name; the topic then does not matter.
+        Whether the user set the name; the topic is then ignored.
 
     """
 
@@ -59,7 +59,7 @@ class Identity:
 
     @property
     def file_name(self) -> str:
-        """Name of the calibration file, different for different sensors."""
+        """Name of the calibration file; it differs between sensors."""
         if self.named:
             return f'{_safe(self.sensor, _UNSAFE_NAMED)}.yaml'
         topic = '.'.join(_safe(part) for part in self.topic.strip('/').split('/'))
@@ -67,7 +67,7 @@ class Identity:
 
 
 def _safe(name: str, unsafe: re.Pattern[str] = _UNSAFE) -> str:
-    """Return a name for a file; it ends with a hash if characters had to be replaced."""
+    """Return a file name; it ends with a hash if characters were replaced."""
     safe = unsafe.sub('_', name)[:_LONGEST] or _NAMELESS
     if safe == name:
         return safe
@@ -87,11 +87,11 @@ class Store:
     Parameters
     ----------
     calibration : Path
-        The poses are in ``<stem>_poses.csv`` beside it.
+        File of the calibration; the poses are in ``<stem>_poses.csv`` in the same folder.
     identity : Identity
         The sensor.
     units : {'m/s2', 'g', 'native'}
-        Unit of its readings.
+        Unit of the readings.
 
     """
 
@@ -106,14 +106,14 @@ class Store:
 
     def load_calibration(self) -> Calibration | None:
         """
-        Read the calibration; None if there is none yet.
+        Return the stored calibration, or None if there is none.
 
         Raises
         ------
         StoredCalibrationError
-            If it is damaged, newer, of another sensor, or of readings in another unit.
+            If it is damaged, newer than this package, or for another sensor or unit.
         OSError
-            If it cannot be read.
+            If the file cannot be read.
 
         """
         if not self.calibration.exists():
@@ -122,22 +122,22 @@ class Store:
         check_sensor(calibration, self.identity.sensor)
         if calibration.units.name != self.units:
             raise StoredCalibrationError(f'{self.calibration} is for readings in '
-                                         f'{calibration.units.name}, the parameter units is '
-                                         f'{self.units}', 'set it to the unit of the calibration')
+                                         f'{calibration.units.name}, but the parameter units is '
+                                         f'{self.units}', 'set units to that of the calibration')
         return calibration
 
     def load_poses(self) -> Poses | None:
         """
-        Read the poses; None if there are none yet.
+        Return the stored poses, or None if there are none.
 
         Raises
         ------
         InputError
             If the table is damaged.
         StoredCalibrationError
-            If it is of another sensor or in another unit.
+            If the table is for another sensor or unit.
         OSError
-            If it cannot be read.
+            If the file cannot be read.
 
         """
         if not self.poses.exists():
@@ -147,11 +147,11 @@ class Store:
                                       ('units', poses.units, self.units)):
             if found and found != expected and expected:
                 raise StoredCalibrationError(f'{self.poses} has {what} {found!r}, expected '
-                                             f'{expected!r}', 'new poses begin a new table')
+                                             f'{expected!r}', 'new poses start a new table')
         return poses
 
     def save_calibration(self, calibration: Calibration) -> None:
-        """Write the calibration; the previous one is kept. Raises OSError."""
+        """Write the calibration, and keep the previous file; raise OSError if it fails."""
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
         if self.calibration.exists():
             try:
@@ -162,7 +162,7 @@ class Store:
             calibration, sensor=self.identity.sensor, stream=self.identity.topic))
 
     def save_poses(self, poses: Poses) -> None:
-        """Write the poses; without any there is no file. Raises OSError."""
+        """Write the poses, or remove the file if there are none; raise OSError if it fails."""
         if len(poses) == 0:
             self.poses.unlink(missing_ok=True)
             return
@@ -170,11 +170,11 @@ class Store:
         write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
 
     def set_aside(self) -> list[Path]:
-        """Rename both files, so that nothing is lost; return the new names. Raises OSError."""
+        """Rename both files, and return the new paths; raise OSError if it fails."""
         return [aside(path, 'reset') for path in (self.calibration, self.poses) if path.exists()]
 
     def is_writable(self) -> bool:
-        """Return whether files can be written there, or the folder made."""
+        """Return whether the files can be written, or their folder created."""
         folder = self.calibration.parent
         while not folder.exists():
             folder = folder.parent
@@ -183,7 +183,7 @@ class Store:
 
 class Lock:
     """
-    The right to use the files of a store, until it is released or the process ends.
+    A lock on the files of a store, until it is released or the process ends.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ class Lock:
     Raises
     ------
     StoreInUseError
-        If another process has it.
+        If another process has locked the files.
 
     """
 
@@ -204,20 +204,20 @@ class Lock:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError:
-            return  # nobody can write there, so there is nothing to protect
+            return  # the folder cannot be written, so there is nothing to protect
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = os.read(self._handle, 32).decode(errors='replace').strip()
             self.release()
             raise StoreInUseError(
-                f'{store.calibration} is in use by the node of process {holder or "unknown"}',
-                'end that node, or set calibration_file or sensor for this one') from None
+                f'{store.calibration} is used by the node with process id {holder or "unknown"}',
+                'stop that node, or set calibration_file or sensor for this node') from None
         os.ftruncate(self._handle, 0)
         os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
 
     def release(self) -> None:
-        """Leave the files to others."""
+        """Release the lock."""
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
@@ -231,11 +231,11 @@ class Loaded:
     Parameters
     ----------
     calibration, poses
-        None if there are none that can be used.
+        Usable calibration and poses; None without them.
     problem : str
-        Why the calibration cannot be used; empty if it can, or if there is none.
+        Reason why the calibration cannot be used; empty if it is usable or does not exist.
     notes : tuple of str
-        What else the user should know.
+        Notes for the user.
 
     """
 
@@ -246,7 +246,7 @@ class Loaded:
 
 
 def load(store: Store) -> Loaded:
-    """Read a store; files that cannot be used are renamed, or left if they can be used later."""
+    """Read a store; damaged files are renamed."""
     notes = take_over(store)
     calibration, poses, problem = None, None, ''
     try:
@@ -256,7 +256,7 @@ def load(store: Store) -> Loaded:
         if isinstance(error, DamagedCalibrationError):
             problem = f'{problem}; {_renamed(store.calibration)}'
     if calibration is not None and calibration.stream not in ('', store.identity.topic):
-        notes.append(f'{store.calibration} was made for {calibration.stream}, and is used for '
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
                      f'{store.identity.topic}')
     try:
         poses = store.load_poses()
@@ -266,11 +266,11 @@ def load(store: Store) -> Loaded:
 
 
 def _renamed(path: Path) -> str:
-    """Rename a file that cannot be used, and return a line about it."""
+    """Rename a file that cannot be used, and return a text about it."""
     try:
         return f'kept as {aside(path, "damaged")}'
     except OSError as error:
-        return f'it cannot be renamed ({error})'
+        return f'it could not be renamed ({error})'
 
 
 def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:
@@ -280,11 +280,11 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
     Parameters
     ----------
     calibration_file : str
-        File that the user chose, ``~`` for home; empty: in ``accel_calib`` in `ros_home`.
+        File set by the user, with ``~`` for home; empty: in ``accel_calib`` in `ros_home`.
     identity : Identity
         The sensor.
     units : {'m/s2', 'g', 'native'}
-        Unit of its readings.
+        Unit of the readings.
 
     """
     if calibration_file:
@@ -294,10 +294,10 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
 
 def take_over(store: Store) -> list[str]:
     """
-    Rename the files that version 0.1 stored under the frame_id alone; return lines about it.
+    Rename the files that version 0.1 named by the frame_id alone; return log lines about it.
 
-    Several sensors may have shared such a name. The first that finds it takes it, if the
-    calibration is of its frame_id; poses without a calibration only if their name is unambiguous.
+    Several sensors may have shared such a name. The first sensor that finds the files takes them
+    if the calibration has its frame_id, or if there is no calibration and the name is unambiguous.
 
     """
     sensor = store.identity.sensor
@@ -321,7 +321,7 @@ def take_over(store: Store) -> list[str]:
 
 
 def aside(path: Path, word: str) -> Path:
-    """Rename a file to ``<name>.<word><k>`` with the first free k, and return that name."""
+    """Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path."""
     names = (path.with_name(f'{path.name}.{word}{k}') for k in itertools.count(1))
     free = next(name for name in names if not name.exists())
     path.replace(free)

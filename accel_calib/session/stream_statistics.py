@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Counts of a stream of messages."""
+"""Statistics of a stream of messages."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from ..table import Floats
 
 class StreamStatistics:
     """
-    Counts of a stream of messages; rates are by a steady clock.
+    Statistics of a stream of messages; rates use a steady clock.
 
     Attributes
     ----------
     messages : int
-        Messages so far.
+        Number of messages.
     not_finite, foreign, implausible : int
-        Of these, readings that were not finite, and messages of another sensor; corrected
-        messages that were not plausible.
+        Numbers of dropped messages: readings that are not finite, messages of another sensor, and
+        corrected messages that are not plausible.
     stamp : float
         Stamp of the last message [s].
     arrived : float
-        When it arrived, by the steady clock [s].
+        Time of its arrival, by the steady clock [s].
     temperature : float
-        The last one [°C]; NaN: none.
+        Last temperature [°C]; NaN: none.
     reading : (3,) array
-        The last one.
+        Last reading.
     rate : float
         Messages per second between the last two ticks.
 
@@ -44,24 +44,24 @@ class StreamStatistics:
         self._tick_at, self._messages_at_tick = monotonic(), 0
 
     def add(self, rows: Floats, arrived: float) -> None:
-        """Count messages; arguments as `Session.push`."""
+        """Count messages; parameters as in `Session.push`."""
         self.messages += len(rows)
         self.stamp, self.reading, self.arrived = float(rows[-1, 0]), rows[-1, 1:4], arrived
 
     def drop(self, name: str, count: int = 1) -> None:
-        """Count messages that are dropped: ``not_finite``, ``foreign`` or ``implausible``."""
+        """Count dropped messages; `name` is ``not_finite``, ``foreign`` or ``implausible``."""
         setattr(self, name, getattr(self, name) + count)
-        if name != 'implausible':  # its raw message is counted with the others
+        if name != 'implausible':  # its raw message is already counted
             self.messages += count
         self._dropped_at = monotonic()
 
     @property
     def dropped_ago(self) -> float:
-        """Time since the last message was dropped [s]; infinite: there was none."""
+        """Time since the last dropped message [s]; infinite if there was none."""
         return monotonic() - self._dropped_at
 
     def tick(self) -> None:
-        """Compute the rate since the last tick."""
+        """Update the rate from the messages since the last tick."""
         now = monotonic()
         self.rate = (self.messages - self._messages_at_tick) / max(now - self._tick_at, 1e-3)
         self._tick_at, self._messages_at_tick = now, self.messages

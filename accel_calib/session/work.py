@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session computes beside the stream, and the words about it."""
+"""The computations of a session, and texts about their results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..calibrate import (
 )
 from ..calibrate.mounting import flat_direction
 from ..effects import Context
-from ..errors import RefusedFitError
+from ..errors import counted, listed, RefusedFitError
 from ..estimate.geometry import pose_noise
 from ..model import Model
 from ..refine import refine, Refinement
@@ -29,16 +29,16 @@ from ..table import Floats, Poses
 from ..units import Units
 
 _FEWEST_NATIVE = 4
-"""Poses from which the centre of native readings can be estimated."""
+"""Smallest number of poses to estimate the centre of native readings."""
 
-_VERDICTS = {'no_gap': 'nothing is missing', 'explained': 'the missing effects are named',
+_VERDICTS = {'no_gap': 'no effect is missing', 'explained': 'the missing effects are named',
              'unexplained': 'a gap remains that no known effect explains'}
 
 
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
            before: Calibration | None, context: Context) -> Calibration:
     """
-    Fit, and level the mounting as it was levelled before.
+    Return a fit with the mounting of the previous calibration.
 
     Parameters
     ----------
@@ -51,14 +51,14 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
     sensor : str
         Name of the sensor.
     before : Calibration or None
-        The previous calibration, of which the levelled frame is kept.
+        The previous calibration; its levelled frame is kept.
     context : mapping of str to array
-        What its effects need, one row.
+        Columns that its effects need, one row.
 
     Raises
     ------
     RefusedFitError
-        If the poses do not determine the model; its advice is how to turn the sensor next.
+        If the poses do not determine the model; the advice is how to turn the sensor next.
     InputError
         If the readings are clearly in another unit.
 
@@ -76,7 +76,7 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
 
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
     """
-    Find what a calibration lacks.
+    Return the refinement of a calibration.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
     sensor : str
         Name of the sensor.
     before : Calibration or None
-        The calibration in use; None: what a fit would use.
+        The calibration in use; None: the model that a fit would select.
 
     Raises
     ------
@@ -107,12 +107,12 @@ def _now() -> str:
 
 def poses_up(poses: Poses, units: Units) -> Floats:
     """
-    Return the directions of up, as far as they are known before a fit.
+    Return the approximate direction of up in each pose, before a fit.
 
     Returns
     -------
     (n, 3) array
-        Unit vectors; none if the centre of native readings is not known.
+        Unit vectors; n = 0 if the centre of native readings is not known.
 
     """
     if units.name == 'native' and len(poses) < _FEWEST_NATIVE:
@@ -124,7 +124,7 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 
 
 def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
-    """Return the pose that helps most next, or that more poses no longer help."""
+    """Return the next pose, or that more poses no longer help."""
     up = poses_up(poses, units)
     noise = pose_noise(poses.noise, up)
     noise_g = None
@@ -133,33 +133,28 @@ def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
     return next_pose(up, '10' if model == 'auto' else model, noise, noise_g=noise_g)
 
 
-def then(asked: NextPose) -> str:
-    """Return what to do next."""
+def next_action(asked: NextPose) -> str:
+    """Return a text about the next action of the user."""
     if asked.direction is None:
         return f'{asked.words}; call ~/fit'
     return asked.words if np.isinf(asked.error) else f'{asked.words}, or call ~/fit'
 
 
-def poses_in_words(count: int) -> str:
-    """Return a number of poses in words."""
-    return '1 pose' if count == 1 else f'{count} poses'
-
-
 def summary(calibration: Calibration) -> str:
-    """Return the quality of a fit in a line."""
+    """Return the quality of a fit as one line."""
     quality = calibration.quality
     floor = ('' if quality.noise_floor_mg is None
              else f', noise floor {quality.noise_floor_mg:.3f} mg')
     words = [f'model {calibration.name} from {len(calibration.used_poses)} of '
-             f'{poses_in_words(len(calibration.poses))}: residual {quality.rms_before_mg:.2f} mg '
+             f'{counted(len(calibration.poses), "pose")}: residual {quality.rms_before_mg:.2f} mg '
              f'before, {quality.rms_after_mg:.3f} mg after{floor}']
-    words += [f'pose {rejected.row} left out, {rejected.reason}'
+    words += [f'pose {rejected.row} left out: {rejected.reason}'
               for rejected in calibration.rejected]
     return '; '.join([*words, *calibration.warnings])
 
 
 def story(refinement: Refinement) -> str:
-    """Return the result of a refinement in a line."""
+    """Return the result of a refinement as one line."""
     lines = [f'{_VERDICTS[refinement.verdict]}: residual {refinement.gap_mg:.3f} mg before, '
              f'{refinement.remaining_gap_mg:.3f} mg after']
     for step in refinement.steps:
@@ -167,13 +162,12 @@ def story(refinement: Refinement) -> str:
         lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '
                      f'{step.gap_after_mg:.3f} mg, {step.where}')
     if refinement.disturbed_poses:
-        rows = ', '.join(str(row) for row in refinement.disturbed_poses)
-        lines.append(f'left out as outliers: poses {rows}')
+        lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
     return '; '.join([*lines, *refinement.calibration.warnings, *refinement.advice])
 
 
 def title(calibration: Calibration) -> str:
-    """Return the name of a calibration in a few words."""
+    """Return a short description of a calibration."""
     return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
             f'{calibration.quality.rms_after_mg:.3f} mg, '
             f'{"levelled" if calibration.is_levelled else "not levelled"}')

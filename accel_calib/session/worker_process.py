@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A process beside the node that computes: fits with their files, refinements, the next pose.
+A separate process for computations: fits with their files, refinements and the next pose.
 
-In a thread of the node they would share its interpreter with the stream, and a message would wait
-up to 5 ms for each piece of them. Here they have an interpreter of their own and use the processor
-only while nothing else does: a nice value is not enough, because the scheduler lets a nice process
-that was asleep finish its slice of 3 ms. If others leave it too little, it is started again with
-the usual priority.
+In a thread of the node, the computations would share the interpreter with the stream, and messages
+would wait up to 5 ms. The process has its own interpreter and runs only while the processor is
+idle. A nice value is not enough, because the scheduler lets a nice process that was asleep finish
+its slice of 3 ms. If the process gets too little time, it is restarted with normal priority.
 
 Functions, arguments and results are pickled between the processes and never stored. The process
-ends with the node, however that ends, because its standard input does. If it cannot be started or
-dies, the node computes for itself.
+ends with the node in all cases, because its standard input is then closed. If the process cannot
+be started or dies, the node does the computation itself.
 
 """
 
@@ -35,20 +34,20 @@ from ..errors import InputError
 Found = TypeVar('Found')
 
 _PATIENCE = 10.0
-"""Time without an answer after which the process gets its share of a busy machine [s]."""
+"""Time without an answer after which the process is restarted with normal priority [s]."""
 
 _IDLE = 'idle'
-"""Argument of a process that runs only while the processor is idle."""
+"""Command line argument for a process that runs only while the processor is idle."""
 
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Arrays are small: more threads would only wait for each other."""
+"""Limits of the number of threads: arrays are small, so more threads would only wait."""
 
-_IMPORTED = ('accel_calib.refine', 'scipy.optimize', 'scipy.special')
-"""Modules imported at the start, so that the first fit takes no longer than the next."""
+_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.special')
+"""Modules imported at the start, so that the first fit is as fast as later ones."""
 
 
 class WorkerProcess:
-    """The process, as the node uses it; for one thread at a time."""
+    """The interface of the node to the process; for one thread at a time."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -56,14 +55,14 @@ class WorkerProcess:
         self._idle = True
 
     def start(self) -> None:
-        """Start the process, unless it is running, and return at once."""
+        """Start the process unless it is running, without waiting for it."""
         if self._closed or (self._process is not None and self._process.poll() is None):
             return
         command = [sys.executable, '-m', __name__, *([_IDLE] if self._idle else [])]
         path = os.pathsep.join(filter(None, sys.path))
         environment = {**os.environ, 'PYTHONPATH': path, **dict.fromkeys(_ONE_THREAD, '1')}
         try:
-            # In a session of its own it does not get the Ctrl-C of a terminal.
+            # In its own session it does not receive the Ctrl-C of a terminal.
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 start_new_session=True)
@@ -77,14 +76,14 @@ class WorkerProcess:
         Parameters
         ----------
         function : callable
-            Of a module, so that it can be imported by name.
+            A module-level function, which can be imported by name.
         *given
-            Its arguments, which can be pickled.
+            Arguments that can be pickled.
 
         Returns
         -------
         object
-            Its result; what it raises is raised here.
+            The result of the function. An error of the function is raised here, too.
 
         Raises
         ------
@@ -97,7 +96,7 @@ class WorkerProcess:
             good, found = self._ask(function, given)
         except (OSError, EOFError, pickle.UnpicklingError):
             if self._closed:
-                raise InputError('the node is ending', 'start it again') from None
+                raise InputError('the node is shutting down', 'start it again') from None
             self._end()
             return function(*given)
         if not good:
@@ -111,7 +110,7 @@ class WorkerProcess:
         process.stdin.write(pickle.dumps((function, given)))
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
-            self._idle = False  # without privileges the priority of a process cannot be raised
+            self._idle = False  # raising the priority needs privileges, so restart it
             self._end()
             self.start()
             return self._ask(function, given)
@@ -119,7 +118,7 @@ class WorkerProcess:
         return answer
 
     def close(self) -> None:
-        """End the process; a call that waits for it is refused."""
+        """End the process; a waiting call raises InputError."""
         self._closed = True
         self._end()
 
@@ -130,12 +129,12 @@ class WorkerProcess:
 
 
 def main() -> None:
-    """Answer calls until standard input ends; the code of the process."""
+    """Answer calls until standard input is closed; the main function of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if _IDLE in sys.argv:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     answers = os.fdopen(os.dup(sys.stdout.fileno()), 'wb')
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is not an answer
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # printed text must not mix with answers
     calls: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_read, args=(sys.stdin.buffer, calls), daemon=True).start()
     for name in _IMPORTED:
@@ -146,7 +145,7 @@ def main() -> None:
 
 
 def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
-    """Read calls; end the process with the node, even while it computes."""
+    """Read calls; end the process when the node ends, even during a computation."""
     try:
         while True:
             calls.put(pickle.load(stream))
