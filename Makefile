@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 SOURCES := package.xml setup.cfg $(shell find accel_calib config launch resource scripts \
 	-name __pycache__ -prune -o -print)
 
-PYTHON_SOURCES := setup.py $(wildcard .ci/*.py accel_calib benchmarks examples launch test)
+PYTHON_SOURCES := setup.py $(wildcard .ci/*.py accel_calib benchmarks docs examples launch test)
 
 # A sourced ROS, or a shell that a Python with ROS wheels started, would mix its libraries
 # with those of .venv.

@@ -28,7 +28,7 @@ from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate.closed_form import closed_form  # noqa: E402
 from accel_calib.estimate.fit import estimate  # noqa: E402
-from accel_calib.estimate.robust import start_of  # noqa: E402
+from accel_calib.estimate.outliers import start_of  # noqa: E402
 from accel_calib.model import predict, sensor_force  # noqa: E402
 from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
 from accel_calib.sphere import random_directions, spread_directions  # noqa: E402

@@ -121,7 +121,7 @@ def of_placement(job: Job) -> tuple[float, bool]:
     case = misplaced(rng, count, degrees)
     found = fitted(case)
     return error_of(found, case, rng), (found is not None and found.name != '12'
-                                        and '|force| = 1 g alone' in found.reason)
+                                        and 'only |force| = 1 g' in found.reason)
 
 
 def of_intervals(job: Job) -> tuple[Floats, Floats]:

@@ -8,8 +8,7 @@ import subprocess
 import sys
 
 from accel_calib.cli.main import main, parser
-from accel_calib.cli.options import plain
-from accel_calib.cli.progress import progress
+from accel_calib.cli.options import plain, progress
 from accel_calib.files import read_calibration, read_poses, write_table
 from accel_calib.simulate import parse_effect
 from accel_calib.sphere import rotation_from_rpy

@@ -9,7 +9,7 @@ import json
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.cli.main import main
 from accel_calib.compare import compare
-from accel_calib.compare.rotation_free import NAMES, rotation_free
+from accel_calib.compare.parameters import NAMES, rotation_free
 from accel_calib.errors import InputError
 from accel_calib.estimate.fit import estimate
 from accel_calib.files import write_calibration

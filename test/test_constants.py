@@ -8,8 +8,7 @@ from itertools import pairwise
 from accel_calib.capture import capture
 from accel_calib.effects import EFFECTS
 from accel_calib.refine import refine
-from accel_calib.refine.candidates import best_of, Candidate, fall_of
-from accel_calib.refine.least_squares import Projected
+from accel_calib.refine.candidates import best_of, Candidate, fall_of, Projected
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
 from accel_calib.table import Recording

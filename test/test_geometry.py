@@ -5,11 +5,15 @@
 import re
 
 from accel_calib.calibrate import fit_poses, next_pose
-from accel_calib.calibrate.pose_planning import missing_poses
-from accel_calib.calibrate.refusal import determines, refuse_if_unfit
+from accel_calib.calibrate.pose_planning import determines, missing_poses, refuse_if_unfit
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate.geometry import dilution, poses_needed, rows_of
-from accel_calib.estimate.identifiability import error_left_in, identifiability
+from accel_calib.estimate.geometry import (
+    dilution,
+    error_left_in,
+    identifiability,
+    poses_needed,
+    rows_of,
+)
 from accel_calib.model import predict
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions

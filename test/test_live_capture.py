@@ -15,8 +15,7 @@ from accel_calib.capture import CaptureSettings, Dwell, poses_from
 from accel_calib.files import read_calibration
 from accel_calib.session import CalibratorSettings
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after
-from accel_calib.session.live_capture import LiveCapture
-from accel_calib.session.pose_book import dwells_of, PoseBook, with_temperature
+from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.work import asked_for, fitted
 from accel_calib.simulate import model_with, simulate_recording
 from accel_calib.sphere import spread_directions

@@ -9,10 +9,15 @@ import struct
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.errors import InputError
 from accel_calib.messages import layout as imu
-from accel_calib.messages.arrays import doubles_at, frame_ids, joined, samples_of
-from accel_calib.messages.correction import corrected
-from accel_calib.messages.layout import layout_of, layout_with
-from accel_calib.messages.rewriter import motion_of, Rewriter
+from accel_calib.messages.correction import corrected, motion_of, Rewriter
+from accel_calib.messages.layout import (
+    doubles_at,
+    frame_ids,
+    joined,
+    layout_of,
+    layout_with,
+    samples_of,
+)
 from accel_calib.model import Model, predict
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions

@@ -5,8 +5,8 @@
 
 import accel_calib as ac
 from accel_calib.effects import _by_axis, AXES, Effect, EFFECTS, ONE
+from accel_calib.messages.correction import Rewriter
 from accel_calib.messages.layout import layout_of
-from accel_calib.messages.rewriter import Rewriter
 from accel_calib.report.page import page
 from accel_calib.sphere import random_directions
 import numpy as np

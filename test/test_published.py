@@ -7,7 +7,7 @@ import json
 
 from accel_calib.calibrate import fit_poses, verify
 from accel_calib.cli.main import main
-from accel_calib.estimate.sensing_axes import sensing_axes
+from accel_calib.estimate.closed_form import sensing_axes
 from accel_calib.files import read_poses
 from accel_calib.units import units_of
 import numpy as np

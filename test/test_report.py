@@ -7,10 +7,8 @@ from html.parser import HTMLParser
 import re
 
 from accel_calib.refine import refine
-from accel_calib.report.against import recorded, variables_of
-from accel_calib.report.drawings import all_drawings
+from accel_calib.report.drawings import all_drawings, equal_area, recorded, variables_of
 from accel_calib.report.page import page
-from accel_calib.report.sphere_map import equal_area
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
 from accel_calib.units import Units

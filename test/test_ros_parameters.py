@@ -12,8 +12,13 @@ from typing import Any
 from accel_calib.capture import CaptureSettings
 from accel_calib.errors import InputError
 from accel_calib.ros.simulator_node import SimulatorSettings
-from accel_calib.session.parameters import changed, default_of, yaml_lines
-from accel_calib.session.settings import CalibratorSettings, capture_settings
+from accel_calib.session.settings import (
+    CalibratorSettings,
+    capture_settings,
+    changed,
+    default_of,
+    yaml_lines,
+)
 import pytest
 import yaml
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from accel_calib.files import read_calibration, read_poses
 from accel_calib.model import Model
-from accel_calib.ros.markers import pose_markers
+from accel_calib.ros.display import pose_markers
 from accel_calib.session.work import asked_for, next_action
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions

@@ -4,9 +4,9 @@
 """
 From poses to a calibration.
 
-`fit` is the entry point; it calls `unknown_orientation` or `known_orientation`. `refusal` explains
-what poses do not determine, and `pose_planning` plans the next pose. `mounting` computes the
-mounting. `checks` detects wrong units and wiring faults, and `gate` rejects implausible results.
+`fit` is the entry point; it calls `unknown_orientation` or `known_orientation`. `pose_planning`
+explains what poses do not determine and plans the next pose. `mounting` computes the mounting.
+`checks` detects wrong units and wiring faults, and `gate` rejects implausible results.
 `calibration` is the record, and `quality` computes its figures.
 
 """

@@ -4,10 +4,10 @@
 """
 Checks of every calibration before it is stored, loaded or used.
 
-A fit has already converged (`accel_calib.estimate.solve`), and its poses determine the model
-(`.refusal`). The gate checks the calibration itself: finite values, a proper rotation, a valid
-covariance, plausible offset, gain and effects, and a useful uncertainty. The limits are far beyond
-the values of working sensors; only useless calibrations exceed them.
+A fit has already converged (`accel_calib.estimate.fit`), and its poses determine the model
+(`.pose_planning`). The gate checks the calibration itself: finite values, a proper rotation, a
+valid covariance, plausible offset, gain and effects, and a useful uncertainty. The limits are far
+beyond the values of working sensors; only useless calibrations exceed them.
 
 """
 

@@ -21,8 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from .calibration import Calibration, Rejected
+from .pose_planning import determines, refuse_if_unfit
 from .quality import fit_warnings, in_g, quality_of
-from .refusal import determines, refuse_if_unfit
 from .unknown_orientation import (
     calibration_of,
     directions_of,

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import Calibration, Rejected
+from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_warnings, in_g, quality_of
-from .refusal import refuse_if_unfit, unseen
 from ..errors import RefusedFitError
-from ..estimate.closed_form import closed_form, fit_4
-from ..estimate.fit import estimate, Fit, judge
+from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
+from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Point, solve
 from ..estimate.geometry import (
     dilution,
     free_parameters,
@@ -38,9 +38,7 @@ from ..estimate.geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
-from ..estimate.robust import fit_norm, start_of
-from ..estimate.sensing_axes import lower_triangular, TIES
-from ..estimate.solve import NotConvergedError, Point, solve
+from ..estimate.outliers import fit_norm, start_of
 from ..model import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..sphere import unit
 from ..table import Floats, Poses

@@ -4,11 +4,10 @@
 """
 From samples to still poses. The node and recordings use the same rule.
 
-`detector` is the entry point. `chunks` sums the samples over short intervals of header time, and
-`rule` decides whether the sensor is still in each chunk. `tracker` joins still chunks to dwells:
-`ongoing` accumulates the sums of a dwell, `average` computes its figures, and `dwell` accepts or
-rejects it. `poses` makes the pose table. `sums`, `window`, `sliding` and `noise` contain the
-arithmetic.
+`detector` is the entry point; it joins still chunks to dwells. `chunks` sums the samples over
+short intervals of header time, and `rule` decides whether the sensor is still in each chunk, from
+the arithmetic in `window`. `dwell` accumulates a dwell and accepts or rejects it. `poses` makes
+the pose table.
 
 """
 

@@ -1,25 +1,207 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stillness detector of one sensor: it converts samples to dwells."""
+"""
+The stillness detector of one sensor: it converts samples to dwells.
+
+**Tracker.** From still chunks to dwells.
+
+The window of a chunk is tested at once, and again after `HORIZON` more chunks, when the noise is
+better known. Only then does the chunk join the dwell. A dwell that began before the noise was
+known therefore starts where the sensor came to rest, and a slope excludes all its chunks. A window
+that is not still ends the dwell at once; the waiting chunks are then decided with the noise known
+so far.
+
+Next to a significant slope, the slope may continue below significance. There a weaker slope is
+enough to reject the dwell.
+
+All chunks of a still window belong to the dwell. The first and the last chunk of a dwell are
+trimmed. If the sensor is still again after a knock, in the same orientation, the dwell continues.
+A dwell is therefore returned `KNOCK` chunks after its end.
+
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+import copy
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .average import FIGURES, figures
-from .chunks import Chunker, Interruption, together
-from .dwell import Dwell, judged
-from .ongoing import OngoingDwell
-from .rule import Rule
+from .chunks import chained, Chunker, CHUNKS_PER_WINDOW, Interruption, Records, together, WIDTH
+from .dwell import DWELL, Dwell, FIGURES, figures, judged, OngoingDwell
+from .rule import HORIZON, Judged, Rule
 from .settings import CaptureSettings
-from .sums import chained, Records, WIDTH
-from .tracker import Tracker
 from ..table import Floats
 from ..units import Units
+
+_SAMPLES = 16
+"""Smallest number of samples in a dwell."""
+
+KNOCK = CHUNKS_PER_WINDOW + 3
+"""Largest number of disturbed windows within a dwell: a knock of about 4 chunks."""
+
+_LEAD = CHUNKS_PER_WINDOW - 2
+"""Chunks before the first still window that belong to the dwell."""
+
+_JUDGED = np.dtype([
+    ('sums', DWELL), ('begin', float), ('end', float), ('limit', float, 6), ('still', bool),
+    ('trending', np.intp)])
+"""A chunk with its verdict; see `rule.Judged`."""
+
+_NONE = np.empty(0, _JUDGED)
+
+
+class Tracker:
+    """Join still chunks to dwells, in one segment."""
+
+    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int
+                 ) -> None:
+        chunks = judged.chunks
+        self._rule = rule
+        self._chunks = chunks
+        shortest = max(settings.min_dwell, _SAMPLES * chunks.period)
+        self._shortest = math.ceil(shortest / chunks.length - 1e-9)
+        longest = settings.max_dwell / chunks.length
+        self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
+        self._waiting = self._lead = self._held = _NONE
+        self._dwell: OngoingDwell | None = None
+        self._pause = 0
+        self._beside_slope = False
+        self.number = number
+
+    def feed(self, judged: Judged) -> list[OngoingDwell]:
+        """Return the dwells that end with these chunks."""
+        self._waiting = chained(self._waiting, _records(judged))
+        return self._decide(last=False)
+
+    def close(self) -> list[OngoingDwell]:
+        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
+        done = self._decide(last=True)
+        return done + self._end()
+
+    def current(self) -> OngoingDwell | None:
+        """Return the ongoing dwell as if it ended now, or None if it is too short."""
+        if not len(self._waiting) or not self._waiting['still'][-1]:
+            return None
+        twin = copy.copy(self)
+        twin._dwell = copy.copy(self._dwell)
+        ended = twin._decide(last=True)
+        del ended
+        return twin._finished()
+
+    def _decide(self, last: bool) -> list[OngoingDwell]:
+        waiting = self._waiting
+        verdict = _verdict(waiting, last)
+        done: list[OngoingDwell] = []
+        edges = np.flatnonzero(np.diff(verdict)) + 1
+        for start, stop in zip([0, *edges], [*edges, len(verdict)]):
+            if stop > start:
+                part = waiting[start:stop]
+                done += self._extend(part) if verdict[start] else self._skip(part)
+        self._waiting = waiting[len(verdict):]
+        return done
+
+    def _skip(self, chunks: Records) -> list[OngoingDwell]:
+        self._pause += len(chunks)
+        self._lead = _tail(chained(self._lead, _tail(chunks, _LEAD)), _LEAD)
+        self._held = _NONE
+        sloping = bool((chunks['trending'] > 0).any())
+        self._beside_slope |= sloping
+        done = self._end() if self._pause > KNOCK or sloping else []
+        self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
+        return done
+
+    def _extend(self, chunks: Records) -> list[OngoingDwell]:
+        done: list[OngoingDwell] = []
+        before = self._held
+        if self._pause or self._dwell is None:
+            before = _without_windows(self._lead)
+            if self._dwell is None or not self._continues(chained(before, chunks[:1])):
+                done = self._end()
+                self._dwell = OngoingDwell(self._chunks, self.number)
+            self._pause = 0
+        chunks = chained(before, chunks)
+        self._lead = _NONE
+        self._held = _tail(chunks, 1)
+        return done + self._add(chunks[:-1])
+
+    def _continues(self, first: Records) -> bool:
+        return (self._dwell is not None and self._dwell.chunks > 0
+                and self._dwell.continued_by(first['sums'], self._rule.scale))
+
+    def _add(self, chunks: Records) -> list[OngoingDwell]:
+        assert self._dwell is not None
+        done: list[OngoingDwell] = []
+        while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
+            room = self._longest - self._dwell.chunks
+            self._append(chunks[:room])
+            done.append(self._dwell)
+            self._dwell = OngoingDwell(self._chunks, self.number)
+            chunks = chunks[room:]
+        self._append(chunks)
+        return done
+
+    def _append(self, chunks: Records) -> None:
+        assert self._dwell is not None
+        self._dwell.add(chunks['sums'].copy(), chunks['begin'], chunks['end'])
+
+    def _end(self) -> list[OngoingDwell]:
+        found = self._finished()
+        if self._dwell is not None:
+            self.number += 1
+        self._dwell = None
+        self._held = _NONE
+        return [] if found is None else [found]
+
+    def _finished(self) -> OngoingDwell | None:
+        if self._dwell is None or self._dwell.chunks < self._shortest:
+            return None
+        self._dwell.beside_slope = self._beside_slope
+        return self._dwell
+
+
+def _records(judged: Judged) -> Records:
+    """Return chunks with their verdicts as records."""
+    chunks = judged.chunks
+    found = np.empty(len(judged.still), _JUDGED)
+    for name in chunks.sums.dtype.names or ():
+        found['sums'][name] = chunks.sums[name]
+    found['sums']['level'], found['sums']['windows'] = judged.level.T, 1.0
+    found['begin'], found['end'] = chunks.begin, chunks.end
+    found['limit'], found['still'] = judged.limit.T, judged.still
+    found['trending'] = judged.trending
+    return found
+
+
+def _tail(chunks: Records, size: int) -> Records:
+    return chunks[max(len(chunks) - size, 0):]
+
+
+def _without_windows(chunks: Records) -> Records:
+    """Return the chunks without the variances of their windows."""
+    found = chunks.copy()
+    found['sums']['level'] = found['sums']['windows'] = 0.0
+    return found
+
+
+def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
+    """Return the final verdict on the first chunks, as many as can be decided now."""
+    size, still = len(chunks), chunks['still']
+    index = np.arange(size)
+    nearest = np.where(still, 2 * size + HORIZON, index)
+    ended = np.minimum.accumulate(nearest[::-1])[::-1]
+    due = np.minimum(index + HORIZON, ended)
+    if last:
+        due = np.minimum(due, size - 1)
+    count = int(np.searchsorted(due, size))
+    due, ended = due[:count], ended[:count]
+    over = np.any(chunks['sums']['level'][:count] > chunks['limit'][due], axis=1)
+    slope = np.append(chunks['trending'], 0)[np.minimum(ended, size)]
+    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope))
+
 
 _EARLIER = 100
 """Number of earlier dwells that are used in the test of a new dwell."""

@@ -5,8 +5,8 @@
 Dwells: still stretches, averaged and tested.
 
 Mean and standard deviation are those of all samples. The number of samples is divided by the
-excess of the noise of the mean (see `noise`), so that std/√count is the noise of the mean along
-the force (see `average`). A short dwell is not enough to estimate the excess, which is a property
+excess of the noise of the mean (see `window`), so that std/√count is the noise of the mean along
+the force (see below). A short dwell is not enough to estimate the excess, which is a property
 of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
 excess. Samples that are rounded to steps of height q cause an error of the mean. Averaging does
 not remove this error if the noise σ of the samples is less than a step: its variance is
@@ -23,6 +23,17 @@ A dwell is rejected in three cases:
 
 The noise may become known after the dwell ended, so each query tests the dwells again.
 
+**Averages.** Figures of finished dwells, one record per dwell.
+
+The noise of a mean is computed along the mean reading if that is known to be the vertical. A
+sensor that settles tilts slightly, which changes its reading across the vertical. Its mean is
+correct for its mean attitude, and the fit uses only the noise along the force.
+
+**Ongoing dwell.** The sums of an ongoing dwell.
+
+The chunks of a dwell are combined into at most `2 · CELLS` cells. The number of chunks per cell is
+a power of two, so a dwell of days needs no more memory than a dwell of a minute.
+
 References
 ----------
 .. [1] B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, chapter 4: the first term of
@@ -32,7 +43,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -40,11 +51,125 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .average import trend_of
-from .noise import Trend
+from .chunks import chained, Chunks, CONTEXT, Records, summed, SUMS
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
-from .sums import CONTEXT, Records
+from .window import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
+
+FIGURES = np.dtype([
+    ('lowest', float, 6),     # lower confidence limit of the mean variance of the windows
+    ('average', float, 6),    # mean variance of the windows
+    ('mean', float, 6),       # reading and rate
+    ('std', float, 3),        # of the samples
+    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `sliding.Line`
+    ('time_square', float), ('cells', float),
+    ('white', float, 3),      # variance of a cell mean for independent samples
+    ('spacing', float),       # time between cells [s]
+    ('begin', float), ('end', float), ('time', float),  # first, last and mean stamp [s]
+    ('samples', float),
+    ('excess', float),        # variance of the mean over that of independent samples
+    ('along', float),         # the same along the mean reading, if that is the vertical
+    ('beside_slope', bool),   # the reading has a slope directly before or after
+    ('orientation', np.intp),
+    ('around', float, 2),     # temperature and supply voltage
+    ('part_slope', float, 3), ('part_strength', float, 3)])  # first, middle and last half
+"""Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
+
+
+def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
+    """
+    Return the figures of dwells.
+
+    Parameters
+    ----------
+    dwells : sequence of OngoingDwell
+        The finished dwells.
+    known_units : bool
+        Whether the unit is known, so that the mean reading is nearly vertical.
+
+    Returns
+    -------
+    (k,) array of FIGURES
+        One record per dwell.
+
+    """
+    found = np.empty(len(dwells), FIGURES)
+    if not dwells:
+        return found
+    total = chained(*(dwell.total() for dwell in dwells))
+    count = total['count'][:, np.newaxis]
+    shift = total['first'] / count
+    square = np.maximum(total['second'] - total['first'] * shift, 0.0)
+    variance = square[:, :3] / np.maximum(count - 1.0, 1.0)
+    level = total['level'] / np.maximum(total['windows'], 1.0)[:, np.newaxis]
+    found['mean'] = shift + [dwell.origin for dwell in dwells]
+    found['std'] = np.sqrt(variance)
+    _add_noise(found, dwells, variance.T, level[:, :3].T, known_units)
+    spread = np.sqrt((1.0 + np.maximum(found['excess'], 1.0)) / total['count'])
+    found['lowest'] = level * np.exp(-2.0 * spread)[:, np.newaxis]
+    found['average'] = level
+    for name in ('begin', 'end', 'orientation', 'beside_slope'):
+        found[name] = [getattr(dwell, name) for dwell in dwells]
+    found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
+    found['samples'] = total['count']
+    known = total['context_count']
+    found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
+    return found
+
+
+def trend_of(found: Records) -> Trend:
+    """Return the slopes over whole dwells, with their significance."""
+    line = Line(found['slope'].T, found['square'].T, found['neighbours'].T, found['time_square'],
+                found['cells'])
+    return strength_of(line, found['spacing'], found['white'].T)
+
+
+def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
+               known_units: bool) -> None:
+    """Set the figures that depend on the means of cells."""
+    sizes = np.array([len(dwell.cells) for dwell in dwells], dtype=float)
+    count = np.zeros((len(dwells), int(sizes.max())))
+    sums = np.zeros((3, *count.shape))
+    for k, dwell in enumerate(dwells):
+        count[k, :len(dwell.cells)] = dwell.cells['count']
+        sums[:, k, :len(dwell.cells)] = dwell.cells['first'][:, :3].T
+    per_cell = count.sum(axis=1) / sizes
+    means = sums / np.maximum(count, 1.0)
+    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * (count > 0.0)
+    line = lines_through(centred, sizes)
+    spacing = np.array([dwell.size * dwell.length for dwell in dwells])
+    for name in ('slope', 'square', 'neighbours'):
+        found[name] = getattr(line, name).T
+    found['white'], found['spacing'] = (level / per_cell).T, spacing
+    found['time_square'], found['cells'] = line.time_square, sizes
+    _add_parts(found, centred, sizes, level / per_cell, spacing)
+    white = variance / per_cell
+    found['excess'] = found['along'] = excess_of_means(centred, sizes, white)
+    if known_units:
+        mean = found['mean'][:, :3].T
+        up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
+        along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
+        found['along'] = excess_of_means(along, sizes, np.sum(up ** 2 * white, axis=0)[np.newaxis])
+
+
+def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
+               ) -> None:
+    """
+    Set the slopes of the first, the middle and the last half, and their strengths.
+
+    They reveal a turn that begins or ends within a dwell better than the slope of the whole dwell.
+
+    """
+    half = sizes // 2
+    inside = np.arange(int(half.max())) < half[:, np.newaxis]
+    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
+        index = start[:, np.newaxis] + np.arange(inside.shape[1])
+        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
+        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
+        trend = strength_of(lines_through(part, half), spacing, white)
+        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
+        found['part_strength'][:, k] = trend.strength
+
 
 DWELL_RATIO = 3.2
 """Largest ratio of the mean variance of the windows of a dwell to the noise."""
@@ -187,3 +312,85 @@ def _dwell(found: Any, std: Floats, count: float) -> Dwell:
         context['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
                  count, int(found['samples']), context, int(found['orientation']))
+
+
+CELLS = 256
+
+DWELL = np.dtype([*SUMS.descr,
+                  ('level', float, 6),     # variance of the window at each chunk
+                  ('windows', float)])     # number of windows in that sum
+"""Sums of a chunk in a dwell."""
+
+_AGREE_G = 2e-3
+"""Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
+
+
+class OngoingDwell:
+    """
+    The accumulated chunks of a dwell.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        Source of epoch, origin and length.
+    orientation : int
+        Number of the dwell.
+
+    Attributes
+    ----------
+    begin, end : float
+        First and last stamp [s].
+    cells : (n,) array of DWELL
+        Sums over `size` chunks each.
+    beside_slope : bool
+        Whether the reading has a slope directly before or after the dwell.
+
+    """
+
+    def __init__(self, chunks: Chunks, orientation: int) -> None:
+        self.epoch = chunks.epoch
+        self.origin = chunks.origin
+        self.length = chunks.length
+        self.cells = self._partial = np.empty(0, DWELL)
+        self.size = 1
+        self.begin = self.end = 0.0
+        self.chunks = 0
+        self.beside_slope = False
+        self.orientation = orientation
+
+    def add(self, sums: Records, begin: Floats, end: Floats) -> None:
+        """Add consecutive chunks: (m,) sums, first and last stamps."""
+        if not len(sums):
+            return
+        self.begin = self.begin if self.chunks else float(begin[0])
+        self.end = float(end[-1])
+        self.chunks += len(sums)
+        while len(sums):
+            room = (2 * CELLS - len(self.cells)) * self.size - len(self._partial)
+            self._append(sums[:room])
+            sums = sums[room:]
+
+    def _append(self, sums: Records) -> None:
+        if self.size > 1:
+            sums = chained(self._partial, sums)
+            whole = len(sums) // self.size * self.size
+            self._partial = sums[whole:]
+            sums = summed(sums[:whole], self.size) if whole else sums[:0]
+        self.cells = chained(self.cells, sums)
+        if len(self.cells) == 2 * CELLS:
+            self.cells = summed(self.cells, 2)
+            self.size *= 2
+
+    def total(self) -> Records:
+        """Return the sum of all chunks, one record."""
+        every = chained(self.cells, self._partial)
+        return summed(every, len(every))
+
+    def continued_by(self, sums: Records, scale: float) -> bool:
+        """Return whether these chunks have the same mean reading as the dwell."""
+        old, new = self.total(), summed(sums, len(sums))
+        level = np.maximum(old['level'] / np.maximum(old['windows'], 1.0)[:, np.newaxis],
+                           new['level'] / new['windows'][:, np.newaxis])[0, :3]
+        apart = np.abs(old['first'] / old['count'][:, np.newaxis]
+                       - new['first'] / new['count'][:, np.newaxis])[0, :3]
+        return bool(np.all(apart <= np.sqrt(level) + _AGREE_G * scale))

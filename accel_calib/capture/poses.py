@@ -25,11 +25,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import Interruption
+from .chunks import CONTEXT, Interruption, WIDTH
 from .detector import StillDetector
 from .dwell import Dwell
 from .settings import CaptureSettings
-from .sums import CONTEXT, WIDTH
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import UnitName, Units

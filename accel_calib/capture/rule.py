@@ -36,10 +36,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import Chunks
-from .noise import Trend
+from .chunks import blank, chained, Chunks, SUMS
 from .settings import CaptureSettings
-from .sums import blank, chained, SUMS
 from .window import (
     at_least,
     at_least_any,
@@ -48,6 +46,7 @@ from .window import (
     rounding,
     Stretch,
     stretch,
+    Trend,
     windows,
 )
 from ..table import Floats

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .progress import progress
+from .options import progress
 from ..calibrate import Calibration, check_sensor, check_units, of_samples
 from ..errors import counted, InputError
 from ..files import correct_bag, is_bag, read_samples, write_table

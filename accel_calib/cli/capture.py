@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .progress import progress
+from .options import progress
 from ..calibrate import check_units
 from ..capture import capture, Captured, CaptureSettings, REPEATED, settings_from
 from ..errors import counted, InputError

@@ -1,15 +1,22 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Options that several commands have, and the output of results."""
+"""
+Options that several commands have, and the output of results.
+
+**Progress.** A progress bar on standard error, if it is a terminal.
+
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import json
 from pathlib import Path
-from typing import Any
+import sys
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +26,26 @@ from ..files import read_calibration
 from ..files.atomic import write_atomically
 from ..table import Poses
 from ..units import STANDARD_GRAVITY, UNIT_NAMES, Units, units_of
+
+if TYPE_CHECKING:
+    from ..files import Progress
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Progress]:
+    """Show a progress bar, and yield the function that updates it."""
+    if not sys.stderr.isatty():
+        yield lambda done, count: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (BarColumn(), TextColumn('{task.completed:,.0f} of {task.total:,.0f} ' + what),
+               TimeRemainingColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task('', visible=False)
+        yield lambda done, count: bar.update(task, completed=done, total=count, visible=True)
 
 
 def add_example(made: argparse.ArgumentParser, example: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from ..calibrate import Calibration, Outlook, outlook
 from ..effects import effect_named
 from ..errors import counted
-from ..estimate.sensing_axes import sensing_axes
+from ..estimate.closed_form import sensing_axes
 from ..units import MG
 from ..words import base_words, chance, short
 

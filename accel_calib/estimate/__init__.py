@@ -4,10 +4,9 @@
 """
 The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
 
-`equations` sets up the equations of the poses, and `solve` minimises their residuals. `fit`
-combines both and computes the covariance; `noise` defines the weight of the measured noise.
-`outliers` finds outliers, and `robust` starts the fit if outliers would distort it. `closed_form`
-and `quadric` compute start values. `geometry` and `identifiability` compute what poses determine
-before any fit.
+`equations` sets up the equations of the poses and defines the weight of their measured noise.
+`fit` minimises the residuals and computes the covariance. `outliers` finds outliers, also those
+that would distort a fit. `closed_form` computes start values. `geometry` computes what poses
+determine before any fit.
 
 """

@@ -4,27 +4,223 @@
 """
 Closed forms: the cost functions of AN5286 and the ESGI'95 report, without weights.
 
-Poses of unknown orientation lie on a quadric (see `accel_calib.estimate.quadric`). For model 4 the
-quadric is a sphere, fitted by linear least squares. For model 7 its axes are parallel to those of
-the sensor, and for model 10 they have any direction.
+Poses of unknown orientation lie on a quadric. For model 4 the quadric is a sphere, fitted by
+linear least squares. For model 7 its axes are parallel to those of the sensor, and for model 10
+they have any direction.
 
 Poses of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report,
 section 3).
+
+**Quadric.** The quadric through the readings of a still sensor, from the moments of the readings.
+
+Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
+
+    readingᵀ A reading - 2 readingᵀ A V + VᵀA V - B² = 0,   W⁻¹ = (A / B²)^(1/2)
+
+The coefficients are the eigenvector of XᵀX with the smallest eigenvalue, where a row of X holds
+the monomials of a reading. This cost depends on origin and scale. The readings are therefore first
+shifted and scaled by the sphere that fits them. Counts and volts then lead to the same result as
+m/s², without a loss of digits. Leading axes of all arrays are sensors.
+
+**Sensing axes.** The 9-parameter model: shifts, scales and the angles between the sensing axes
+(ESGI'95 report).
+
+Sensing axis i is a unit vector f_i with the reading m_i = b_i (f_i · a) + s_i. The reference axes
+e are fixed to the sensing axes by e1 = f1 and e2 in the f1-f2 plane, so that in these axes
+
+    f1 = (1, 0, 0)
+    f2 = (cos φ, sin φ, 0)
+    f3 = (cos ψ, cos ξ, cos η),  cos² η = 1 - cos² ξ - cos² ψ,
+                                 cos ξ = (cos θ - cos φ cos ψ) / sin φ
+
+with φ between f1 and f2, ψ between f1 and f3, and θ between f2 and f3. The rows f_i form the
+matrix T̄ᵒʳᵗʰ of the report (its eq. 11 needs the transpose of its eq. 12), and W = diag(b) T̄ᵒʳᵗʰ
+is lower triangular. The angles need not be small.
+
+|force| does not depend on the axes of the force. This model is therefore fitted as model 10 and
+then rotated (`lower_triangular`). `TIES` maps its nine parameters to the twelve values of the
+model.
 
 """
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from functools import cached_property
 
-from .quadric import centred, DIAGONAL, quadric, sphere_of, SYMMETRIC
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import counted, RefusedFitError
+from ..model import MODELS, parameter_names
 from ..table import Floats
+
+_RIDGE = 1e-12
+"""Keeps the solution finite for poses in a plane; the centre is then in the plane."""
+
+_BLOCK = 8192
+"""Number of poses per block; their monomials fit in the cache."""
+
+_IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
+
+
+@dataclass(frozen=True)
+class Form:
+    """
+    The quadratic monomials r_i r_j of a quadric.
+
+    Parameters
+    ----------
+    first, second : (k,) array of int
+        i and j; pairs with i = j are first.
+
+    """
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+
+    @cached_property
+    def pairs(self) -> NDArray[np.intp]:
+        """(2 k,) array, all i, then all j."""
+        return np.concatenate([self.first, self.second])
+
+    @cached_property
+    def twice(self) -> Floats:
+        """(k,) array, how often each monomial occurs in rᵀ A r."""
+        return np.where(self.first == self.second, 1.0, 2.0)
+
+    @cached_property
+    def linear(self) -> Floats:
+        """(3, 3 k) array, the part linear in r when the origin moves by c."""
+        taken = np.zeros((3, 3, len(self.twice)))
+        for k, (i, j) in enumerate(zip(self.first, self.second)):
+            taken[i, j, k] += self.twice[k]
+            taken[j, i, k] += self.twice[k]
+        return taken.reshape(3, -1)
+
+    @cached_property
+    def scatter(self) -> Floats:
+        """(k, 9) array, maps the coefficients to the entries of A."""
+        entries = np.zeros((len(self.twice), 3, 3))
+        each = np.arange(len(self.twice))
+        entries[each, self.first, self.second] = entries[each, self.second, self.first] = 1.0
+        return entries.reshape(-1, 9)
+
+
+DIAGONAL = Form(np.array([0, 1, 2]), np.array([0, 1, 2]))
+SYMMETRIC = Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
+
+
+def centred(reading: Floats) -> tuple[Floats, Floats]:
+    """Return the (..., 3) mean, and the (..., 3, n) readings minus the mean."""
+    transposed = reading.swapaxes(-1, -2)
+    mean = transposed.sum(axis=-1) / reading.shape[-2]
+    return mean, transposed - mean[..., np.newaxis]
+
+
+def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
+    """
+    Return the sphere from moments about the mean.
+
+    It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses. The
+    sum of all r is zero.
+
+    Parameters
+    ----------
+    second : (..., 3, 3) array
+        Sum of r rᵀ.
+    third : (..., 3) array
+        Sum of |r|² r.
+    count : int
+        Number of poses.
+
+    Returns
+    -------
+    (..., 3) array, (...) array
+        Centre and radius.
+
+    """
+    trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
+    ridge = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
+    centre = np.linalg.solve(second + ridge, third[..., np.newaxis])[..., 0] / 2.0
+    squared = trace / count + (centre * centre) @ _ONES
+    return centre, np.sqrt(squared + (squared == 0.0))
+
+
+def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
+    """
+    Fit the quadric whose matrix A has the entries of this form; other entries are zero.
+
+    Parameters
+    ----------
+    reading : (..., n, 3) array
+        Readings in any unit.
+    form : Form
+        `DIAGONAL` or `SYMMETRIC`.
+
+    Returns
+    -------
+    (..., 3, 3) array, (..., 3) array
+        W and V; NaN where the quadric is no ellipsoid.
+
+    """
+    mean, r = centred(reading)
+    size = len(form.twice)
+    moments = _moments(form, r[..., :_BLOCK])
+    for start in range(_BLOCK, r.shape[-1], _BLOCK):
+        moments = moments + _moments(form, r[..., start:start + _BLOCK])
+    centre, radius = sphere_of(moments[..., size:-1, size:-1],
+                               _ONES @ moments[..., :3, size:-1], r.shape[-1])
+    radius = radius[..., np.newaxis]
+    change = _to_sphere(form, centre, radius)
+    beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
+    mat_w, offset = _ellipsoid(form, beta)
+    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
+
+
+def _moments(form: Form, r: Floats) -> Floats:
+    """Sum the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
+    size = len(form.twice)
+    monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
+    monomials[..., size:-1, :] = r
+    pairs = r[..., form.pairs, :]
+    np.multiply(pairs[..., :size, :], pairs[..., size:, :], out=monomials[..., :size, :])
+    return monomials @ monomials.swapaxes(-1, -2)
+
+
+def _to_sphere(form: Form, centre: Floats, radius: Floats) -> Floats:
+    """Return the matrix from monomials of r to those of (r - centre) / radius, times `twice`."""
+    size, lead = len(form.twice), centre.shape[:-1]
+    change = np.zeros((*lead, size + 4, size + 4))
+    diagonal = change.reshape(*lead, -1)[..., ::size + 5]
+    moved, twice = centre / -radius, form.twice / (radius * radius)
+    diagonal[..., :size] = twice
+    diagonal[..., size:] = 1.0 / radius
+    change[..., size:-1, :size] = ((moved / radius) @ form.linear).reshape(*lead, 3, size)
+    pairs = moved[..., form.pairs]
+    change[..., -1, :size] = form.twice * pairs[..., :size] * pairs[..., size:]
+    change[..., -1, size:-1] = moved
+    change[..., -1, -1] = 1.0
+    return change
+
+
+def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
+    """Return W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
+    size = len(form.twice)
+    mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
+    values, vectors = np.linalg.eigh(mat_a)
+    sign = np.copysign(1.0, values[..., 1:2])  # AN5286: negate the whole vector
+    with np.errstate(invalid='ignore', divide='ignore'):
+        along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] / (-2.0 * values)
+        values = values * sign
+        field_squared = (along * along * values) @ _COLUMN - beta[..., -1:] * sign  # B²
+        gain = np.sqrt(field_squared / values)  # the middle value is positive: NaN where B² is not
+        mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
+        return mat_w, (vectors @ along[..., np.newaxis])[..., 0]
+
 
 _FACE_COSINE = np.cos(np.radians(20.0))
 """A reading within 20° of a sensor axis is one of the six faces."""
-
-_IDENTITY = np.eye(3)
 
 
 def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
@@ -123,3 +319,69 @@ def faces(reading: Floats) -> Floats | None:
     reference = np.eye(3)[axis] * np.sign(along)[:, np.newaxis]
     aligned = np.all(np.abs(along) >= _FACE_COSINE * np.linalg.norm(r, axis=1))
     return reference if aligned and len(np.unique(reference, axis=0)) == 6 else None
+
+
+def _ties() -> Floats:
+    """Return the (12, 9) matrix from offset and lower triangle of W to the values of the model."""
+    names = parameter_names(MODELS['9'])
+    ties = np.zeros((len(names), 9))
+    for k in range(6):  # offset and axis_gain
+        ties[k, k] = 1.0
+    # An entry (i, j) below the diagonal is half cross-axis, half rotation.
+    for k, (pair, axis, sign) in enumerate((('xy', 'z', 1), ('xz', 'y', -1), ('yz', 'x', 1))):
+        ties[names.index(f'cross_axis.{pair}'), 6 + k] = 0.5
+        ties[names.index(f'misalignment.{axis}'), 6 + k] = 0.5 * sign
+    return ties
+
+
+TIES = _ties()
+"""(12, 9) matrix from offset and lower triangle of W to the values of model 9."""
+
+
+@dataclass(frozen=True)
+class SensingAxes:
+    """
+    The nine parameters of the ESGI'95 report.
+
+    Parameters
+    ----------
+    shifts : (3,) array
+        s, in the unit of the readings.
+    scales : (3,) array
+        b > 0, in the unit of the readings per unit of force.
+    phi, psi, theta : float
+        Angles between f1 and f2, f1 and f3, f2 and f3 [rad].
+
+    """
+
+    shifts: Floats
+    scales: Floats
+    phi: float
+    psi: float
+    theta: float
+
+
+def sensing_axes(mat_w: Floats, vec_v: Floats) -> SensingAxes:
+    """Return shifts, scales and angles of W (3, 3) and V (3,), for W in any axes."""
+    scales = np.linalg.norm(mat_w, axis=1)
+    cosines = (mat_w @ mat_w.T) / np.outer(scales, scales)
+    phi, psi, theta = np.arccos(np.clip(cosines[[0, 0, 1], [1, 2, 2]], -1.0, 1.0))
+    return SensingAxes(np.array(vec_v), scales, float(phi), float(psi), float(theta))
+
+
+def lower_triangular(mat_w: Floats) -> Floats:
+    """
+    Rotate the axes of W so that e1 = f1 and e2 is in the f1-f2 plane.
+
+    Parameters
+    ----------
+    mat_w : (3, 3) array
+        Gain in any axes.
+
+    Returns
+    -------
+    (3, 3) array
+        W Q for the rotation Q that makes it lower triangular with a positive diagonal.
+
+    """
+    return np.linalg.cholesky(mat_w @ mat_w.T)

@@ -11,20 +11,32 @@ are outliers. In this test several outliers do not mask each other. Between the 
 updated to first order. Above `_MANY` poses, outliers no longer mask each other, and all poses that
 are extreme relative to the median are removed at once.
 
-A gross outlier can distort the first fit. `.robust` starts from poses that agree.
+A gross outlier can distort the first fit. `fit_norm` then starts from poses that agree.
+
+**Gross outliers.** Fits that are robust against gross outliers.
+
+A single wrong row, such as zeros or a reading in another unit, can distort the closed form and the
+fit of all poses so far that the residuals do not show which row is wrong. If the fit of all poses
+is suspicious, subsets are therefore fitted in closed form. The subset with the smallest trimmed
+squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
+agrees with it.
 
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import ByPose, Fit
-from .noise import belief_in
-from ..table import Floats
+from .closed_form import closed_form
+from .equations import belief_in, noise_of
+from .fit import ByPose, estimate, Fit, judge, NotConvergedError
+from ..model import Model, MODELS, parameter_names, with_linear_part
+from ..table import Floats, Poses
 
 LEVEL = 0.007
 """Probability that a pose of a set without outliers is removed."""
@@ -196,3 +208,191 @@ def _far_out(data: ByPose, fit: Fit, limit: int) -> Outliers:
     largest = np.argsort(-size, kind='stable')[:limit]
     found = np.sort(largest[extreme[largest]])
     return Outliers(found, max(fit.chi2 - float(np.sum(alone[found])), 0.0))
+
+
+_ROUNDS = 6
+"""Largest number of fits after which poses are left out or included."""
+
+_SUSPICIOUS = 4.0
+"""chi² per degree of freedom above which the fit of all poses is suspicious."""
+
+_CLEARLY = 10.0
+"""Ratio of the variances above which a pose that the robust fit leaves out is an outlier. The
+choice among subsets makes small differences look significant, so a smaller ratio is ignored;
+`.outliers` decides about the other poses."""
+
+_MOST_SUBSETS = 400
+"""Largest number of subsets that are fitted."""
+
+_SPARE = 3
+"""Number of poses in a random subset beyond the free parameters."""
+
+_CONCENTRATIONS = 3
+"""Number of closed forms after each of which the nearest poses are selected again."""
+
+
+def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
+    """
+    Fit a model to poses of unknown orientation, without the outliers.
+
+    Parameters
+    ----------
+    name : {'4', '7', '10'}
+        The model.
+    poses_g : Poses
+        Poses in g, at least as many as free parameters.
+
+    Returns
+    -------
+    Fit, (k,) array of int
+        The fit, and the indices of the poses used.
+
+    Raises
+    ------
+    NotConvergedError
+        If the poses are not on an ellipsoid.
+
+    """
+    everyone = np.arange(len(poses_g))
+    direct = _without_outliers(name, poses_g, everyone)
+    if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):
+        return direct
+    robust = _from_those_that_agree(name, poses_g)
+    if robust is None:
+        if direct is None:
+            raise NotConvergedError
+        return direct
+    found, gross = direct, _grossest_first(*robust, poses_g)
+    for count in range(len(gross) + 1):
+        if found is not None and found[0].variance <= _CLEARLY * robust[0].variance:
+            return found
+        found = _without_outliers(name, poses_g, np.setdiff1d(everyone, gross[:count + 1]))
+    return robust
+
+
+def start_of(name: str, reading: Floats) -> Model:
+    """Return start values by the closed form; a sphere if the poses are not on an ellipsoid."""
+    mat_w, vec_v = closed_form(name, reading)
+    if not np.all(np.isfinite(mat_w)):
+        mat_w, vec_v = closed_form('4', reading)
+    values = with_linear_part(mat_w, vec_v).values
+    if name == '4':
+        values = {**values, 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0])}
+    return Model({effect: values[effect] for effect in MODELS[name]})
+
+
+def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.intp]:
+    """Return the poses that a fit leaves out, in decreasing order of the residual."""
+    out = np.setdiff1d(np.arange(len(poses_g)), kept)
+    away = np.abs(judge(fit.model, poses_g).residual[out])
+    return out[np.argsort(-away, kind='stable')]
+
+
+def _without_outliers(name: str, poses_g: Poses, kept: NDArray[np.intp]
+                      ) -> tuple[Fit, NDArray[np.intp]] | None:
+    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
+    fit = _fit(name, poses_g, kept)
+    for _ in range(_ROUNDS):
+        out = () if fit is None else outliers(fit, len(poses_g)).poses
+        if not len(out):
+            break
+        kept = np.delete(kept, out)
+        fit = _fit(name, poses_g, kept)
+    if fit is None:
+        return None
+    if len(kept) < len(poses_g):
+        return _with_those_that_agree(name, poses_g, kept) or (fit, kept)
+    return fit, kept
+
+
+def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]] | None:
+    """Fit the poses that agree best, and include those that agree with them."""
+    most = _most(name, len(poses_g))
+    if most < 1:
+        return None
+    return _with_those_that_agree(name, poses_g, _agreeing(name, poses_g, most))
+
+
+def _with_those_that_agree(name: str, poses_g: Poses, kept: NDArray[np.intp]
+                           ) -> tuple[Fit, NDArray[np.intp]] | None:
+    """Include the poses that agree with a fit, leave out the others; None if too few agree."""
+    tried: set[bytes] = set()
+    while (fit := _fit(name, poses_g, kept)) is not None:
+        tried.add(kept.tobytes())
+        agreeing = np.flatnonzero(_agrees(fit, kept, poses_g))
+        if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
+            return None
+        if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
+            return fit, kept
+        kept = agreeing
+    return None
+
+
+def _fit(name: str, poses_g: Poses, kept: NDArray[np.intp]) -> Fit | None:
+    now = poses_g.take(kept)
+    try:
+        return estimate(start_of(name, now.reading), now)
+    except NotConvergedError:
+        return None
+
+
+def _most(name: str, count: int) -> int:
+    """Return the largest number of poses that can be left out."""
+    return min(int(LARGEST_SHARE * count), (count - _free(name)) // 2)
+
+
+def _free(name: str) -> int:
+    return len(parameter_names(MODELS[name]))
+
+
+def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool_]:
+    """Return which poses agree with a fit to the poses kept."""
+    data = judge(fit.model, poses_g).by_pose
+    leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
+    inside = np.isin(np.arange(len(poses_g)), kept)
+    spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
+    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+    size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
+    agrees: NDArray[np.bool_] = beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
+    return agrees
+
+
+def _agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
+    """Return the indices of all poses but `most`, selected so that they agree best."""
+    count = len(poses_g)
+    reading = poses_g.reading
+    noise = noise_of(poses_g)
+    noise = np.ones_like(reading) if noise is None else noise
+    nearest = _subsets(count, most, _free(name))
+    for _ in range(_CONCENTRATIONS):
+        squared = _squared_distances(name, reading, nearest, noise)
+        nearest = np.argsort(squared, axis=1)[:, :count - most]
+        trimmed = np.take_along_axis(squared, nearest, axis=1).sum(axis=1)
+        nearest = nearest[np.argsort(trimmed)[:10]]
+    return np.sort(nearest[0])
+
+
+def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
+    """Return all subsets of count - most poses, or `_MOST_SUBSETS` random subsets."""
+    if comb(count, most) <= _MOST_SUBSETS:
+        out = np.array(list(combinations(range(count), most)))
+        inside = np.ones((len(out), count), bool)
+        np.put_along_axis(inside, out, False, axis=1)
+        return np.nonzero(inside)[1].reshape(len(out), -1)
+    size = min(free + _SPARE, count - most)
+    rng = np.random.default_rng(count)
+    return np.argsort(rng.random((_MOST_SUBSETS, count)), axis=1)[:, :size]
+
+
+def _squared_distances(name: str, reading: Floats, subsets: NDArray[np.intp], noise: Floats
+                       ) -> Floats:
+    """Return the (s, n) squared distances of all poses from the closed form of each subset."""
+    with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane
+        mat_w, vec_v = closed_form(name, reading[subsets])
+        sound = np.isfinite(mat_w).all(axis=(1, 2)) & (np.abs(np.linalg.det(mat_w)) > 0.0)
+        inverse = np.linalg.inv(np.where(sound[:, np.newaxis, np.newaxis], mat_w, np.eye(3)))
+        u = (reading - vec_v[:, np.newaxis]) @ np.swapaxes(inverse, 1, 2)
+        length = np.linalg.norm(u, axis=2)
+        along = (u / length[:, :, np.newaxis]) @ inverse
+        squared = (length - 1.0) ** 2 / np.sum((along * noise) ** 2, axis=2)
+    return np.where(sound[:, np.newaxis] & np.isfinite(squared), squared, np.inf)

@@ -6,8 +6,14 @@
 from .bag import is_bag
 from .bag_correction import correct_bag, Progress
 from .calibration_yaml import read_calibration, write_calibration
-from .recording import open_recording, OpenRecording, read_recording
-from .table_csv import read_poses, read_samples, write_table
+from .tables import (
+           open_recording,
+           OpenRecording,
+           read_poses,
+           read_recording,
+           read_samples,
+           write_table,
+)
 
 __all__ = ['OpenRecording', 'Progress', 'correct_bag', 'is_bag', 'open_recording',
            'read_calibration', 'read_poses', 'read_recording', 'read_samples',

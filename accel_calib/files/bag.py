@@ -5,7 +5,7 @@
 Reader of bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
 `rosbags` reads the serialized messages. They are joined to blocks of arrays
-(`accel_calib.messages.arrays`), so the memory needed does not depend on the length of the bag.
+(`accel_calib.messages.layout`), so the memory needed does not depend on the length of the bag.
 
 """
 
@@ -23,8 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..messages.arrays import doubles_at, frame_ids, joined, Messages, samples_of, stamps_of
-from ..messages.layout import IMU_DOUBLES
+from ..messages.layout import (
+    doubles_at,
+    frame_ids,
+    IMU_DOUBLES,
+    joined,
+    Messages,
+    samples_of,
+    stamps_of,
+)
 from ..table import Floats, Recording
 
 if TYPE_CHECKING:

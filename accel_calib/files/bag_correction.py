@@ -28,9 +28,8 @@ from .bag import (
 )
 from ..calibrate import Calibration, check_sensor
 from ..errors import InputError
-from ..messages.arrays import doubles_at, Messages, put_doubles, samples_of
 from ..messages.correction import corrected
-from ..messages.layout import IMU_DOUBLES
+from ..messages.layout import doubles_at, IMU_DOUBLES, Messages, put_doubles, samples_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

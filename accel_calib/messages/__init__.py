@@ -4,7 +4,7 @@
 """
 Serialized sensor_msgs/Imu messages, from bags and from topics.
 
-`layout` defines the places of the fields in a message. `arrays` reads many messages at once, and
-`correction` corrects them. `rewriter` corrects single messages.
+`layout` defines the places of the fields in a message and reads many messages at once.
+`correction` corrects many messages or single ones.
 
 """

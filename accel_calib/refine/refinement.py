@@ -6,6 +6,8 @@ The refinement of a calibration: the entry point and the record of the result.
 
 See `accel_calib.refine.search` for the method, and `.stored` for a stored calibration as the base.
 
+**Base.** The base: the model that a refinement starts from.
+
 """
 
 from __future__ import annotations
@@ -16,30 +18,65 @@ from itertools import pairwise
 
 import numpy as np
 
-from .advice import advice_for, change_words
-from .base import base_of
 from .candidates import fall_of, probability, RIVAL
+from .findings import advice_for, change_words, not_testable, where
 from .records import Refinement, Stage, Step, Verdict
 from .search import Found, search
 from .state import is_noise, State
 from .stored import beside_stored, with_changes, with_stored
-from .untestable import not_testable
-from .where import where
-from ..calibrate import Calibration, check_sensor, check_units, FLAT, gated, in_g, Rejected
+from ..calibrate import (
+    Calibration,
+    check_sensor,
+    check_units,
+    fit_poses,
+    FLAT,
+    gated,
+    in_g,
+    Rejected,
+)
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
-from ..calibrate.previous_pose import with_previous
-from ..calibrate.quality import fit_warnings, other_warnings, quality_of
-from ..calibrate.refusal import refuse_if_unfit
+from ..calibrate.pose_planning import refuse_if_unfit
+from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_previous
 from ..effects import CHANGES, effect_named, LADDER, WANDER
 from ..errors import counted, listed, RefusedFitError
-from ..estimate.fit import judge
+from ..estimate.closed_form import fit_4
+from ..estimate.equations import variance_factor
+from ..estimate.fit import judge, NotConvergedError
 from ..estimate.geometry import LARGEST_DILUTION
-from ..estimate.noise import variance_factor
-from ..estimate.solve import NotConvergedError
 from ..model import Model
 from ..sphere import unit
-from ..table import Poses
+from ..table import Floats, Poses
 from ..units import MG, Units
+
+BASES = ('auto', 'ideal', '4', '7', '10', '12')
+
+
+def base_of(poses: Poses, units: Units, name: str) -> Calibration:
+    """Return the base as a calibration; errors as in `fit_poses`."""
+    if name not in BASES:
+        raise ValueError(f'base is {name!r}, expected one of {BASES}')
+    if name == 'ideal':
+        return ideal(poses, units)
+    try:
+        return fit_poses(poses, units, model=name)
+    except RefusedFitError:
+        if name == 'auto' and 'orientation' in poses:
+            return ideal(poses, units)
+        raise
+
+
+def ideal(poses: Poses, units: Units) -> Calibration:
+    """Return the ideal sensor; for native readings with a fitted offset and scale."""
+    values: dict[str, Floats] = {}
+    if units.name == 'native':
+        mat_w, vec_v = fit_4(poses.reading)
+        units = Units('native', float(mat_w[0, 0]))
+        values = {'offset': vec_v / units.per_g}
+    poses_g = in_g(poses, units)
+    fit = judge(Model(values), poses_g)
+    return Calibration('ideal', 'ml', fit.model, units, '', 'ros', '', fit.covariance,
+                       quality_of(fit, units, unit(poses_g.reading)), poses, (), 'ideal', ())
+
 
 _LEAST_POSES = 4
 _NAMED = 4

@@ -34,8 +34,8 @@ from .candidates import (
     LEVEL,
     pair_is_better,
     probability,
+    projected,
 )
-from .least_squares import projected
 from .output import Clipped, off_grid, unclipped
 from .state import beginning, State
 from ..effects import LADDER, WANDER

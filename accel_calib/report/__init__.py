@@ -4,8 +4,8 @@
 """
 Figures of a refinement, and one page (the report) with all figures.
 
-`drawings` lists the figures. `sphere_map`, `against` and `ladder` draw them in the style of
-`style`, and `page` writes the HTML. matplotlib is imported only when a figure is drawn.
+`drawings` draws the figures in the style of `style`, and `page` writes the HTML. matplotlib is
+imported only when a figure is drawn.
 
 """
 

@@ -1,28 +1,322 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figures of a refinement."""
+"""
+The figures of a refinement.
+
+**Sphere map.** Figures of residuals over the sphere: two hemispheres in Lambert's equal-area
+projection.
+
+A direction u is at the radius √(1 - |u_z|) from the pole. Equal areas of the sphere have equal
+areas on the map.
+
+**Residual against a variable.** Figures of residuals against a variable, such as force along an
+axis or time.
+
+**Ladder.** Figure of the residual of each step, from the base to the noise floor.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .against import draw_against, recorded, Variable, variables_of
-from .ladder import draw_ladder
-from .sphere_map import draw_map
-from .style import AFTER, BEFORE, save
-from ..table import Floats
+from .style import (
+    ACCENT,
+    AFTER,
+    BEFORE,
+    DIVERGING,
+    FAINT,
+    INK,
+    new_figure,
+    residual_label,
+    save,
+    SEQUENTIAL,
+    styled,
+)
+from ..effects import AXES, effect_named
+from ..table import Floats, Poses
+from ..units import MG
 from ..words import base_words, short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..refine import Refinement, Stage
+
+_HEIGHT_INCHES = 3.3
+_INK_PER_POSE = 3500.0
+"""Total area of the markers [points²]; markers are larger for fewer poses."""
+
+
+def equal_area(force: Floats) -> Floats:
+    """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
+    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
+    flat = unit[:, :2]
+    across = np.linalg.norm(flat, axis=1, keepdims=True)
+    radius = np.sqrt(1.0 - np.abs(unit[:, 2:]))
+    return flat / np.where(across > 0.0, across, 1.0) * radius
+
+
+def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
+             signed: bool, left_out: Floats, rows: tuple[int, ...]) -> Figure:
+    """
+    Draw residuals over the sphere.
+
+    Parameters
+    ----------
+    title : str
+        Title of the figure.
+    force : (n, 3) array
+        Direction of up in each pose, in the sensor axes.
+    residual_mg : (n,) array
+        Residual of each pose [mg].
+    limit_mg : float
+        Residual at the end of the colour scale [mg].
+    signed : bool
+        Whether the residuals are signed.
+    left_out : (d, 3) array
+        Directions of the poses left out.
+    rows : tuple of int
+        Rows of the poses left out.
+
+    """
+    with styled():
+        figure = new_figure(_HEIGHT_INCHES)
+        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+        discs = figure.subplots(1, 2)
+        for disc, up in zip(discs, (True, False), strict=True):
+            _draw_disc(disc, up=up)
+            here = (force[:, 2] >= 0.0) == up
+            drawn = _draw_poses(disc, force[here], residual_mg[here], limit_mg, signed,
+                                _INK_PER_POSE / max(len(force), 12))
+            _draw_left_out(disc, left_out, rows, up=up)
+        bar = figure.colorbar(drawn, ax=list(discs), orientation='horizontal', aspect=40,
+                              shrink=0.8, pad=0.03)
+        bar.set_label(residual_label(signed=signed))
+        bar.outline.set_visible(False)
+    return figure
+
+
+def _draw_disc(disc: Any, *, up: bool) -> None:
+    """Draw the map of the hemisphere +z or -z with the sensor axes."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    disc.fill(np.cos(angle), np.sin(angle), facecolor='#fafafa', edgecolor='#888888', zorder=0)
+    middle = np.sqrt(1.0 - np.sqrt(0.5))
+    disc.plot(middle * np.cos(angle), middle * np.sin(angle), color=FAINT, linewidth=0.8, zorder=1)
+    disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
+    for name, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
+        disc.text(1.13 * x, 1.12 * y, name.replace('-', '−'), ha='center', va='center',
+                  fontsize=8.5)
+    disc.text(-1.22, 1.08, '+z up' if up else '−z up', fontsize=9.5)
+    disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
+    disc.axis('off')
+
+
+def _draw_poses(disc: Any, force: Floats, residual_mg: Floats, limit_mg: float, signed: bool,
+                area: float) -> Any:
+    place = equal_area(force)
+    order = np.argsort(np.abs(residual_mg))
+    return disc.scatter(*place[order].T, c=residual_mg[order], s=min(area, 130.0),
+                        cmap=DIVERGING if signed else SEQUENTIAL,
+                        vmin=-limit_mg if signed else 0.0, vmax=limit_mg,
+                        edgecolors=INK, linewidths=0.5, zorder=3)
+
+
+def _draw_left_out(disc: Any, left_out: Floats, rows: tuple[int, ...], *, up: bool) -> None:
+    """Draw the poses left out as hollow squares with their rows."""
+    for place, z, row in zip(equal_area(left_out), left_out[:, 2], rows, strict=True):
+        if (z >= 0.0) == up:
+            disc.plot(*place, marker='s', markersize=8, fillstyle='none', color=ACCENT, zorder=4)
+            disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
+                          color=ACCENT, zorder=4)
+
+
+_CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
+
+
+@dataclass(frozen=True)
+class Variable:
+    """
+    A variable for the horizontal axis.
+
+    Parameters
+    ----------
+    label : str
+        Name and unit.
+    values : (n,) array
+        One value per pose.
+    unit_range : bool
+        Whether the range is -1 to 1 by definition.
+
+    """
+
+    label: str
+    values: Floats
+    unit_range: bool = False
+
+
+def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
+    """Return the variables that an effect depends on: one variable, or one per axis."""
+    key = next((name for name in effect_named(effect).needs if name in poses_g), None)
+    if key == 'previous':
+        return [Variable(f'from the previous pose, {axis}', poses_g[key][:, k], True)
+                for k, axis in enumerate(AXES)]
+    if key is None:
+        return [Variable(f'force along {axis} [g]', force[:, k], True)
+                for k, axis in enumerate(AXES)]
+    return [_variable(key, poses_g)]
+
+
+def recorded(poses_g: Poses) -> list[Variable]:
+    """Return the variables of the context that change between poses."""
+    found = [_variable(key, poses_g) for key in _CONTEXT if key in poses_g]
+    return [variable for variable in found if np.ptp(variable.values) > 0.0]
+
+
+def _variable(key: str, poses_g: Poses) -> Variable:
+    values = poses_g[key]
+    if key == 'time':
+        return _time(values)
+    if key == 'std':
+        return Variable('standard deviation of the samples [mg]',
+                        np.sqrt(np.mean(values ** 2, axis=1)) * MG)
+    if key == 'rate':
+        return Variable('angular rate [rad/s]', np.linalg.norm(values, axis=1))
+    label, unit = {'temperature': ('temperature', '°C'), 'supply_voltage': ('supply', 'V')}[key]
+    return Variable(f'{label} [{unit}]', values)
+
+
+def _time(seconds: Floats) -> Variable:
+    since = seconds - np.min(seconds)
+    span = np.max(since)
+    for unit, size in (('h', 3600.0), ('min', 60.0)):
+        if span > 3.0 * size:
+            return Variable(f'time since the first pose [{unit}]', since / size)
+    return Variable('time since the first pose [s]', since)
+
+
+def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
+                 limit_mg: float, *, signed: bool, colour: str) -> Figure:
+    """
+    Draw residuals against variables, with one panel per variable.
+
+    Parameters
+    ----------
+    title : str
+        Title of the figure.
+    variables : sequence of Variable
+        Variable of each panel.
+    residual_mg : (n,) array
+        Residual of each pose [mg].
+    limit_mg : float
+        Limit of the residual axis [mg].
+    signed : bool
+        Whether the residuals are signed.
+    colour : str
+        Colour of the poses.
+
+    """
+    with styled():
+        figure = new_figure(1.0 + 1.45 * len(variables) + (0.8 if len(variables) == 1 else 0.0))
+        panels = figure.subplots(len(variables), 1, sharey=True, squeeze=False)[:, 0]
+        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+        size = float(np.clip(5.5 - len(residual_mg) / 80.0, 2.5, 5.5))
+        for panel, variable in zip(panels, variables, strict=True):
+            panel.grid(visible=True)
+            panel.axhline(0.0, color=ACCENT, linewidth=1.0)
+            panel.plot(variable.values, residual_mg, 'o', color=colour, markersize=size,
+                       markeredgecolor='white', markeredgewidth=0.4)
+            panel.set_xlabel(variable.label)
+            if variable.unit_range:
+                panel.set(xlim=(-1.06, 1.06), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
+            panel.set_ylim(-limit_mg if signed else -0.04 * limit_mg, limit_mg)
+        figure.supylabel(residual_label(signed=signed), fontsize=10.0)
+    return figure
+
+
+_WIDTH_INCHES = 4.9
+_LEVEL_INCHES = 0.52
+
+
+def draw_ladder(result: Refinement) -> Figure:
+    """Draw the residual and the held-out residual of the base and after each step."""
+    levels = _levels(result)
+    with styled():
+        figure = new_figure(1.25 + _LEVEL_INCHES * len(levels), _WIDTH_INCHES)
+        axes = figure.subplots()
+        _draw_levels(axes, levels)
+        if result.noise_floor_mg:
+            axes.axvline(result.noise_floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),
+                         label=f'noise floor {short(result.noise_floor_mg)} mg', zorder=1)
+        _scale(axes, *_limits(result, levels))
+        axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, handletextpad=0.2,
+                    columnspacing=0.9, handlelength=1.6, borderaxespad=0.0)
+    return figure
+
+
+def _scale(axes: Any, least: float, largest: float) -> None:
+    """Set a logarithmic axis of residuals with legible ticks."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    few = largest / least > 300.0
+    axes.set_xscale('log')
+    axes.set_xlim(least, largest)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if few else (1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel('residual: RMS over the poses [mg], logarithmic')
+    axes.grid(visible=True, axis='x')
+
+
+def _levels(result: Refinement) -> list[tuple[str, float, float | None]]:
+    """Return name, residual and held-out residual [mg] of the base and after each step."""
+    held_out = (result.steps[0].held_out_before_mg if result.steps
+                else result.calibration.quality.held_out_rms_mg)
+    levels = [(base_words(result), result.gap_mg, held_out)]
+    levels += [(f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg)
+               for step in result.steps]
+    return levels
+
+
+def _draw_levels(axes: Any, levels: list[tuple[str, float, float | None]]) -> None:
+    height = np.arange(len(levels))
+    residuals = np.array([residual for _, residual, _ in levels])
+    axes.step(residuals, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
+    axes.plot(residuals, height, 'o', color=AFTER, markersize=9, label='all poses used', zorder=3)
+    held_out = np.array([np.nan if out is None else out for _, _, out in levels])
+    if np.any(np.isfinite(held_out)):
+        axes.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
+                  markeredgewidth=1.6, label='held out', zorder=3)
+    white = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1.0}
+    for at, residual, out in zip(height, residuals, held_out, strict=True):
+        words = short(residual) + ('' if np.isnan(out) else f', held out {short(out)}')
+        axes.annotate(words, (np.nanmax([residual, out]), at), (9, 0), va='center',
+                      textcoords='offset points', fontsize=9.0,
+                      bbox=white)
+    for at, (name, _, _) in zip(height, levels, strict=True):
+        axes.text(0.005, at - 0.36, name, transform=axes.get_yaxis_transform(), va='center',
+                  fontweight='bold', fontsize=9.5, bbox=white)
+    axes.set_ylim(len(levels) - 0.55, -0.65)
+    axes.yaxis.set_visible(False)
+    axes.spines['left'].set_visible(False)
+
+
+def _limits(result: Refinement, levels: list[tuple[str, float, float | None]]
+            ) -> tuple[float, float]:
+    """Return the limits of the axis, with space for the numbers."""
+    values = [value for level in levels for value in level[1:] if value]
+    values += [result.noise_floor_mg] if result.noise_floor_mg else []
+    least, largest = min(values, default=1.0), max(values, default=1.0)
+    room = max(float(np.log10(largest / least)), 0.5)
+    return least / 10.0 ** (0.08 * room), largest * 10.0 ** (0.5 * room)
+
 
 _ROOM = 1.08
 _FEW_DIRECTIONS = 6

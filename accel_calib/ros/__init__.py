@@ -6,8 +6,8 @@ The ROS nodes. They only convert messages, call other parts, and publish the res
 
 `calibrator` and `simulator` are the executables, and `calibrator_node` and `simulator_node` the
 nodes; `run` starts, spins and ends them. In the calibrator, `stream` processes Imu messages,
-`services` answers service calls, `worker` runs jobs, `diagnostics` and `markers` make messages,
-and `declare` declares parameters. `demo` runs both nodes as a demonstration.
+`services` answers service calls and runs jobs, `display` makes diagnostics and markers,
+`declare` declares parameters, and `qos` defines the quality of service. `demo` runs both nodes.
 
 All callbacks run in one thread, and only callbacks use the session.
 

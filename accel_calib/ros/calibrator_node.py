@@ -26,11 +26,9 @@ from visualization_msgs.msg import MarkerArray
 
 from . import qos
 from .declare import declared, follow
-from .diagnostics import self_test_of, status_of
-from .markers import pose_markers
-from .services import Services
+from .display import pose_markers, self_test_of, status_of
+from .services import Services, Worker
 from .stream import Stream
-from .worker import Worker
 from ..session import CalibratorSettings, Event, Job, Log, Session, ShowPoses, Still
 
 _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading', 'save',

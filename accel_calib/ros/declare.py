@@ -18,7 +18,7 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 from ..errors import InputError
-from ..session.parameters import changed, default_of, expected, Settings
+from ..session.settings import changed, default_of, expected, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

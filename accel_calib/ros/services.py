@@ -9,22 +9,86 @@ false`` with the message of the error. For a job the response is sent when the j
 no callback waits. This works with every executor. Coroutines as service callbacks, which rclpy
 offers for this purpose, do not work with EventsExecutor.
 
+**Worker.** The thread of a node for jobs, which use files and wait for the worker process.
+
+Jobs run in this thread one after the other, and finish as callbacks in the thread of the executor.
+Only callbacks therefore change the session.
+
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from queue import SimpleQueue
+from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
 from std_srvs.srv import Trigger
 
-from .worker import Worker
 from ..errors import AccelCalibError
 from ..session import Job
+from ..session.work import WorkerProcess
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.service import Service
+
+Answer = Callable[[bool, str], object]
+"""Function of the success of a job, and of a text about its result."""
+
+
+class Worker:
+    """
+    The thread for the jobs of a node.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+    on_events : callable
+        Function that is called after each job, in the thread of the executor.
+
+    """
+
+    def __init__(self, node: Node, on_events: Callable[[], None]) -> None:
+        self._node, self._on_events = node, on_events
+        self._pool = ThreadPoolExecutor(1, 'accel_calib')
+        self._done: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._process = WorkerProcess()
+
+    def run(self, job: Job, answer: Answer) -> None:
+        """Run a job in the thread, finish it in the executor, and call `answer`."""
+        future = self._pool.submit(job.run, self._process.call)
+        future.add_done_callback(lambda done: self._call_back(job, answer, done))
+
+    def _call_back(self, job: Job, answer: Answer, done: Future[Any]) -> None:
+        self._done.put(lambda: self._finish(job, answer, done))
+        executor = self._node.executor
+        if executor is not None:
+            # The executor may run tasks in any order; the queue keeps the order of the jobs.
+            executor.create_task(lambda: self._done.get()())
+
+    def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
+        """Finish a job and call `answer`; unexpected errors are logged, and the node continues."""
+        try:
+            words, success = job.finish(done.result()), True
+        except AccelCalibError as error:
+            words, success = str(error), False
+        except OSError as error:
+            words = f'{error}; correct the permissions, or set calibration_file'
+            success = False
+        except Exception as error:
+            self._node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+            words = f'unexpected error in accel_calib ({error!r}); please report it with the log'
+            success = False
+        answer(success, words)
+        self._on_events()
+
+    def close(self) -> None:
+        """Stop the computation, and finish writing."""
+        self._process.close()
+        self._pool.shutdown(wait=True)
 
 
 class Services:

@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 
 from . import qos
 from .declare import declared
-from ..session.parameters import parameter
+from ..session.settings import parameter
 from ..simulate import model_with, parse_effect, simulate_recording
 from ..sphere import rotation_from_rpy, spread_directions
 from ..table import Floats, Recording

@@ -24,17 +24,18 @@ from sensor_msgs.msg import Imu
 
 from ..calibrate import Calibration
 from ..errors import AccelCalibError
-from ..messages.arrays import joined, samples_of
+from ..messages.correction import motion_of, Rewriter
 from ..messages.layout import (
     ACCELERATION,
     IMU_DOUBLES,
+    joined,
     Layout,
     layout_of,
     LITTLE_ENDIAN,
     NAME_AT,
+    samples_of,
     THREE,
 )
-from ..messages.rewriter import motion_of, Rewriter
 from ..session import CalibratorSettings, Session
 
 _TOGETHER = 0.3

@@ -4,10 +4,9 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the entry point. `live_capture` and `pose_book` capture poses. `active_calibration`
-contains the calibration in use. `store` and `sensor_files` manage files. `work` contains the
-computations, which run in the process of `worker_process`. `stream_statistics` and `health`
-describe the state. `settings` and `parameters` define the parameters.
+`session` is the entry point. `live_capture` captures poses, and `active_calibration` contains the
+calibration in use. `store` manages files. `work` contains the computations, which run in a process
+of their own. `health` describes the state. `settings` defines the parameters.
 
 """
 

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .live_capture import LONG_REST
-from .pose_book import overlap
+from .live_capture import LONG_REST, overlap
 from ..calibrate import Calibration
 from ..capture import Dwell
 from ..effects import Context

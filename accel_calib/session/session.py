@@ -22,12 +22,10 @@ import numpy as np
 
 from .active_calibration import ActiveCalibration, context_of_rest
 from .events import Compute, Event, Job, Log, Severity, ShowPoses, Still
-from .health import Health
+from .health import Health, StreamStatistics
 from .live_capture import Change, LiveCapture
-from .sensor_files import SensorFiles
 from .settings import CalibratorSettings, capture_settings
-from .store import load, Loaded, Store
-from .stream_statistics import StreamStatistics
+from .store import load, Loaded, SensorFiles, Store
 from .work import (
     asked_for,
     fitted,

@@ -8,6 +8,8 @@ A sensor is identified by its topic (with namespace) and the frame_id of its mes
 that the user sets. Each sensor has its own files. Stored data are never lost: files that cannot be
 used, or that belong to another sensor, are renamed and never overwritten.
 
+**Sensor files.** The files of the sensor of a session, which only one node can use at a time.
+
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ import os
 from pathlib import Path
 import re
 
+from .settings import CalibratorSettings
 from ..calibrate import Calibration, check_sensor
-from ..errors import AccelCalibError, DamagedCalibrationError, StoredCalibrationError
+from ..errors import AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError
 from ..files import read_calibration, read_poses, write_calibration, write_table
 from ..table import Poses
 from ..units import UnitName
@@ -326,3 +329,78 @@ def aside(path: Path, word: str) -> Path:
     free = next(name for name in names if not name.exists())
     path.replace(free)
     return free
+
+
+class SensorFiles:
+    """
+    The store of a sensor, with its lock.
+
+    Parameters
+    ----------
+    settings : CalibratorSettings
+        Parameters for sensor and files.
+    topic : str
+        Topic of the messages, with namespace.
+
+    Attributes
+    ----------
+    store : Store or None
+        The store; None until the sensor is known.
+    problem : str
+        Reason why the files cannot be used, or empty.
+
+    """
+
+    def __init__(self, settings: CalibratorSettings, topic: str) -> None:
+        self._settings, self._topic = settings, topic
+        self._lock: Lock | None = None
+        self.store: Store | None = None
+        self.problem = ''
+
+    @property
+    def locked(self) -> bool:
+        """Whether this node has locked the files."""
+        return self._lock is not None
+
+    def take(self, sensor: str) -> Store | None:
+        """Lock the files of a sensor and return the store; None if another node uses them."""
+        identity = Identity(sensor, self._topic, bool(self._settings.sensor))
+        before, self.store = self.store, store_of(self._settings.calibration_file, identity,
+                                                  self._settings.units)
+        if before is None or before.calibration != self.store.calibration:
+            self.release()
+        return self.store if self.locked else self.try_again()
+
+    def try_again(self) -> Store | None:
+        """Lock the files if they have become free; return the store, or otherwise None."""
+        if self.store is None or self.locked:
+            return None
+        try:
+            self._lock, self.problem = Lock(self.store), ''
+        except StoreInUseError as error:
+            self.problem = str(error)
+            return None
+        return self.store
+
+    def usable(self) -> Store:
+        """
+        Return the locked store.
+
+        Raises
+        ------
+        InputError
+            If the sensor is not known yet, or another node uses the files.
+
+        """
+        if self.store is None:
+            raise InputError('the name of the sensor is not known, because there is no Imu '
+                             'message yet', 'start the driver, or set the parameter sensor')
+        if not self.locked:
+            raise InputError(self.problem, 'this node stores nothing')
+        return self.store
+
+    def release(self) -> None:
+        """Unlock the files."""
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None

@@ -1,20 +1,47 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Markers for rviz: captured poses and the next pose on the unit sphere."""
+"""
+Markers for rviz: captured poses and the next pose on the unit sphere.
+
+**Diagnostics.** The state of the calibrator as diagnostic messages.
+
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
 import numpy as np
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from ..session import Finding, findings, Health, worst
+from ..session.health import figures
+
 if TYPE_CHECKING:
     from ..calibrate import NextPose
     from ..table import Floats
+
+
+def status_of(health: Health) -> DiagnosticStatus:
+    """Return the diagnostics: the most severe finding, and the values."""
+    status = _status(worst(health), 'calibrator', health)
+    status.values = [KeyValue(key=key, value=value) for key, value in figures(health)]
+    return status
+
+
+def self_test_of(health: Health) -> list[DiagnosticStatus]:
+    """Return one status for each finding; the test passes if all are OK."""
+    return [_status(finding, finding.name, health) for finding in findings(health)]
+
+
+def _status(finding: Finding, name: str, health: Health) -> DiagnosticStatus:
+    return DiagnosticStatus(level=bytes([finding.level]), name=f'accel_calib: {name}',
+                            message=finding.words, hardware_id=health.sensor)
+
 
 _CAPTURED = (0.2, 0.7, 0.3, 1.0)
 _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)

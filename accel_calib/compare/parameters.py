@@ -1,0 +1,363 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The parameters of a calibration that do not depend on its axes, and their uncertainty.
+
+|force| depends on W only through W Wᵀ: a rotation of the axes of the force, W -> W Q, does not
+change it. Calibrations with different axes (model 9 in the sensing axes, 10 symmetric, 12 and
+levelled ones rotated) are therefore compared in V and in S = (W Wᵀ)^(1/2), the symmetric factor of
+the polar decomposition W = S Q. The derivative of S solves S dS + dS S = dW Wᵀ + W dWᵀ.
+
+Effects that depend on the context are evaluated at one context, as parts of V and W. Effects with
+bending terms add their own parameters.
+
+**Common scale.** The uncertainty of calibrations, estimated together with others of the same
+sensor.
+
+A fit with few degrees of freedom estimates its noise badly. With three, the stated variance is
+often wrong by a factor of three, and a test based on it would raise a false alarm in a third of
+all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not depend on the noise. The
+scale is therefore estimated from all runs together,
+
+    s² = (b + Σ chi²) / (b + Σ dof)
+
+where the measured noise of the runs counts as b degrees of freedom (for each run as in
+`accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
+repeat significantly worse than those of the others keeps its own scale.
+
+**Agreement.** Test whether the parameters of several runs agree within their covariances.
+
+Runs of one sensor have parameters x_i with covariances C_i. Contrasts of the x_i, such as their
+differences, are then normally distributed about zero with the covariance K diag(C_i) Kᵀ, and
+
+    T² = dᵀ (K diag(C_i) Kᵀ)⁺ d,   d = K x
+
+divided by its rank has an F distribution with the degrees of freedom of the noise. T² tests all
+directions at once. In addition, each parameter of each run is compared with the mean of the other
+runs (Student's t), to detect a change of a single parameter. The smaller of the two probabilities
+is used, corrected for two tests and for the number of parameters (Bonferroni). The differing run
+is the run whose removal reduces T² most.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibrate import Calibration, in_g
+from ..calibrate.quality import with_previous
+from ..effects import Context, EFFECTS
+from ..estimate.fit import Fit, judge
+from ..model import force_slope, Model, parameter_basis, reading_of
+from ..table import Floats, Poses
+from ..units import STANDARD_GRAVITY
+
+NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain.xy', 'gain.xz',
+         'gain.yz')
+"""V, and the diagonal and the upper triangle of S."""
+
+_ENTRIES = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class RotationFree:
+    """
+    The parameters of a calibration that do not depend on its axes.
+
+    Parameters
+    ----------
+    names : tuple of str
+        `NAMES`, and the parameters of effects with bending terms.
+    values : (t,) array
+        Values of the parameters [g].
+    slope : (t, p) array
+        Derivative of the parameters by ``calibration.model.vector``.
+    axes : (3, 3) array
+        Q ΔR, the rotation from the levelled frame to the axes of S.
+    reading_scale, force_scale : float
+        Factors from readings and forces in the local g of the calibration to the common unit.
+
+    """
+
+    names: tuple[str, ...]
+    values: Floats
+    slope: Floats
+    axes: Floats
+    reading_scale: float
+    force_scale: float
+
+    @property
+    def vec_v(self) -> Floats:
+        """V, (3,) [g]."""
+        return self.values[:3]
+
+    @property
+    def mat_s(self) -> Floats:
+        """S, (3, 3)."""
+        return _symmetric(self.values[3:9])
+
+
+def rotation_free(calibration: Calibration, context: Context, per_g: float) -> RotationFree:
+    """
+    Return the parameters of a calibration that do not depend on its axes.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with any model.
+    context : mapping of str to array
+        Columns that the effects need, one row.
+    per_g : float
+        Native reading that counts as 1 g; not used for other units.
+
+    Returns
+    -------
+    RotationFree
+        The parameters at this context.
+
+    """
+    model = calibration.model
+    origin, axes = np.zeros((1, 3)), np.eye(3)
+    vec_v = reading_of(model, origin, context)[0]
+    mat_w = force_slope(model, origin, context)[0]
+    slope_v = parameter_basis(model, origin, context)[0]
+    either = [np.array([parameter_basis(model, sign * _STEP * axis[np.newaxis], context)[0]
+                        for axis in axes]) for sign in (1.0, -1.0)]
+    slope_w = np.swapaxes(either[0] - either[1], 0, 1) / (2.0 * _STEP)  # (row, column, p)
+    mat_s, slope_s = _polar(mat_w, slope_w)
+    reading_scale, force_scale = _scales(calibration, per_g)
+    gain_scale = reading_scale / force_scale
+    own = [k for k, name in enumerate(calibration.parameters)
+           if EFFECTS[name.split('.')[0]].bends]
+    size = len(model.vector)
+    return RotationFree(
+        (*NAMES, *(calibration.parameters[k] for k in own)),
+        np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
+        np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
+                        np.eye(size)[own]]),
+        np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
+
+
+def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
+    """Return the factors from readings and forces to the common unit, standard g or native."""
+    units = calibration.units
+    if units.name == 'native':
+        return units.per_g / per_g, 1.0
+    scale = units.per_g / STANDARD_GRAVITY if units.name == 'm/s2' else 1.0
+    return scale, scale
+
+
+def _symmetric(entries: Floats) -> Floats:
+    matrix = np.zeros((3, 3))
+    matrix[_ENTRIES] = entries
+    return matrix + np.triu(matrix, 1).T
+
+
+def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
+    """Return S (3, 3) and its (3, 3, p) derivative from W and the (3, 3, p) derivative of W."""
+    squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
+    roots = np.sqrt(squared)
+    half = np.einsum('ijp,kj->ikp', slope_w, mat_w)
+    turned = np.einsum('ia,ijp,jb->abp', vectors, half + np.swapaxes(half, 0, 1), vectors)
+    turned = turned / np.add.outer(roots, roots)[:, :, np.newaxis]
+    return (vectors * roots) @ vectors.T, np.einsum('ia,abp,jb->ijp', vectors, turned, vectors)
+
+
+_WORSE = 0.001
+"""A run is noisier than the others if the probability of its chi² is lower."""
+
+_CONTRADICTED = 0.1
+"""Measured noise is ignored if the probability of the chi² of all runs is lower."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """
+    Covariances of several calibrations on one scale.
+
+    Parameters
+    ----------
+    covariances : tuple of (p, p) arrays
+        Covariance of each ``model.vector`` [g²].
+    dof : float
+        Degrees of freedom of the common scale.
+    noisier : tuple of int
+        Indices of calibrations whose poses repeat significantly worse than the others.
+
+    """
+
+    covariances: tuple[Floats, ...]
+    dof: float
+    noisier: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The chi² of a run, its degrees of freedom, its stated variance, and the dof of its noise."""
+
+    chi2: float
+    dof: int
+    stated: float
+    belief: float
+
+
+def on_one_scale(calibrations: Sequence[Calibration]) -> Spread:
+    """Return the covariances of calibrations of one sensor on a common scale."""
+    runs = [_run_of(calibration) for calibration in calibrations]
+    factors, noisier, dofs = np.ones(len(runs)), [], []
+    for measured in (True, False):  # without measured noise, chi² has no unit
+        group = [k for k, run in enumerate(runs) if (run.belief > 0.0) is measured]
+        scale, dof, worse = _pooled([runs[k] for k in group])
+        for k in group:
+            own = runs[k].chi2 / max(runs[k].dof, 1) if k in (group[j] for j in worse) else scale
+            factors[k] = own / runs[k].stated if runs[k].stated > 0.0 and dof > 0.0 else 1.0
+        noisier += [group[j] for j in worse]
+        dofs += [dof] if group and dof > 0.0 else []
+    return Spread(tuple(run.covariance * factor
+                        for run, factor in zip(calibrations, factors, strict=True)),
+                  min(dofs, default=np.inf), tuple(sorted(noisier)))
+
+
+def _pooled(runs: Sequence[_Run]) -> tuple[float, float, list[int]]:
+    """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
+    from scipy.special import fdtrc
+
+    pool, worse = [run for run in runs if run.dof == 0], []
+    for k in sorted((k for k, run in enumerate(runs) if run.dof > 0),
+                    key=lambda k: runs[k].chi2 / runs[k].dof):
+        scale, dof = _scale(pool)
+        ratio = runs[k].chi2 / runs[k].dof / max(scale, 1e-300)
+        if dof > 0.0 and fdtrc(runs[k].dof, dof, ratio) < _WORSE:
+            worse.append(k)
+        else:
+            pool = [*pool, runs[k]]
+    return (*_scale(pool), worse)
+
+
+def _scale(pool: Sequence[_Run]) -> tuple[float, float]:
+    """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
+    from scipy.special import chdtrc
+
+    chi2, dof = sum(run.chi2 for run in pool), sum(run.dof for run in pool)
+    belief = sum(run.belief for run in pool)
+    if dof > 0 and chdtrc(dof, chi2) < _CONTRADICTED:
+        belief = 0.0
+    return ((belief + chi2) / (belief + dof) if belief + dof > 0 else 1.0), belief + dof
+
+
+def _run_of(calibration: Calibration) -> _Run:
+    """Return the figures about the noise of a calibration."""
+    fit = _fit_of(calibration)
+    free = int(np.linalg.matrix_rank(fit.columns))
+    # Over its own poses, the variances of a fit sum to the number of free parameters.
+    total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
+    belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
+    return _Run(fit.chi2, fit.equations.count - free, total / free if free else 0.0, belief)
+
+
+def _fit_of(calibration: Calibration) -> Fit:
+    """Return the model of a calibration at the poses it was fitted to."""
+    model = Model(calibration.model.values)
+    poses_g = with_previous(in_g(calibration.poses, calibration.units), model)
+    poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
+    if calibration.name != '12':
+        poses_g = Poses({key: values for key, values in poses_g.columns.items()
+                         if key != 'reference'}, poses_g.row)
+    return judge(model, poses_g, np.eye(len(model.vector)))
+
+
+LEVEL = 0.03
+"""Probability that runs of an unchanged sensor are reported to differ."""
+
+SAME_G = 1e-7
+"""Differences below this count as zero [g]."""
+
+_NO_SPREAD = 1e-10
+"""A variance below this part of the largest counts as zero."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs in common parameters: (n, t) values, (n, t, t) covariances, and dof of the noise."""
+
+    values: Floats
+    covariances: Floats
+    dof: float
+
+    def without(self, run: int) -> Runs:
+        """Return the runs without one run."""
+        return Runs(np.delete(self.values, run, 0), np.delete(self.covariances, run, 0), self.dof)
+
+    @property
+    def squared(self) -> tuple[float, int]:
+        """T² and its rank: squared differences in all directions over their variances."""
+        count = len(self.values)
+        contrasts = np.linalg.svd(np.ones((1, count)))[2][1:]
+        away = (contrasts @ self.values).ravel()
+        covariance = np.einsum('ai,irs,bi->arbs', contrasts, self.covariances, contrasts)
+        variances, vectors = np.linalg.eigh(covariance.reshape(away.size, away.size))
+        along = vectors.T @ away
+        vary = variances > _NO_SPREAD * max(float(np.max(variances, initial=0.0)), 1e-300)
+        if np.linalg.norm(along[~vary]) > SAME_G:
+            return np.inf, int(np.sum(vary))
+        return float(np.sum(along[vary] ** 2 / variances[vary])), int(np.sum(vary))
+
+    @property
+    def least(self) -> Floats:
+        """(n,) array, the probability of the most deviating parameter of each run."""
+        from scipy.special import stdtr
+
+        variance = np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0) + SAME_G ** 2
+        weight = 1.0 / variance
+        others = np.sum(weight, axis=0) - weight
+        mean = (np.sum(weight * self.values, axis=0) - weight * self.values) / others
+        sizes = np.abs(self.values - mean) / np.sqrt(variance + 1.0 / others)
+        number = np.sum(np.any(variance > 4.0 * SAME_G ** 2, axis=0))
+        least: Floats = 2.0 * stdtr(self.dof, -np.max(sizes, axis=1)) * max(number, 1)
+        return least
+
+    @property
+    def p_value(self) -> float:
+        """Probability of differences at least this large, if the runs agree."""
+        count = len(self.values)
+        tests = 1 if count == 2 else count
+        return _either(_beyond(*self.squared, self.dof), float(np.min(self.least)) * tests)
+
+
+def _beyond(chi2: float, rank: int, dof: float) -> float:
+    """Return the probability of a T² of this rank that is at least this large."""
+    from scipy.special import chdtrc, fdtrc
+
+    if rank == 0 or not np.isfinite(chi2):
+        return 1.0 if np.isfinite(chi2) else 0.0
+    return float(chdtrc(rank, chi2) if np.isinf(dof) else fdtrc(rank, dof, chi2 / rank))
+
+
+def _either(first: float, second: float) -> float:
+    return min(1.0, 2.0 * min(first, second))
+
+
+def p_values(runs: Runs) -> Floats:
+    """Return the probability of the differences between each run and the others."""
+    if len(runs.values) == 2:
+        return np.full(2, runs.p_value)
+    chi2, rank = runs.squared
+    found = []
+    for k, least in enumerate(runs.least):
+        others, others_rank = runs.without(k).squared
+        found.append(_either(_beyond(chi2 - others, rank - others_rank, runs.dof), float(least)))
+    return np.array(found)
+
+
+def outlier(runs: Runs) -> int | None:
+    """Return the index of the run without which the others agree, or None."""
+    if len(runs.values) == 2:
+        return None
+    left = [runs.without(k) for k in range(len(runs.values))]
+    best = int(np.argmin([others.squared[0] for others in left]))
+    return best if left[best].p_value >= LEVEL else None
