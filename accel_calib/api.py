@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from datetime import datetime, timezone
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, overload, TypeVar
@@ -36,6 +35,7 @@ from .simulate import model_with, simulate_poses, simulate_recording
 from .sphere import rotation_from_rpy, spread_directions
 from .table import columns_from, Floats, numbered, Poses, Recording, Table
 from .units import STANDARD_GRAVITY, UnitName, Units, units_of
+from .words import now
 
 __all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
            'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
@@ -296,7 +296,7 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     table = _poses(poses)
     known = _units(units, gravity, table.units, 'the pose table')
     calibration = calibrate.fit_poses(table, known, model=model, method=method, sensor=sensor,
-                                      date=_now())
+                                      date=now())
     return _public(level_by_rows(calibration, table, frame, flat, nose_down))
 
 
@@ -336,7 +336,7 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
     table = _poses(poses)
     known = (base.units if isinstance(base, calibrate.Calibration)
              else _units(units, gravity, table.units, 'the pose table'))
-    found = find_effects(table, known, base=base, sensor=sensor, date=_now())
+    found = find_effects(table, known, base=base, sensor=sensor, date=now())
     return replace(found, calibration=_public(found.calibration))
 
 
@@ -524,7 +524,3 @@ def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> 
 def _public(calibration: calibrate.Calibration) -> Calibration:
     return Calibration(**{each.name: getattr(calibration, each.name)
                           for each in fields(calibrate.Calibration)})
-
-
-def _now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec='seconds')

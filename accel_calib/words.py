@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,11 @@ _VERDICTS = {
     'explained': 'The gap is explained: only noise remains beyond the named effects.',
     'unexplained': 'A gap remains that no effect of the catalogue explains.',
 }
+
+
+def now() -> str:
+    """Return the date of a result: ISO 8601, UTC, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
 def verdict_words(result: Refinement) -> str:

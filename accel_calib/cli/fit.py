@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from ..calibrate import (
 )
 from ..errors import AccelCalibError, InputError
 from ..files import read_poses, write_calibration
+from ..words import now
 
 _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
 
@@ -91,9 +91,8 @@ def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
     """Fit one pose table with the given options."""
     table = read_poses(path)
     units = options.units_from(args, table.units, path)
-    date = datetime.now(timezone.utc).isoformat(timespec='seconds')
     calibration = fit_poses(options.rows_between(table, args.rows), units, model=args.model,
-                            method=args.method, sensor=args.sensor, date=date)
+                            method=args.method, sensor=args.sensor, date=now())
     return level_by_rows(calibration, table, args.frame, args.flat, args.nose_down)
 
 

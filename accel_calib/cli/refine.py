@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from ..refine import BASES, refine, Refinement
 from ..report import check_matplotlib, write_page
 from ..table import Poses, Recording
 from ..units import Units
-from ..words import residual_words, verdict_words
+from ..words import now, residual_words, verdict_words
 
 _EXAMPLE = 'accel-calib refine poses.csv -o refined.yaml --report report.html'
 _SAMPLES_APART_S = 0.5
@@ -132,9 +131,8 @@ def refine_file(args: argparse.Namespace, path: Path) -> Refinement:
     if args.calibration is not None:
         base = options.stored_calibration(args.calibration)
     poses, units = _poses_from(args, path, base.units if isinstance(base, Calibration) else None)
-    date = datetime.now(timezone.utc).isoformat(timespec='seconds')
     return refine(options.rows_between(poses, args.rows), units, base=base,
-                  sensor=args.sensor, date=date)
+                  sensor=args.sensor, date=now())
 
 
 def _poses_from(args: argparse.Namespace, path: Path, units: Units | None) -> tuple[Poses, Units]:

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import datetime, timezone
 from importlib import import_module
 import os
 import pickle
@@ -53,12 +52,10 @@ from ..model import Model
 from ..refine import refine, Refinement
 from ..table import Floats, Poses
 from ..units import Units
+from ..words import now, residual_words, verdict_words
 
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
-
-_VERDICTS = {'no_gap': 'no effect is missing', 'explained': 'the missing effects are named',
-             'unexplained': 'a gap remains that no known effect explains'}
 
 
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
@@ -90,7 +87,7 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
 
     """
     calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
-                            sensor=sensor, date=_now())
+                            sensor=sensor, date=now())
     if before is None or not before.is_levelled:
         return calibration
     flat = flat_direction(before.frame) * before.force_per_g
@@ -124,11 +121,7 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
 
     """
     return refine(poses, units, base='auto' if before is None else before, sensor=sensor,
-                  date=_now())
-
-
-def _now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec='seconds')
+                  date=now())
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
@@ -181,8 +174,7 @@ def summary(calibration: Calibration) -> str:
 
 def story(refinement: Refinement) -> str:
     """Return the result of a refinement as one line."""
-    lines = [f'{_VERDICTS[refinement.verdict]}: residual {refinement.gap_mg:.3f} mg before, '
-             f'{refinement.remaining_gap_mg:.3f} mg after']
+    lines = [f'{verdict_words(refinement).rstrip(".")}; {residual_words(refinement)}']
     for step in refinement.steps:
         rivals = f' (or {", ".join(step.rivals)})' if step.rivals else ''
         lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '
