@@ -138,13 +138,23 @@ class Bench:
         return future.result()
 
     def call_while(self, name: str, make: Callable[[], Any]) -> Any:
-        """Call a service of the calibrator while messages continue, and return its answer."""
+        """
+        Call a service of the calibrator while messages continue, and return its answer.
+
+        The next message waits for the output of the previous one, but not longer than 0.1 s. More
+        messages would be dropped while the calibrator is busy.
+
+        """
         client = self.client(name)
         self.send(make())
-        future = client.call_async(client.srv_type.Request())
+        future, sent = client.call_async(client.srv_type.Request()), time.monotonic()
 
         def answered() -> bool:
-            self.send(make())
+            nonlocal sent
+            if self._came_out or time.monotonic() - sent > 0.1:
+                self._came_out.clear()
+                self.send(make())
+                sent = time.monotonic()
             return bool(future.done())
 
         self.spin(answered)

@@ -18,7 +18,8 @@ from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.files import read_calibration, write_table
 from accel_calib.ros.services import Services, Worker
 from accel_calib.session import CalibratorSettings, Job
-from accel_calib.session.work import fitted, WorkerProcess
+from accel_calib.session.work import fitted
+from accel_calib.session.worker_process import WorkerProcess
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -111,7 +112,7 @@ def test_worker_process_computes_what_this_process_computes(
 
 def test_process_that_waits_too_long_is_restarted_with_normal_priority(
         process: WorkerProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('accel_calib.session.work._PATIENCE', 0.5)
+    monkeypatch.setattr('accel_calib.session.worker_process._PATIENCE', 0.5)
     process.call(time.sleep, 0.7)
     assert process.call(os.sched_getscheduler, 0) == os.SCHED_OTHER
     process.call(time.sleep, 0.7)

@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from ..errors import AccelCalibError
 from ..session import Job
-from ..session.work import WorkerProcess
+from ..session.worker_process import WorkerProcess
 
 if TYPE_CHECKING:
     from rclpy.node import Node

@@ -5,8 +5,8 @@
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
 `session` is the entry point. `live_capture` captures poses, and `active_calibration` contains the
-calibration in use. `store` manages files. `work` contains the computations, which run in a process
-of their own. `health` describes the state. `settings` defines the parameters.
+calibration in use. `store` manages files. `work` contains the computations, which run in
+`worker_process`. `health` describes the state. `settings` defines the parameters.
 
 """
 
