@@ -303,22 +303,21 @@ class AtReading:
         if self._bends:
             added = self._bent_spread(_times(self._owner.back, *force))
         else:
-            x, y, z = force
-            products = (1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
-            added = np.dot(products, self._form).tolist()
+            xx, xy, xz, yy, yz, zz = [form(*force) for form in self._forms]
+            added = [xx, xy, xz, xy, yy, yz, xz, yz, zz]
         return [*map(float.__add__, own, added)]
 
     @cached_property
-    def _form(self) -> Floats:
-        """(10, 9) array, the covariance as a quadratic form of the force."""
+    def _forms(self) -> list[Callable[[float, float, float], float]]:
+        """Entries of the covariance as quadratic forms of the force; the upper triangle."""
         basis = self._owner.spread_basis(self._known).reshape(AFFINE, 3, -1)
         moved = np.reshape(_product(self._owner.turn, _inverse(self._gain)), (3, 3)) @ basis
         moved[1:] = np.einsum('ij,ikp->jkp', np.reshape(self._owner.back, (3, 3)), moved[1:])
         each = np.einsum('mip,njp->mnij', moved, moved).reshape(AFFINE, AFFINE, 9)
         both = each + np.swapaxes(each, 0, 1)
-        return np.array([both[m, n] / (2.0 if m == n else 1.0)
-                         for m, n in ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3),
-                                      (2, 2), (2, 3), (3, 3))])
+        form = np.array([both[m, n] / (2.0 if m == n else 1.0)
+                         for m, n in zip(*np.triu_indices(AFFINE), strict=True)])
+        return [_quadratic(*form[:, entry].tolist()) for entry in (0, 1, 2, 4, 5, 8)]
 
     def _bent_spread(self, u: Triple) -> list[float]:
         monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
@@ -344,6 +343,15 @@ def _affine(matrix: Sequence[float], less: Triple) -> Callable[[float, float, fl
 
     def apply(x: float, y: float, z: float) -> Triple:
         return a * x + b * y + c * z - p, d * x + e * y + f * z - q, g * x + h * y + i * z - r
+
+    return apply
+
+
+def _quadratic(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float,
+               i: float, j: float) -> Callable[[float, float, float], float]:
+    """Return the quadratic form with the coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz."""
+    def apply(x: float, y: float, z: float) -> float:
+        return a + x * (b + e * x + f * y + g * z) + y * (c + h * y + i * z) + z * (d + j * z)
 
     return apply
 
