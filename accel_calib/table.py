@@ -52,6 +52,8 @@ COLUMNS: dict[str, Column] = {
     'temperature': Column(('temperature',), '°C', 'temperature of the sensor'),
     'supply_voltage': Column(('supply_voltage',), 'V', 'supply of the sensor'),
     'rate': Column(('gx', 'gy', 'gz'), 'rad/s', 'angular rate'),
+    'rate_std': Column(('gstd_x', 'gstd_y', 'gstd_z'), 'rad/s',
+                       'standard deviation of the samples of the angular rate of a pose'),
     'reference': Column(('ref_x', 'ref_y', 'ref_z'), 'unit of the reading',
                         'true specific force (known orientation); in g for native units'),
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
@@ -234,6 +236,8 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
                          'positive numbers', 'enter the number of samples of each pose')
-    if 'std' in columns and not np.all(columns['std'] >= 0):
-        raise InputError(f'{source}: column std_x, std_y or std_z holds negative numbers, '
-                         'expected 0 or more', 'enter standard deviations')
+    for key in ('std', 'rate_std'):
+        if key in columns and not np.all(columns[key] >= 0):
+            one, two, three = COLUMNS[key].names
+            raise InputError(f'{source}: column {one}, {two} or {three} holds negative numbers, '
+                             'expected 0 or more', 'enter standard deviations')

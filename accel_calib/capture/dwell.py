@@ -13,6 +13,9 @@ not remove this error if the noise σ of the samples is less than a step: its va
 (q²/12) exp(-4π² σ²/q²) [1]_. σ is estimated from the quietest stretch so far; samples that
 alternate between two steps are not suitable.
 
+The white noise of the angular rate is the mean variance of the windows. The standard deviation
+over the whole dwell would include the slow drift of a gyro, which is not white.
+
 A dwell is rejected in three cases:
 
 - Its windows vary on average more than `DWELL_RATIO` times the noise of the sensor, significantly.
@@ -44,7 +47,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from typing import Any
 
@@ -214,6 +217,8 @@ class Dwell:
         Dwells with the same number are parts of one dwell (see ``max_dwell``).
     doubtful : bool
         Whether the sensor may have moved, according to later dwells.
+    rate_std : (3,) array
+        White noise of one sample of the angular rate [rad/s]; NaN without a rate.
 
     """
 
@@ -227,6 +232,7 @@ class Dwell:
     context: Mapping[str, float | Floats]
     orientation: int
     doubtful: bool = False
+    rate_std: Floats = field(default_factory=lambda: np.full(3, np.nan))
 
 
 def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
@@ -250,8 +256,9 @@ def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
     turned, sure = _by_gyro(table, quiet, rule)
     good = quiet & ~turned & (sure | rule.rests(slopes, across))
     std, count = _counts(table[first:], excess[first:], rule)
-    return [_dwell(*each) if fine else None
-            for fine, *each in zip(good[first:], table[first:], std.T.copy(), count.tolist())]
+    rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
+    return [_dwell(*each) if fine else None for fine, *each in zip(
+        good[first:], table[first:], std.T.copy(), count.tolist(), rate_std)]
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
@@ -303,7 +310,7 @@ def _counts(table: Records, excess: Floats, rule: Rule) -> tuple[Floats, Floats]
     return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
 
 
-def _dwell(found: Any, std: Floats, count: float) -> Dwell:
+def _dwell(found: Any, std: Floats, count: float, rate_std: Floats) -> Dwell:
     context: dict[str, float | Floats] = {
         name: value for name, value in zip(CONTEXT, found['around'].tolist())
         if math.isfinite(value)}
@@ -311,7 +318,8 @@ def _dwell(found: Any, std: Floats, count: float) -> Dwell:
     if np.isfinite(mean).all():
         context['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 count, int(found['samples']), context, int(found['orientation']))
+                 count, int(found['samples']), context, int(found['orientation']),
+                 rate_std=rate_std)
 
 
 CELLS = 256

@@ -151,7 +151,8 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     """
     Return the pose table of these dwells.
 
-    The table has the column ``orientation`` if ``max_dwell`` is finite, and the column
+    The table has the columns of context that all dwells have; ``rate_std`` likewise. It has the
+    column ``orientation`` if ``max_dwell`` is finite, and the column
     ``doubtful`` if a dwell is doubtful.
 
     """
@@ -163,6 +164,9 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     for name in (*CONTEXT, 'rate'):
         if dwells and all(name in each.context for each in dwells):
             columns[name] = np.array([each.context[name] for each in dwells])
+    rate_std = np.array([each.rate_std for each in dwells], dtype=float)
+    if 'rate' in columns and np.isfinite(rate_std).all():
+        columns['rate_std'] = rate_std
     if np.isfinite(settings.max_dwell):
         columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
     if any(each.doubtful for each in dwells):
@@ -202,11 +206,12 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     count = first.count + second.count
     samples = first.samples + second.samples
     share = first.samples / samples
+    rate_std = np.sqrt(share * first.rate_std**2 + (1.0 - share) * second.rate_std**2)
     context = {name: share * first.context[name] + (1.0 - share) * second.context[name]
                for name in first.context if name in second.context}
     return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
                    time=share * first.time + (1.0 - share) * second.time,
-                   samples=samples, context=context)
+                   samples=samples, context=context, rate_std=rate_std)
 
 
 def _weight(first: Dwell, second: Dwell) -> float:

@@ -31,6 +31,7 @@ deviation above `STD_CAP_G` is not still.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -166,6 +167,12 @@ class Rule:
 
         """
         return rounding(float(self._step[0]), self._floor[:3, np.newaxis], mean, std)
+
+    @property
+    def rate_resolution(self) -> float:
+        """Return the standard deviation of the rounding error of a rate; 0 without steps."""
+        step = float(self._step[1])
+        return step / math.sqrt(12.0) if math.isfinite(step) else 0.0
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:

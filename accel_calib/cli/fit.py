@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from . import options
-from .results import fit_result, parameter_table, quality_table
+from .results import fit_result, gyro_line, parameter_table, quality_table
 from ..calibrate import (
     Calibration,
     fit_poses,
@@ -128,6 +128,8 @@ def _show(args: argparse.Namespace, calibration: Calibration) -> None:
     console.print(quality_table(calibration))
     console.print(parameter_table(calibration))
     console.print(f'model {calibration.name}: {calibration.reason}', markup=False)
+    if calibration.gyro is not None:
+        console.print(gyro_line(calibration.gyro), markup=False)
     for rejected in calibration.rejected:
         console.print(f'left out: row {rejected.row}: {rejected.reason}', markup=False)
     for warning in calibration.warnings:

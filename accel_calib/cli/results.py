@@ -10,10 +10,11 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, Outlook, outlook
+from ..calibrate import Calibration, GyroBias, Outlook, outlook
 from ..effects import effect_named
 from ..errors import counted
 from ..estimate.closed_form import sensing_axes
+from ..table import Floats
 from ..units import MG
 from ..words import base_words, chance, short
 
@@ -35,8 +36,30 @@ def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
         'poses_used': len(calibration.poses) - len(calibration.rejected),
         'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
         **asdict(calibration.quality), 'reason': calibration.reason,
-        'warnings': calibration.warnings, **_own_names(calibration),
+        'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
         **_outlook(outlook(calibration, asked))}
+
+
+def _rest_noise(calibration: Calibration) -> dict[str, Any]:
+    """Return the gyro bias [rad/s] and the noise of a sample for JSON; None if not known."""
+    gyro, noise = calibration.gyro, calibration.noise
+    return {'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
+            'noise_force': noise and _known(noise.force),
+            'noise_rate': noise and _known(noise.rate)}
+
+
+def _known(values: Floats) -> Floats | None:
+    return None if np.isnan(values).all() else values
+
+
+def gyro_line(gyro: GyroBias) -> str:
+    """Return the gyro bias as a line of text, in °/s."""
+    values = ', '.join(f'{axis} {bias:+.3f} ± {sd:.1g}' for axis, bias, sd in zip(
+        'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
+    slope = ('' if not np.any(gyro.slope) else
+             f' at {gyro.temperature:.1f} °C, changes by '
+             f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
+    return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
 
 
 def _outlook(found: Outlook) -> dict[str, Any]:

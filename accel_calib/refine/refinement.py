@@ -33,6 +33,7 @@ from ..calibrate import (
     gated,
     in_g,
     Rejected,
+    with_rest_noise,
 )
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.pose_planning import refuse_if_unfit
@@ -355,7 +356,7 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
         rejected=rejected, warnings=tuple(warnings),
         reason=f'{base.reason}; refined: {names or "nothing added"}')
     try:
-        return _determined(gated(refined), final)
+        return _determined(gated(with_rest_noise(refined, given.poses)), final)
     except RefusedFitError as refused:
         return refined, (refused.message, refused.advice)
 

@@ -1,0 +1,401 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Bias of the gyro and white noise of the samples, from the rests.
+
+**Bias.** The mean rate of a rest is the bias of the gyro, plus noise. Its variance has two parts:
+
+    v_i  the white noise of the samples, ``rate_std``² / ``count``; 0 if the table lacks them
+    τ²   the scatter from rest to rest: slow drift of the bias, dependence on the orientation, the
+         rotation of the Earth (0.004 °/s)
+
+The bias is the mean with the weights 1 / (v_i + τ²). τ² is the value at which the weighted squares
+of the residuals have their expected sum (Paule and Mandel [1]_). For k rests, τ is only as certain
+as k - 1 squares make it. Its part of the variance is therefore multiplied by the square of the
+ratio of the Student to the normal quantile. Successive rests can have similar errors, if the bias
+drifts. With the correlation ρ between neighbours, the variance is multiplied by (1 + ρ) / (1 - ρ),
+as for slopes in `accel_calib.capture.window`.
+
+**Turning rests.** A sensor that turns steadily about the vertical has a constant reading. Only its
+rate differs. A rest is left out if its rate on any axis is further from the others than noise and
+scatter explain. Until then, the centre is the median, and τ is the median absolute deviation, with
+the factors of Croux and Rousseeuw for few values [2]_. A few such rests do not affect either.
+
+**Temperature.** With a temperature for each rest, a line is fitted, too. An axis has a slope if
+the line shows it with p < 0.001. A bias that drifts while the temperature rises looks the same.
+Rests are then left out by their distance from a robust line: its slope is the median of the slopes
+of all pairs, weighted by their difference of temperature [3]_.
+
+**Noise.** The noise of a sample is the median over the rests, by axis, so that disturbed rests do
+not affect it. For the rate, `accel_calib.capture` measures it in windows of 0.5 s, without slow
+drift. For the reading it is ``std``, over the whole rest, because pose tables of all sources have
+it. On real recordings with rests of some seconds, the medians of both agree within 4 %.
+
+References
+----------
+.. [1] R. C. Paule, J. Mandel, Consensus values and weighting factors, J. Res. NBS 87 (1982) 377.
+.. [2] C. Croux, P. J. Rousseeuw, Time-efficient algorithms for two highly robust estimators of
+   scale, COMPSTAT 1992, section 2: the factors of MAD.
+.. [3] G. L. Sievers, Weighted rank statistics for simple linear regression, JASA 73 (1978) 628.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..table import Floats, Poses
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+
+LARGEST_BIAS = 1.0
+"""Largest bias of a gyro [rad/s]; a larger rate is in another unit, or is no rest."""
+
+LEAST_RESTS = 2
+"""Fewest rests that show how much the bias differs from rest to rest."""
+
+_LARGEST_SD = 0.05
+"""Largest standard deviation of a useful bias [rad/s]; it is larger if the sensor was turned."""
+
+_ENOUGH = 8                # fewest rests for a slope over temperature, and for a correlation
+_TAIL = 5e-4               # probability, on each side, of a rest left out or a slope by chance
+_CONFIDENCE = 0.975        # quantile at which the uncertainty of τ is included
+_NORMAL = 1.959964         # the same quantile of the normal distribution
+_CORRELATION_MAX = 0.9
+_BISECTIONS = 40
+_PAIRED = 200              # rests used for the slopes of pairs
+_TINY = 1e-30              # variance added to rests without noise [(rad/s)²]
+_MAD = 1.4826
+_MAD_FEW = (1.0, 1.0, 1.196, 1.495, 1.363, 1.206, 1.200, 1.140, 1.129, 1.107)
+"""Factors on the median absolute deviation of 0 to 9 values."""
+
+
+@dataclass(frozen=True)
+class GyroBias:
+    """
+    Mean angular rate of a gyro at rest.
+
+    Parameters
+    ----------
+    bias : (3,) array
+        The rate to subtract, in the axes of the sensor [rad/s].
+    sd : (3,) array
+        Standard deviation of the bias [rad/s].
+    rests : int
+        Number of rests used.
+    temperature : float
+        Temperature at which `bias` holds [°C]; NaN if it is not known.
+    slope : (3,) array
+        Change of the bias with the temperature [rad/s/°C]; 0 unless the rests show it.
+    temperatures : tuple of float
+        Lowest and highest temperature of the rests [°C]; empty if they are not known.
+
+    """
+
+    bias: Floats
+    sd: Floats
+    rests: int
+    temperature: float
+    slope: Floats
+    temperatures: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name, bound in (('bias', LARGEST_BIAS), ('sd', math.inf), ('slope', math.inf)):
+            values = getattr(self, name)
+            if np.shape(values) != (3,) or not np.all(np.abs(values) < bound):
+                raise ValueError(f'the {name} of the gyro is {np.asarray(values).tolist()}, '
+                                 f'expected three numbers below {bound:g} in magnitude')
+        if np.any(self.sd < 0.0):
+            raise ValueError(f'the sd of the gyro bias is {self.sd.tolist()}, expected 0 or more')
+        if self.rests < 1:
+            raise ValueError(f'the gyro bias has {self.rests} rests, expected at least 1')
+        self._check_temperatures()
+
+    def _check_temperatures(self) -> None:
+        known = tuple(self.temperatures)
+        if not known and math.isnan(self.temperature) and not np.any(self.slope):
+            return
+        if len(known) != 2 or not -math.inf < known[0] <= self.temperature <= known[1] < math.inf:
+            raise ValueError(f'the gyro bias holds at {self.temperature} °C, and its rests have '
+                             f'temperatures {list(known)}, expected a temperature between the '
+                             'lowest and the highest, or none and no slope')
+
+    def at(self, temperature: float) -> Floats:
+        """
+        Return the (3,) bias at a temperature [°C], which is limited to that of the rests.
+
+        It is `bias` if the temperature is NaN, or the rests have no temperatures.
+
+        """
+        if not self.temperatures or math.isnan(temperature):
+            return self.bias
+        held = min(max(temperature, self.temperatures[0]), self.temperatures[1])
+        return self.bias + self.slope * (held - self.temperature)
+
+
+@dataclass(frozen=True)
+class SampleNoise:
+    """
+    White noise of one sample at rest.
+
+    Parameters
+    ----------
+    force : (3,) array
+        Standard deviation of the reading by axis, in the unit of the readings; NaN if not known.
+    rate : (3,) array
+        Standard deviation of the angular rate by axis [rad/s]; NaN if not known.
+
+    """
+
+    force: Floats
+    rate: Floats
+
+    def __post_init__(self) -> None:
+        for name in ('force', 'rate'):
+            values = getattr(self, name)
+            if np.shape(values) != (3,) or np.any(values < 0.0) or np.any(np.isinf(values)):
+                raise ValueError(f'the noise of the {name} is {np.asarray(values).tolist()}, '
+                                 'expected three numbers of 0 or more')
+
+
+def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
+    """
+    Return a calibration with gyro bias and noise from rests.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration. Figures that the rests do not determine are kept.
+    poses : Poses
+        The rests, in the unit of the readings. Those that the calibration rejects are not used.
+
+    """
+    rejected = [pose.row for pose in calibration.rejected]
+    used = poses.take(~np.isin(poses.row, rejected))
+    return replace(calibration, gyro=gyro_bias_of(used) or calibration.gyro,
+                   noise=sample_noise_of(used) or calibration.noise)
+
+
+def sample_noise_of(poses: Poses) -> SampleNoise | None:
+    """
+    Return the white noise of one sample, by axis.
+
+    Parameters
+    ----------
+    poses : Poses
+        Rests, with ``std`` and ``rate_std`` where they are known.
+
+    Returns
+    -------
+    SampleNoise or None
+        The noise, in the unit of the readings and in rad/s. An axis whose samples never change has
+        no known noise. None if no noise is known.
+
+    """
+    force, rate = (_median(poses, key) for key in ('std', 'rate_std'))
+    if 'rate' in poses and len(poses) and not _in_rad_s(poses['rate']):
+        rate = np.full(3, np.nan)
+    if np.isnan(force).all() and np.isnan(rate).all():
+        return None
+    return SampleNoise(force, rate)
+
+
+def _median(poses: Poses, key: str) -> Floats:
+    if key not in poses or not len(poses):
+        return np.full(3, np.nan)
+    found = np.median(poses[key], axis=0)
+    return np.asarray(np.where(found > 0.0, found, np.nan))
+
+
+def _in_rad_s(rate: Floats) -> bool:
+    """Return whether rates at rest can be in rad/s; those of a raw gyro are counts."""
+    return bool(np.all(np.abs(np.median(rate, axis=0)) < LARGEST_BIAS))
+
+
+def gyro_bias_of(poses: Poses) -> GyroBias | None:
+    """
+    Return the bias of the gyro, from the rates at rest.
+
+    Parameters
+    ----------
+    poses : Poses
+        Rests with ``rate``, and with ``rate_std``, ``count``, ``time`` and ``temperature`` where
+        they are known.
+
+    Returns
+    -------
+    GyroBias or None
+        The bias, without the rests that turned. None if there are no rates or fewer than
+        `LEAST_RESTS` rests, if the rates are all 0 or not in rad/s, or if they differ so much that
+        the poses are not rests.
+
+    """
+    if 'rate' not in poses or len(poses) < LEAST_RESTS:
+        return None
+    rests = _rests_of(poses)
+    if not np.any(rests.rate) or not _in_rad_s(rests.rate):
+        return None
+    rests = rests.take(_agreeing(rests))
+    constant, line = _means(rests), _lines(rests)
+    sloping = np.zeros(3, bool) if line is None else line.is_sloping(len(rests.rate))
+    chosen = constant if line is None else line.where(sloping, constant)
+    bias, sd = chosen.values[0], chosen.deviation[0]
+    if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
+        return None
+    slope = np.where(sloping, chosen.values[-1], 0.0)
+    if rests.warmth is None:
+        return GyroBias(bias, sd, len(rests.rate), math.nan, slope, ())
+    limits = (float(rests.warmth.min()), float(rests.warmth.max()))
+    return GyroBias(bias, sd, len(rests.rate), float(np.clip(rests.warmth.mean(), *limits)), slope,
+                    limits)
+
+
+@dataclass(frozen=True)
+class _Rests:
+    """Rates (n, 3) [rad/s], variances of their noise, and (n,) temperatures, in order of time."""
+
+    rate: Floats
+    variance: Floats
+    warmth: Floats | None
+
+    def take(self, which: NDArray[np.bool_]) -> _Rests:
+        return _Rests(self.rate[which], self.variance[which],
+                      None if self.warmth is None else self.warmth[which])
+
+
+def _rests_of(poses: Poses) -> _Rests:
+    if 'time' in poses:
+        poses = poses.take(np.argsort(poses['time'], kind='stable'))
+    variance = np.zeros_like(poses['rate'], dtype=float)
+    if 'rate_std' in poses and 'count' in poses:
+        variance = poses['rate_std'] ** 2 / poses['count'][:, np.newaxis]
+    return _Rests(poses['rate'], variance + _TINY, poses.columns.get('temperature'))
+
+
+def _agreeing(rests: _Rests) -> NDArray[np.bool_]:
+    """Return which rests have the rate that noise and scatter explain."""
+    from scipy.special import stdtrit
+
+    count, left = len(rests.rate), rests.rate
+    with_slope = rests.warmth is not None and count >= _ENOUGH
+    if rests.warmth is not None and with_slope:
+        left = left - rests.warmth[:, np.newaxis] * _slope_of_pairs(rests.rate, rests.warmth)
+    left = np.abs(left - np.median(left, axis=0))
+    factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
+    spread = _MAD * factor * np.median(left, axis=0)
+    scatter = np.maximum(spread ** 2 - np.median(rests.variance, axis=0), 0.0)
+    limit = float(stdtrit(count - 1 - with_slope, 1.0 - _TAIL))
+    return np.asarray(np.all(left ** 2 <= limit ** 2 * (rests.variance + scatter), axis=1))
+
+
+def _slope_of_pairs(values: Floats, warmth: Floats) -> Floats:
+    """Return the (3,) weighted medians of the slopes of all pairs; see the module."""
+    rows = np.unique(np.linspace(0, len(warmth) - 1, min(len(warmth), _PAIRED)).astype(np.intp))
+    one, other = (rows[each] for each in np.triu_indices(len(rows), 1))
+    apart = warmth[other] - warmth[one]
+    one, other, apart = (each[apart != 0.0] for each in (one, other, apart))
+    if not len(apart):
+        return np.zeros(3)
+    slopes = (values[other] - values[one]) / apart[:, np.newaxis]
+    order = np.argsort(slopes, axis=0)
+    weight = np.cumsum(np.abs(apart)[order], axis=0)
+    middle = np.argmax(weight >= 0.5 * weight[-1], axis=0)
+    return np.asarray(np.take_along_axis(slopes, np.take_along_axis(
+        order, middle[np.newaxis], axis=0), axis=0)[0])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """(p, 3) values by axis, their variances, and (n, 3) residuals over their deviation."""
+
+    values: Floats
+    variance: Floats
+    residual: Floats
+
+    @property
+    def deviation(self) -> Floats:
+        """Return the standard deviations, including the correlation of successive rests."""
+        return np.asarray(np.sqrt(self.variance * self._excess()))
+
+    def _excess(self) -> float:
+        count, square = len(self.residual), float(np.sum(self.residual ** 2))
+        if count < _ENOUGH or square == 0.0:
+            return 1.0
+        neighbours = float(np.sum(self.residual[1:] * self.residual[:-1]))
+        # Without the mean, independent residuals have a correlation of -1/n.
+        correlation = min(max(neighbours / square + 1.0 / count, 0.0), _CORRELATION_MAX)
+        return (1.0 + correlation) / (1.0 - correlation)
+
+    def is_sloping(self, count: int) -> NDArray[np.bool_]:
+        """Return which axes have a significant slope."""
+        from scipy.special import stdtrit
+
+        limit = float(stdtrit(count - 2, 1.0 - _TAIL))
+        return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
+
+    def where(self, mine: NDArray[np.bool_], other: _Fit) -> _Fit:
+        """Return this fit for some axes, and another without slope for the others."""
+        values, variance = (np.where(mine, one, np.vstack([two, np.zeros(3)])) for one, two in (
+            (self.values, other.values), (self.variance, other.variance)))
+        return _Fit(values, variance, np.where(mine, self.residual, other.residual))
+
+
+def _means(rests: _Rests) -> _Fit:
+    return _fit(np.ones((len(rests.rate), 1)), rests)
+
+
+def _lines(rests: _Rests) -> _Fit | None:
+    """Return lines over temperature minus its mean; None if they are not determined."""
+    warmth = rests.warmth
+    if warmth is None or len(warmth) < _ENOUGH or not np.ptp(warmth) > 0.0:
+        return None
+    return _fit(np.column_stack([np.ones(len(warmth)), warmth - warmth.mean()]), rests)
+
+
+def _fit(design: Floats, rests: _Rests) -> _Fit:
+    """Fit the rates of each axis with noise and scatter; `design` is (n, p)."""
+    from scipy.special import stdtrit
+
+    surplus = float(stdtrit(len(design) - design.shape[1], _CONFIDENCE)) / _NORMAL
+    values, variance, residual = [], [], []
+    for rate, noise in zip(rests.rate.T, rests.variance.T, strict=True):
+        scatter = _scatter(design, rate, noise)
+        found, inverse, left = _weighted(design, rate, noise + scatter)
+        share = (noise + surplus ** 2 * scatter) / (noise + scatter) ** 2
+        covariance = inverse @ (design.T * share @ design) @ inverse
+        values.append(found)
+        variance.append(np.diag(covariance))
+        residual.append(left / np.sqrt(noise + scatter))
+    return _Fit(np.column_stack(values), np.column_stack(variance), np.column_stack(residual))
+
+
+def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the least squares values, their covariance, and the residuals."""
+    inverse = np.linalg.inv(design.T / variance @ design)
+    values = inverse @ (design.T / variance @ rate)
+    return values, inverse, rate - design @ values
+
+
+def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
+    """Return τ², at which the weighted squares have their expected sum; see the module."""
+    dof = design.shape[0] - design.shape[1]
+    flat = _weighted(design, rate, np.ones(len(rate)))[2]
+    low, high = 0.0, float(flat @ flat) / dof
+
+    def excess(scatter: float) -> float:
+        left = _weighted(design, rate, noise + scatter)[2]
+        return float(np.sum(left ** 2 / (noise + scatter))) - dof
+
+    if excess(0.0) <= 0.0:
+        return 0.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
+    return 0.5 * (low + high)

@@ -1,0 +1,420 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bias of the gyro and noise of the samples, from simulated and real rests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+
+from accel_calib.calibrate import (
+    fit_poses,
+    gyro_bias_of,
+    GyroBias,
+    level,
+    sample_noise_of,
+    SampleNoise,
+)
+from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from, select
+from accel_calib.cli.main import main
+from accel_calib.errors import InputError, StoredCalibrationError
+from accel_calib.files import read_poses, read_samples, write_table
+from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
+from accel_calib.model import Model
+from accel_calib.refine import refine
+from accel_calib.simulate import simulate_poses, simulate_recording
+from accel_calib.sphere import spread_directions
+from accel_calib.table import numbered, Poses, Recording
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import data, sensor
+
+BIAS = np.array([0.01, -0.02, 0.03])
+TURNING = np.array([0.3, -0.2, 0.9])
+G = units_of('g')
+
+
+def rests(seed, count=24, *, scatter=2e-4, noise=(0.003, 0.002, 0.005), samples=300, warmth=None,
+          slope=(0.0, 0.0, 0.0)) -> Poses:
+    """Return rests of a calibrated accelerometer and of a gyro with this scatter [rad/s]."""
+    rng = np.random.default_rng(seed)
+    rate = BIAS + rng.normal(size=(count, 3)) * scatter
+    rate += rng.normal(size=(count, 3)) * noise / np.sqrt(samples)
+    measured = noise * np.sqrt(rng.chisquare(samples, size=(count, 3)) / samples)
+    known = {'rate': rate, 'rate_std': measured}
+    if warmth is not None:
+        known = {**known, 'temperature': warmth,
+                 'rate': rate + np.outer(warmth - np.mean(warmth), slope)}
+    return simulate_poses(Model({}), spread_directions(count), rng, samples=samples,
+                          context=known)
+
+
+def found(poses: Poses) -> GyroBias:
+    gyro = gyro_bias_of(poses)
+    assert gyro is not None
+    return gyro
+
+
+def turned(poses: Poses, row: int, rate: float) -> Poses:
+    moved = poses['rate'].copy()
+    moved[row] += rate * TURNING
+    return poses.with_columns(rate=moved)
+
+
+@pytest.mark.parametrize('scatter', [0.0, 3e-4])
+@pytest.mark.parametrize('count', [6, 12, 24])
+def test_the_stated_uncertainty_covers_the_true_bias(count, scatter):
+    inside = []
+    for seed in range(300):
+        gyro = found(rests(seed, count, scatter=scatter))
+        inside.append(np.abs(gyro.bias - BIAS) < 1.96 * gyro.sd)
+    assert 0.9 < np.mean(inside) < 0.99
+
+
+def test_rests_without_their_noise_show_it_by_their_scatter():
+    inside, ratio = [], []
+    for seed in range(300):
+        poses = rests(seed, 12)
+        known = {key: poses[key] for key in ('reading', 'rate')}
+        alone = found(Poses(known, poses.row))
+        inside.append(np.abs(alone.bias - BIAS) < 1.96 * alone.sd)
+        ratio.append(alone.sd / found(poses).sd)
+    assert 0.9 < np.mean(inside) < 0.99
+    assert 0.8 < np.median(ratio) < 1.25
+
+
+def test_successive_rests_with_similar_errors_count_less():
+    slow = np.outer(np.sin(np.arange(24) / 4.0), np.ones(3)) * 1e-3
+    poses = rests(1)
+    drifting = found(poses.with_columns(rate=poses['rate'] + slow))
+    mixed = found(poses.with_columns(
+        rate=poses['rate'] + np.random.default_rng(2).permutation(slow)))
+    assert np.all(drifting.sd > 1.5 * mixed.sd)
+
+
+def test_a_slope_over_temperature_is_found_where_it_is():
+    warmth, slope = np.linspace(20.0, 40.0, 24), np.array([2e-4, 0.0, -3e-4])
+    for seed in range(50):
+        gyro = found(rests(seed, warmth=warmth, slope=slope))
+        assert gyro.slope[0] != 0.0
+        assert gyro.slope[2] != 0.0
+        np.testing.assert_allclose(gyro.slope, slope, atol=5e-5)
+        assert gyro.temperature == pytest.approx(30.0, abs=1.0)
+        np.testing.assert_allclose(gyro.at(25.0), BIAS + slope * -5.0, atol=5e-4)
+
+
+def test_no_slope_is_found_where_there_is_none():
+    warmth = np.linspace(20.0, 40.0, 24)
+    slopes = [found(rests(seed, warmth=warmth)).slope for seed in range(300)]
+    assert np.mean(np.array(slopes) != 0.0) < 0.01
+
+
+def test_the_bias_is_not_extrapolated_over_temperature():
+    gyro = GyroBias(BIAS, 0.1 * BIAS ** 2, 24, 30.0, np.array([1e-4, 0.0, 0.0]), (20.0, 40.0))
+    np.testing.assert_allclose(gyro.at(30.0), BIAS)
+    np.testing.assert_allclose(gyro.at(20.0) - BIAS, [-1e-3, 0.0, 0.0])
+    np.testing.assert_array_equal(gyro.at(-40.0), gyro.at(20.0))
+    np.testing.assert_array_equal(gyro.at(80.0), gyro.at(40.0))
+    np.testing.assert_array_equal(gyro.at(np.nan), BIAS)
+
+
+def test_a_bias_without_temperatures_is_the_same_at_every_temperature():
+    gyro = found(rests(3))
+    assert gyro.temperatures == ()
+    assert np.isnan(gyro.temperature)
+    np.testing.assert_array_equal(gyro.at(60.0), gyro.bias)
+
+
+@pytest.mark.parametrize('rate', [0.01, 0.05, 0.3])
+@pytest.mark.parametrize('warmth', [None, np.linspace(20.0, 40.0, 24)])
+def test_a_rest_at_which_the_platform_turned_is_ignored(rate, warmth):
+    for seed in range(20):
+        poses = rests(seed, warmth=warmth)
+        row = seed % len(poses)
+        gyro = found(turned(poses, row, rate))
+        without = found(poses.take(np.arange(len(poses)) != row))
+        assert gyro.rests < len(poses)
+        assert np.all(np.abs(gyro.bias - without.bias) < gyro.sd)
+        np.testing.assert_allclose(gyro.sd, without.sd, rtol=0.4)
+
+
+def test_one_of_six_rests_that_turned_does_not_matter():
+    for seed in range(50):
+        gyro = found(turned(rests(seed, 6), seed % 6, 0.05))
+        assert gyro.rests == 5
+        assert np.all(np.abs(gyro.bias - BIAS) < 5.0 * gyro.sd)
+
+
+def test_two_rests_that_disagree_are_uncertain():
+    sure, unsure = found(rests(4, 2)), found(turned(rests(4, 2), 1, 0.005))
+    assert np.all(np.abs(unsure.bias - BIAS) < 2.0 * unsure.sd)
+    assert unsure.sd[2] > 5.0 * sure.sd[2]
+
+
+@pytest.mark.parametrize('rate', [
+    np.zeros((12, 3)), np.full((12, 3), 32768.0),
+    np.random.default_rng(5).uniform(-0.9, 0.9, size=(12, 3))],
+    ids=['no gyro', 'counts', 'turntable'])
+def test_rates_that_are_no_gyro_at_rest_give_no_bias(rate):
+    assert gyro_bias_of(rests(5, 12).with_columns(rate=rate)) is None
+
+
+def test_poses_without_rates_or_a_single_rest_give_no_bias():
+    poses = rests(6)
+    without = Poses({'reading': poses.reading}, poses.row)
+    assert gyro_bias_of(without) is None
+    assert sample_noise_of(without) is None
+    assert gyro_bias_of(poses.take(slice(1))) is None
+    assert gyro_bias_of(poses.take(slice(0))) is None
+    assert sample_noise_of(poses.take(slice(0))) is None
+
+
+def test_noise_that_is_not_known_is_nan():
+    poses = rests(7)
+    only_force = sample_noise_of(Poses({key: poses[key] for key in ('reading', 'std')}, poses.row))
+    assert only_force is not None
+    np.testing.assert_allclose(only_force.force, 0.003)
+    assert np.isnan(only_force.rate).all()
+    in_counts = sample_noise_of(poses.with_columns(rate=poses['rate'] + 32768.0))
+    assert in_counts is not None
+    assert np.isnan(in_counts.rate).all()
+    constant = sample_noise_of(poses.with_columns(rate_std=poses['rate_std'] * [1.0, 0.0, 1.0]))
+    assert constant is not None
+    np.testing.assert_array_equal(np.isnan(constant.rate), [False, True, False])
+
+
+def recorded(seed=8, *, step=0.0, drift=0.0) -> Recording:
+    """Return a recording with noise that differs by axis, and a gyro that drifts or is rounded."""
+    rng = np.random.default_rng(seed)
+    samples = simulate_recording(Model({}), spread_directions(12), rng, noise_g=0.0, dwell=6.0,
+                                 gyro_noise=0.0)
+    size, time = samples.reading.shape, samples['time'][:, np.newaxis]
+    rate = samples['rate'] + BIAS + rng.normal(size=size) * [0.002, 0.004, 0.001]
+    rate += drift * np.sin(2.0 * np.pi * time / 12.0)
+    return samples.with_columns(
+        reading=samples.reading + rng.normal(size=size) * [0.003, 0.005, 0.002],
+        rate=np.round(rate / step) * step if step else rate)
+
+
+def test_the_noise_of_each_axis_is_recovered_from_a_recording():
+    noise = sample_noise_of(capture(recorded(), G).poses)
+    assert noise is not None
+    np.testing.assert_allclose(noise.force, [0.003, 0.005, 0.002], rtol=0.05)
+    np.testing.assert_allclose(noise.rate, [0.002, 0.004, 0.001], rtol=0.05)
+
+
+def test_slow_drift_of_the_gyro_is_not_white_noise():
+    samples = recorded(drift=0.004)
+    poses = capture(samples, G).poses
+    noise = sample_noise_of(poses)
+    assert noise is not None
+    np.testing.assert_allclose(noise.rate, [0.002, 0.004, 0.001], rtol=0.1)
+    whole = [samples['rate'][np.abs(samples['time'] - time) < 2.5].std(axis=0)[2]
+             for time in poses['time']]
+    assert np.median(whole) > 1.5 * noise.rate[2]
+
+
+def test_a_coarse_gyro_has_at_least_the_noise_of_its_rounding():
+    step = 0.05
+    poses = capture(recorded(step=step), G).poses
+    assert np.all(poses['rate_std'] >= 0.999 * step / np.sqrt(12.0))
+
+
+def test_a_recording_without_a_gyro_has_no_noise_of_the_rate():
+    samples = recorded()
+    columns = {key: values for key, values in samples.columns.items() if key != 'rate'}
+    poses = capture(replace(samples, columns=columns), G).poses
+    assert 'rate' not in poses
+    assert 'rate_std' not in poses
+
+
+def dwell(start, rate_std, samples=100, **known) -> Dwell:
+    std = np.full(3, 0.003)
+    context = {'rate': BIAS, **known}
+    made = Dwell(start, start + 1.0, start + 0.5, np.array([0.0, 0.0, 1.0]), std, float(samples),
+                 samples, context, int(start))
+    return made if rate_std is None else replace(made, rate_std=np.full(3, rate_std))
+
+
+def test_merged_rests_have_the_noise_of_both():
+    both = [dwell(0.0, 0.003, 100), dwell(5.0, 0.006, 300)]
+    merged = select(both, CaptureSettings(repeated='merge'), G)
+    assert len(merged) == 1
+    np.testing.assert_allclose(merged[0].rate_std, np.sqrt((0.003 ** 2 + 3 * 0.006 ** 2) / 4))
+
+
+def test_a_table_has_the_noise_of_the_rate_if_all_its_rests_have_it():
+    assert 'rate_std' in poses_from([dwell(0.0, 0.003), dwell(5.0, 0.004)])
+    mixed = poses_from([dwell(0.0, 0.003), dwell(5.0, None)])
+    assert 'rate' in mixed
+    assert 'rate_std' not in mixed
+
+
+def test_a_negative_noise_of_the_rate_is_refused(tmp_path):
+    poses = rests(9)
+    write_table(tmp_path / 'poses.csv', poses.with_columns(rate_std=-poses['rate_std']))
+    with pytest.raises(InputError, match='gstd_x, gstd_y or gstd_z holds negative numbers'):
+        read_poses(tmp_path / 'poses.csv')
+
+
+@pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
+def test_a_real_gyro_has_the_bias_of_its_quietest_seconds(name):
+    samples = read_samples(data(name))
+    gyro = found(capture(samples, units_of('m/s2')).poses)
+    seconds = samples['rate'][:len(samples) // 100 * 100].reshape(-1, 100, 3)
+    spread = seconds.std(axis=1).max(axis=1)
+    quiet = np.median(seconds[spread < np.quantile(spread, 0.25)].mean(axis=1), axis=0)
+    np.testing.assert_allclose(gyro.bias, quiet, atol=np.radians(0.04))
+    assert np.all(gyro.sd < np.radians(0.015))
+    assert np.all(gyro.sd > np.radians(0.003))
+
+
+def test_a_real_rest_that_turned_is_left_out():
+    poses = capture(read_samples(data('mpu9150_imu0.csv')), units_of('m/s2')).poses
+    gyro = found(poses)
+    away = np.linalg.norm(poses['rate'] - gyro.bias, axis=1)
+    assert away.max() > np.radians(3.0)
+    assert gyro.rests == np.sum(away < np.radians(0.5))
+    plain = poses['rate'].mean(axis=0)
+    assert np.linalg.norm(plain - gyro.bias) > 5.0 * np.linalg.norm(gyro.sd)
+
+
+def test_a_real_gyro_in_counts_has_no_bias_in_radians():
+    poses = capture(read_samples(data('xsens_mti_counts.csv')), units_of('native')).poses
+    noise = sample_noise_of(poses)
+    assert gyro_bias_of(poses) is None
+    assert noise is not None
+    assert np.isnan(noise.rate).all()
+    assert np.all((noise.force > 2.0) & (noise.force < 5.0))
+
+
+def fitted(**known):
+    return fit_poses(rests(10, **known), G, model='4', date='2026-01-01T00:00:00+00:00')
+
+
+def test_a_fit_has_bias_and_noise_and_levelling_keeps_them():
+    calibration = fitted()
+    assert calibration.gyro is not None
+    assert calibration.noise is not None
+    assert np.all(np.abs(calibration.gyro.bias - BIAS) < 5.0 * calibration.gyro.sd)
+    levelled = level(calibration, np.array([0.0, 0.0, 1.0]), 'ros')
+    assert levelled.gyro is calibration.gyro
+    assert levelled.noise is calibration.noise
+
+
+def test_poses_that_the_fit_rejects_are_no_rests():
+    poses = rests(11)
+    reading, rate = poses.reading.copy(), poses['rate'].copy()
+    reading[5] *= 1.2
+    rate[5] += 5e-4
+    disturbed = poses.with_columns(reading=reading, rate=rate)
+    calibration = fit_poses(disturbed, G, model='4')
+    assert [each.row for each in calibration.rejected] == [6]
+    expected = found(poses.take(np.arange(len(poses)) != 5))
+    np.testing.assert_array_equal(calibration.gyro.bias, expected.bias)
+
+
+def test_a_refinement_takes_the_bias_of_the_new_rests():
+    rng = np.random.default_rng(12)
+    stored = fit_poses(rests(12), G, model='10')
+    later = rests(13)
+    changed = later.with_columns(rate=later['rate'] + 0.005)
+    refined = refine(changed, G, base=stored).calibration
+    assert refined.gyro is not None
+    assert np.all(np.abs(refined.gyro.bias - BIAS - 0.005) < 5.0 * refined.gyro.sd)
+    bare = simulate_poses(sensor(rng), spread_directions(24), rng)
+    assert refine(bare, G, base='10').calibration.gyro is None
+
+
+def test_a_refinement_without_rates_keeps_the_stored_bias():
+    stored = fit_poses(rests(14), G, model='10')
+    rng = np.random.default_rng(15)
+    later = simulate_poses(Model({}), spread_directions(24), rng)
+    assert refine(later, G, base=stored).calibration.gyro is stored.gyro
+
+
+@pytest.mark.parametrize('known', [
+    {}, {'warmth': np.linspace(20.0, 40.0, 24), 'slope': (2e-4, 0.0, -3e-4)}])
+def test_bias_and_noise_are_read_as_they_were_written(known):
+    calibration = fitted(**known)
+    text = format_calibration(calibration)
+    read = parse_calibration(text, 'x.yaml')
+    assert format_calibration(read) == text
+    assert read.warnings == calibration.warnings
+    for name in ('bias', 'sd', 'slope', 'temperature', 'temperatures', 'rests'):
+        np.testing.assert_array_equal(getattr(read.gyro, name), getattr(calibration.gyro, name))
+    for name in ('force', 'rate'):
+        np.testing.assert_array_equal(getattr(read.noise, name), getattr(calibration.noise, name))
+
+
+def test_noise_that_is_not_known_is_stored_as_null():
+    noise = SampleNoise(np.array([0.003, 0.002, 0.004]), np.full(3, np.nan))
+    text = format_calibration(replace(fitted(), noise=noise))
+    assert 'rate: [null, null, null]' in text
+    np.testing.assert_array_equal(parse_calibration(text, 'x.yaml').noise.rate, noise.rate)
+
+
+def test_a_file_without_bias_and_noise_is_read():
+    text = format_calibration(replace(fitted(), gyro=None, noise=None))
+    assert 'gyro_bias' not in text
+    assert '\nnoise:' not in text
+    read = parse_calibration(text, 'x.yaml')
+    assert read.gyro is None
+    assert read.noise is None
+    assert not read.warnings
+
+
+@pytest.mark.parametrize(('old', 'new', 'message'), [
+    ('  bias: [', '  bias: [2.0, 0.0, 0.0]\n  was: [', 'below 1 in magnitude'),
+    ('  bias: [', '  bias: [.nan, 0.0, 0.0]\n  was: [', 'bias contains a number that is not'),
+    ('  bias: [', '  bias: [0.0, 0.0]\n  was: [', 'bias has shape'),
+    ('  bias: [', '  bais: [', 'bias is missing'),
+    ('  sd: [', '  sd: [-0.1, 0.0, 0.0]\n  was: [', 'expected 0 or more'),
+    ('  rests: 24', '  rests: 0', 'has 0 rests, expected at least 1'),
+    ('  rests: 24', '  rests: many', 'expected a whole number'),
+    ('  slope: [', '  slope: [0.1, 0.0, 0.0]\n  was: [', 'or none and no slope'),
+    ('  temperatures: []', '  temperatures: [20.0]', 'between the lowest and the highest'),
+    ('  temperature: null', '  temperature: warm', 'temperature is .warm., expected a finite'),
+    ('  force: [', '  force: [-1.0, 0.0, 0.0]\n  was: [', 'noise of the force'),
+    ('  force: [', '  force: [.inf, 0.0, 0.0]\n  was: [', 'noise of the force'),
+    ('\nnoise:\n', '\nnoise: 3\nwas:\n', 'noise is 3, expected names with values'),
+])
+def test_a_damaged_bias_or_noise_is_refused_in_one_line(old, new, message):
+    text = format_calibration(fitted())
+    assert text.count(old) == 1
+    with pytest.raises(StoredCalibrationError, match=message) as refusal:
+        parse_calibration(text.replace(old, new), 'x.yaml')
+    assert '\n' not in str(refusal.value)
+
+
+def fit(tmp_path, poses, capsys):
+    write_table(tmp_path / 'poses.csv', replace(poses, units='g'))
+    status = main(['fit', str(tmp_path / 'poses.csv'), '--json', str(tmp_path / 'fit.json')])
+    assert status == 0
+    return json.loads((tmp_path / 'fit.json').read_text()), capsys.readouterr().out
+
+
+def test_fit_prints_the_bias_in_degrees_and_writes_it_in_radians(tmp_path, capsys):
+    result, out = fit(tmp_path, rests(16), capsys)
+    assert 'gyro bias: x +0.57' in out
+    assert '°/s (24 rests)' in out
+    np.testing.assert_allclose(result['gyro_bias'], BIAS, atol=4 * max(result['gyro_bias_sd']))
+    np.testing.assert_allclose(result['noise_force'], 0.003, rtol=0.05)
+    np.testing.assert_allclose(result['noise_rate'], [0.003, 0.002, 0.005], rtol=0.05)
+
+
+def test_fit_prints_the_slope_over_temperature(tmp_path, capsys):
+    warm = rests(17, warmth=np.linspace(20.0, 40.0, 24), slope=(2e-4, 0.0, -3e-4))
+    out = fit(tmp_path, warm, capsys)[1]
+    assert '°/s at 30.0 °C, changes by +0.01' in out
+
+
+def test_fit_of_poses_without_rates_has_null_for_the_gyro(tmp_path, capsys):
+    rng = np.random.default_rng(18)
+    columns = {'reading': simulate_poses(sensor(rng), spread_directions(24), rng).reading}
+    result, out = fit(tmp_path, Poses(columns, numbered(columns)), capsys)
+    assert 'gyro bias' not in out
+    assert [result[key] for key in ('gyro_bias', 'gyro_bias_sd', 'noise_force', 'noise_rate')] == [
+        None] * 4
