@@ -4,8 +4,11 @@
 """Outliers are found, and clean poses are kept."""
 
 from accel_calib.calibrate import fit_poses
+from accel_calib.errors import RefusedFitError
+from accel_calib.model import Model
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
+from accel_calib.table import Poses
 from accel_calib.units import units_of
 import numpy as np
 import pytest
@@ -52,3 +55,69 @@ def test_all_outliers_are_found_if_a_fifth_of_the_poses_is_knocked(count):
 def test_at_most_a_quarter_of_the_poses_is_left_out(count):
     poses = knocked(8, count, 2 * count // 5)
     assert len(left_out(poses)) <= count // 4
+
+
+def with_copies(poses, rows):
+    """Return poses followed by exact copies of these rows, 0-based."""
+    again = np.concatenate([np.arange(len(poses)), rows]).astype(int)
+    kept = ('reading', 'std', 'count', 'temperature')
+    return Poses({key: poses[key][again] for key in kept if key in poses},
+                 np.arange(1, len(again) + 1))
+
+
+def lacking(seed, count, effect):
+    """Return poses of a sensor with an effect that no model of `fit` has."""
+    rng = np.random.default_rng(seed)
+    values = {**sensor(rng).values, effect: 0.0005 * rng.normal(size=3)}
+    return simulate_poses(Model(values), spread_directions(count), rng, noise_g=1e-4,
+                          context={'temperature': rng.uniform(15.0, 45.0, count)})
+
+
+@pytest.mark.parametrize('copies', [[2], [2, 2, 2, 2, 2], [0, 3, 5, 7, 8, 10], range(12)])
+@pytest.mark.parametrize('apart', [0.0, 2e-7])
+@pytest.mark.parametrize('measured', [True, False])
+def test_copies_of_a_pose_make_no_pose_an_outlier(copies, measured, apart):
+    for seed in range(10):
+        poses = lacking(seed, 12, 'offset_temperature')
+        poses = Poses({key: poses[key] for key in ('reading', 'std', 'count')[:3 if measured
+                                                                              else 1]}, poses.row)
+        once = fit_poses(poses, G, model='10')
+        again = with_copies(poses, copies)
+        if measured:  # the noise is 1e-5 g
+            again.reading[12:] += apart * np.random.default_rng(seed).normal(
+                size=again.reading[12:].shape)
+        found = fit_poses(again, G, model='10')
+        assert {each.row for each in found.rejected if each.row <= 12} == {
+            each.row for each in once.rejected}
+        np.testing.assert_allclose(found.model.vector, once.model.vector, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6)
+        assert found.quality.held_out_rms_mg == pytest.approx(once.quality.held_out_rms_mg)
+        assert found.quality.chi2_per_dof == pytest.approx(once.quality.chi2_per_dof)
+
+
+def test_copies_of_a_pose_are_used_and_named():
+    poses = knocked(3, 18, 0)
+    found = fit_poses(with_copies(poses, [4, 4, 9]), G)
+    assert len(found.used_poses) == len(found.poses) == 21
+    assert 'equal rows count as one pose: rows 5, 19, 20; rows 10, 21' in found.warnings
+
+
+def test_copies_of_a_knocked_pose_are_left_out_with_it():
+    poses = knocked(4, 18, 1)
+    assert left_out(with_copies(poses, [0, 0, 0, 0, 0, 0])) == {1, *range(19, 25)}
+
+
+def test_readings_that_were_measured_again_are_not_copies():
+    poses = knocked(5, 18, 0)
+    again = with_copies(poses, range(18))
+    again.reading[18:] += np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
+    found = fit_poses(again, G, model='10')
+    once = fit_poses(poses, G, model='10')
+    assert not [line for line in found.warnings if 'equal' in line]
+    assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
+
+
+def test_poses_that_count_once_are_too_few_for_the_model():
+    poses = knocked(6, 8, 0)
+    with pytest.raises(RefusedFitError, match='14 poses have 8 directions'):
+        fit_poses(with_copies(poses, [0, 1, 2, 3, 4, 5]), G, model='10')

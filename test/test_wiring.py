@@ -6,7 +6,7 @@
 from itertools import permutations, product
 import json
 
-from accel_calib.calibrate import fit_poses, level
+from accel_calib.calibrate import ARBITRARY_HEADING, fit_poses, level, with_given_mounting
 from accel_calib.calibrate.checks import axes_of, fault_of
 from accel_calib.cli.main import main
 from accel_calib.errors import InputError
@@ -120,16 +120,37 @@ def levelled(up, frame='ros'):
     ((0, 1, 0.1), 'ros', 'mounted with +y up, or y and z are swapped'),
     ((-1, 0, 0), 'ned', 'mounted with -x up, or x and z are swapped')])
 def test_a_flat_pose_on_another_face_causes_a_warning(up, frame, words):
-    calibration = levelled(up, frame)
-    assert len(calibration.warnings) == 1
-    assert calibration.warnings[0].startswith('the flat pose ')
-    assert words in calibration.warnings[0]
+    warnings = [line for line in levelled(up, frame).warnings if line != ARBITRARY_HEADING]
+    assert len(warnings) == 1
+    assert warnings[0].startswith('the flat pose ')
+    assert words in warnings[0]
 
 
 @pytest.mark.parametrize(('up', 'frame'), [((0, 0, 1), 'ros'), ((0.5, -0.3, 1), 'ned'),
                                            ((0.1, 0, -1), 'win8')])
 def test_an_expected_flat_pose_causes_no_warning(up, frame):
     assert not levelled(up, frame).warnings
+
+
+@pytest.mark.parametrize(('up', 'frame', 'arbitrary'), [
+    ((1, 0, 0), 'ros', True), ((-1, 0.1, 0.1), 'ned', True), ((1, 0.3, 0), 'ros', False),
+    ((0, 1, 0), 'win8', True), ((0, 1, 0), 'ros', False), ((1, 0, 0), 'win8', False)])
+def test_a_heading_near_its_singular_direction_is_called_arbitrary(up, frame, arbitrary):
+    calibration = levelled(up, frame)
+    assert (ARBITRARY_HEADING in calibration.warnings) is arbitrary
+    again = level(calibration, calibration.predict(np.array([up]) / np.linalg.norm(up))[0], frame)
+    assert ARBITRARY_HEADING not in again.warnings  # the heading of before is kept
+    given = rotation_from_rpy(0.1, 0.2, 0.3)
+    assert ARBITRARY_HEADING not in with_given_mounting(calibration, given).warnings
+
+
+def test_a_given_mounting_keeps_a_measured_tilt_within_10_degrees():
+    given = rotation_from_rpy(0.0, 0.0, 2.0).T
+    for tilt, kept in ((0.1, True), (0.3, False)):
+        up = given @ rotation_from_rpy(tilt, 0.0, 0.0) @ np.array([0.0, 0.0, 1.0])
+        found = with_given_mounting(levelled(up), given).rotation
+        np.testing.assert_allclose(found[:, 2], up if kept else given[:, 2], atol=1e-9)
+        np.testing.assert_allclose(found[:, 0], given[:, 0], atol=0.02)
 
 
 def test_levelling_again_removes_the_warning():

@@ -4,14 +4,16 @@
 """
 From poses to a calibration.
 
-`fit` is the entry point; it calls `unknown_orientation` or `known_orientation`. `pose_planning`
-explains what poses do not determine and plans the next pose. `mounting` computes the mounting.
-`checks` detects wrong units and wiring faults, and `gate` rejects implausible results.
-`calibration` is the record, and `quality` computes its figures.
+`fit` is the entry point; it calls `unknown_orientation` or `known_orientation`. `partial` is for a
+sensor that cannot be turned over. `pose_planning` explains what poses do not determine and plans
+the next pose. `mounting` computes the mounting. `checks` detects wrong units and wiring faults,
+and `gate` rejects implausible results. `calibration` is the record, `quality` computes its
+figures, and `rest_noise` those of the gyro and of the samples.
 
 """
 
 from .calibration import (
+    ARBITRARY_HEADING,
     Calibration,
     check_sensor,
     EDITED,
@@ -20,16 +22,28 @@ from .calibration import (
     Quality,
     Rejected,
     set_heading,
+    with_given_mounting,
 )
 from .checks import check_units, FLAT
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .gate import gated
 from .mounting import FrameName, FRAMES
-from .pose_planning import next_pose, NextPose, Outlook, outlook
+from .partial import carried_words, fit_partial, mounting_only
+from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
 from .quality import in_g, Verification, verify
-from .unknown_orientation import directions_of, Method, METHODS
+from .rest_noise import (
+    gyro_bias_of,
+    GyroBias,
+    sample_noise_of,
+    SampleNoise,
+    with_rest_noise,
+)
+from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
 
-__all__ = ['EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'Calibration', 'FrameName',
-           'Method', 'NextPose', 'Outlook', 'Quality', 'Rejected', 'Verification', 'check_sensor',
-           'check_units', 'directions_of', 'fit_poses', 'gated', 'in_g', 'level', 'level_by_rows',
-           'next_pose', 'of_samples', 'outlook', 'set_heading', 'verify']
+__all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR',
+           'STORED_METHODS', 'Calibration', 'FrameName', 'GyroBias', 'Method', 'NextPose',
+           'Outlook', 'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words',
+           'check_sensor', 'check_units', 'directions_of', 'fit_partial', 'fit_poses', 'gated',
+           'gyro_bias_of', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_only',
+           'next_pose', 'of_samples', 'outlook', 'sample_noise_of', 'set_heading', 'verify',
+           'with_given_mounting', 'with_rest_noise']

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import FLAT, flat_warnings
-from .mounting import FrameName, mounting, with_heading, with_heading_of
+from .mounting import (
+    FrameName,
+    heading_is_arbitrary,
+    mounting,
+    with_heading,
+    with_heading_of,
+)
+from .rest_noise import GyroBias, SampleNoise
 from ..effects import AXES, Context
 from ..errors import StoredCalibrationError
 from ..html_table import table
@@ -25,6 +32,16 @@ from ..units import Units
 
 EDITED = 'the file was edited by hand since it was stored'
 """Warning of a calibration whose file does not match its checksum."""
+
+_SAME_TILT = np.cos(np.radians(10.0))
+
+_HEADING = 'the heading of the mounting'
+
+ARBITRARY_HEADING = (
+    f'{_HEADING} is arbitrary, because an axis of the sensor that defines it is within 10° of the '
+    'vertical: take a second pose with the nose of the robot down (~/set_heading or --nose-down), '
+    'or give the mounting (mounting_rpy or base_frame)')
+"""Warning of a levelled calibration without a known heading near the singular direction."""
 
 HELD = ('time', 'temperature', 'supply_voltage')
 """Context that is limited to the range of the poses; effects are not extrapolated."""
@@ -84,7 +101,7 @@ class Calibration:
     name : str
         Name of the fitted model: 4, 7, 9, 10, 12 or ``ideal``.
     method : str
-        ``ml`` or ``algebraic``.
+        ``ml``, ``algebraic``, or ``prior`` (`accel_calib.calibrate.partial`).
     model : Model
         The effects with their values, and ΔR.
     units : Units
@@ -109,6 +126,10 @@ class Calibration:
         Warnings for the user.
     stream : str
         Topic of the messages, with namespace; empty for recordings.
+    gyro : GyroBias or None
+        Bias of the gyro over the poses used; None if it is not known.
+    noise : SampleNoise or None
+        White noise of a sample over the poses used; None if it is not known.
 
     """
 
@@ -126,6 +147,8 @@ class Calibration:
     reason: str
     warnings: tuple[str, ...]
     stream: str = ''
+    gyro: GyroBias | None = None
+    noise: SampleNoise | None = None
 
     def __post_init__(self) -> None:
         size = len(self.model.vector)
@@ -189,6 +212,11 @@ class Calibration:
     def is_levelled(self) -> bool:
         """Whether ΔR is known."""
         return not np.array_equal(self.rotation, np.eye(3))
+
+    @property
+    def in_sensor_frame(self) -> Calibration:
+        """The same calibration without the mounting: offset, gain and the other effects."""
+        return replace(self, model=Model(self.model.values)) if self.is_levelled else self
 
     @property
     def offset_sd(self) -> Floats:
@@ -392,11 +420,15 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
-    if calibration.is_levelled and frame == calibration.frame:
+    kept = calibration.is_levelled and frame == calibration.frame
+    arbitrary = not kept and heading_is_arbitrary(rotation, frame)
+    if kept:
         rotation = with_heading_of(calibration.rotation, rotation)
-    others = [warning for warning in calibration.warnings if not warning.startswith(FLAT)]
+    others = [warning for warning in calibration.warnings
+              if not warning.startswith((FLAT, _HEADING))]
     return replace(calibration, model=Model(calibration.model.values, rotation), frame=frame,
-                   warnings=(*others, *flat_warnings(rotation, frame)))
+                   warnings=(*others, *flat_warnings(rotation, frame),
+                             *((ARBITRARY_HEADING,) if arbitrary else ())))
 
 
 def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
@@ -426,7 +458,33 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
     """
     nose_down = _in_sensor_axes(calibration, reading, context)
     rotation = with_heading(calibration.rotation, nose_down, calibration.frame)
-    return replace(calibration, model=Model(calibration.model.values, rotation))
+    return with_mounting(calibration, rotation)
+
+
+def with_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
+    """Return a calibration with another ΔR, whose heading is known."""
+    return replace(calibration, model=Model(calibration.model.values, rotation), warnings=tuple(
+        line for line in calibration.warnings if not line.startswith(_HEADING)))
+
+
+def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
+    """
+    Return a calibration with a mounting that is known from elsewhere, such as a URDF.
+
+    A calibration that is levelled to within 10° of the given mounting keeps its tilt, which a flat
+    pose measured, and takes only the heading.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    rotation : (3, 3) array
+        The given ΔR.
+
+    """
+    if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:
+        rotation = with_heading_of(rotation, calibration.rotation)
+    return with_mounting(calibration, rotation)
 
 
 def _in_sensor_axes(calibration: Calibration, reading: Floats, context: Context | None) -> Floats:

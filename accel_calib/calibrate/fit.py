@@ -12,6 +12,7 @@ from .checks import check_units, wiring_warnings
 from .gate import gated, sound_rows, sure_rows
 from .known_orientation import fit_known
 from .mounting import FrameName
+from .rest_noise import with_rest_noise
 from .unknown_orientation import fit_unknown, Method, METHODS
 from ..errors import InputError, listed, RefusedFitError
 from ..table import Floats, Poses
@@ -63,10 +64,10 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
                               'algebraic uses every row', 'remove the row, or use the method ml')
     calibration, rejected = _without_doubtful(sound, rejected, units, model, method)
     left_out = sorted((*rejected, *calibration.rejected), key=lambda each: each.row)
-    return gated(replace(
+    return with_rest_noise(gated(replace(
         calibration, sensor=sensor or poses.sensor, date=date,
         poses=_all_poses(poses, calibration.poses), rejected=tuple(left_out),
-        warnings=(*wiring_warnings(calibration), *calibration.warnings)))
+        warnings=(*wiring_warnings(calibration), *calibration.warnings))), poses)
 
 
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,

@@ -9,6 +9,10 @@ A fit has already converged (`accel_calib.estimate.fit`), and its poses determin
 valid covariance, plausible offset, gain and effects, and a useful uncertainty. The limits are far
 beyond the values of working sensors; only useless calibrations exceed them.
 
+A calibration without effects, such as a mounting alone, has no residual of a fit to check. The
+uncertainty of a partial fit (`.partial`) is limited by that of common sensors, and its warning
+states it. It has no other limit.
+
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from .calibration import Calibration, Rejected
+from .unknown_orientation import PRIOR
 from ..effects import LADDER
 from ..errors import RefusedFitError
 from ..model import Model, times
@@ -76,7 +81,7 @@ def gated(calibration: Calibration) -> Calibration:
     _check_gain(calibration)
     _check_effects(calibration)
     residual = calibration.quality.rms_after_mg / MG
-    if residual > LARGEST_RESIDUAL_G:
+    if calibration.model.effects and residual > LARGEST_RESIDUAL_G:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
             f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
@@ -159,19 +164,41 @@ def _contribution(model: Model, used: Poses, units: Units) -> float:
 
 def uncertainty_g(calibration: Calibration) -> float:
     """Return the largest standard deviation of |force| over the sphere [g]."""
-    up, model = spread_directions(300), calibration.model
+    return float(np.max(deviations_g(calibration, spread_directions(300))))
+
+
+def deviations_g(calibration: Calibration, up: Floats) -> Floats:
+    """
+    Return the standard deviation of |force| that the calibration causes.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    up : (n, 3) array
+        Directions of up in the sensor axes, unit vectors.
+
+    Returns
+    -------
+    (n,) array
+        Standard deviations [g]; 0 if the effects need context that the calibration does not have.
+
+    """
+    model = calibration.model
     context = {key: np.full(len(up), sum(limits) / 2.0)
                for key, limits in calibration.ranges.items()}
     none = np.zeros((len(up), 3))
     known = {'std': none, 'previous': none, 'rate': none, **context}
     if any(key not in known for key in model.needs):
-        return 0.0
+        return np.zeros(len(up))
     across = times(model.at(known).inverse_slope(up).swapaxes(-1, -2), up)
     rows = model.basis(up, known).along(across)
-    return float(np.sqrt(np.max(np.sum(rows @ calibration.covariance * rows, axis=1))))
+    return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
 
 
 def _with_warning(calibration: Calibration) -> Calibration:
+    if calibration.method == PRIOR:
+        return calibration
     uncertain = uncertainty_g(calibration)
     if uncertain > LARGEST_UNCERTAINTY_G:
         raise RefusedFitError(

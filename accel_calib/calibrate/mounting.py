@@ -31,11 +31,14 @@ determines the heading (TRIAD, Black 1964).
 
 from __future__ import annotations
 
-from typing import get_args, Literal
+from collections.abc import Sequence
+import math
+from typing import Any, get_args, Literal
 
 import numpy as np
 
 from ..errors import InputError
+from ..sphere import quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats
 
 FrameName = Literal['ros', 'ned', 'android', 'win8']
@@ -46,6 +49,7 @@ _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]
 """Reading of a sensor whose nose points straight down, for each frame [g]."""
 
 _VERTICAL = 1e-9
+_DIGITS = 9
 _LEAST_HEADING_ANGLE = np.radians(10.0)
 
 
@@ -170,3 +174,59 @@ def _triad(first: Floats, second: Floats) -> Floats:
                          'tilt the nose of the robot further down')
     normal = normal / np.linalg.norm(normal)
     return np.column_stack([np.cross(normal, unit), normal, unit])
+
+
+def mounting_of(rpy: Sequence[float]) -> Floats:
+    """Return ΔR, (3, 3), from roll, pitch and yaw of the sensor on the robot [rad] (URDF)."""
+    return rotation_from_rpy(*rpy).T
+
+
+def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str, Any]:
+    """
+    Return a mounting as numbers and as the lines for the URDF and for TF.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+        ΔR.
+    sensor : str
+        frame_id of the sensor; empty: ``imu_link``.
+    base : str
+        Frame of the robot; empty: ``base_link``.
+
+    Returns
+    -------
+    dict
+        ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, ``quaternion``
+        (x, y, z, w), ``urdf`` and ``static_transform_publisher``.
+
+    """
+    roll, pitch, yaw = (round(angle, _DIGITS) + 0.0 for angle in rpy_of(rotation.T))
+    quaternion = [round(part, _DIGITS) + 0.0 for part in quaternion_of(rotation.T)]
+    return {'roll': roll, 'pitch': pitch, 'yaw': yaw, 'quaternion': quaternion,
+            'urdf': f'<origin xyz="0 0 0" rpy="{roll} {pitch} {yaw}"/>',
+            'static_transform_publisher':
+                f'ros2 run tf2_ros static_transform_publisher --roll {roll} --pitch {pitch} '
+                f'--yaw {yaw} --frame-id {base or "base_link"} --child-frame-id '
+                f'{sensor or "imu_link"}'}
+
+
+def mounting_words(rotation: Floats, sensor: str, base: str = '') -> str:
+    """Return `mounting_figures` as one line."""
+    found = mounting_figures(rotation, sensor, base)
+    angles = ', '.join(f'{name} {math.degrees(found[name]):.2f}°'
+                       for name in ('roll', 'pitch', 'yaw'))
+    quaternion = ', '.join(f'{part:.6f}' for part in found['quaternion'])
+    return (f'mounting of the sensor: {angles}; quaternion ({quaternion}); URDF {found["urdf"]}; '
+            f'or {found["static_transform_publisher"]}')
+
+
+def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
+    """
+    Return whether the heading of `mounting` depends on the noise of the flat pose.
+
+    The axis that defines the heading is then within 10° of the vertical: x, for ``win8`` y.
+
+    """
+    axis = 1 if frame == 'win8' else 0
+    return bool(np.hypot(*np.delete(rotation[:, 2], axis)) < np.sin(_LEAST_HEADING_ANGLE))

@@ -61,6 +61,9 @@ _LEAST_GAIN = 0.03
 _GOOD_DILUTION = 3.0
 """More poses are requested while the dilution is larger."""
 
+_SPARE = 3
+"""Poses beyond the fewest that determine a model, so that the fit can be checked."""
+
 _TAKEN = np.cos(np.radians(17.0))
 """An orientation within 17° of a pose counts as taken; its neighbours are 35° away."""
 
@@ -81,12 +84,18 @@ class NextPose:
     error : float
         Expected error of |force| after a fit to the poses so far, RMS over the sphere, relative
         to the noise of a pose; infinite if the poses do not determine a parameter.
+    total : int
+        Number of poses that determine the model well, if each is the one that is asked for.
+    fits : bool
+        Whether the poses so far determine the model, so that a fit is not refused.
 
     """
 
     direction: Floats | None
     words: str
     error: float
+    total: int
+    fits: bool
 
 
 @lru_cache(maxsize=8)
@@ -128,16 +137,41 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     """
     information = information_of(name, directions, relative_weights(noise, len(directions)))
     error = _error(name, information, len(directions))
+    best = _next(name, directions, information)
+    fits = determines(name, directions, noise)
+    if best is None:
+        words = _enough(len(directions), error, noise_g)
+        return NextPose(None, words, error, len(directions), fits)
+    signs = _attitudes()[best]
+    return NextPose(unit(signs[np.newaxis])[0], f'turn the sensor so that {words_of(signs)} '
+                    f'points up ({_axes(signs)})', error,
+                    _poses_in_all(name, directions, information), fits)
+
+
+def _next(name: str, directions: Floats, information: Floats) -> int | None:
+    """Return the index of the next orientation, or None if more poses no longer help."""
     best = _best(name, directions, information)
     if best is None:
-        return NextPose(None, _enough(len(directions), error, noise_g), error)
-    signs = _attitudes()[best]
-    up = unit(signs[np.newaxis])
-    after = _error(name, information + information_of(name, up, np.ones(1)), len(directions) + 1)
-    if after > (1.0 - _LEAST_GAIN) * error and not _is_poor(name, information):
-        return NextPose(None, _enough(len(directions), error, noise_g), error)
-    return NextPose(up[0], f'turn the sensor so that {words_of(signs)} points up '
-                    f'({_axes(signs)})', error)
+        return None
+    after = information + _information_at(name, best)
+    now = _error(name, information, len(directions))
+    helps = _error(name, after, len(directions) + 1) <= (1.0 - _LEAST_GAIN) * now
+    return best if helps or _is_poor(name, information) else None
+
+
+def _information_at(name: str, index: int) -> Floats:
+    return information_of(name, unit(_attitudes()[index][np.newaxis]), np.ones(1))
+
+
+def _poses_in_all(name: str, directions: Floats, information: Floats) -> int:
+    """Return the number of poses that determine a model well, if each is the one asked for."""
+    while len(directions) < poses_needed(name) + _SPARE or _is_poor(name, information):
+        best = _best(name, directions, information)
+        if best is None:
+            break
+        directions = np.vstack([directions, unit(_attitudes()[best][np.newaxis])])
+        information = information + _information_at(name, best)
+    return len(directions)
 
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
@@ -248,7 +282,8 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     Parameters
     ----------
     calibration : Calibration
-        A calibration with a linear model, as `accel_calib.calibrate.fit_poses` returns it.
+        A calibration with a linear model, as `accel_calib.calibrate.fit_poses` returns it, or one
+        of a sensor that cannot be turned over (`accel_calib.calibrate.partial`).
     asked : {'auto', '4', '7', '9', '10', '12'}
         The requested model.
 
@@ -258,13 +293,13 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
     noise = pose_noise(poses.noise, directions)
-    uncertainty = _uncertainty(calibration)
+    uncertainty = _uncertainty(calibration) if calibration.model.effects else np.nan
     planned = asked
     if asked in ('auto', '12'):  # with wrong orientations model 12 became 10
         planned = '12' if calibration.name == '12' else '10'
-    fitted = identifiability(calibration.name, directions, noise).mean_dilution
-    known = np.isfinite(uncertainty)
-    noise_g = uncertainty / fitted if known and np.isfinite(fitted) else None
+    known, noise_g = np.isfinite(uncertainty), None
+    if known and determines(calibration.name, directions, noise):
+        noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
     return Outlook(identifiability(planned, directions, noise),
                    next_pose(directions, planned, noise, noise_g=noise_g),
                    uncertainty * MG if known else None)
@@ -280,8 +315,45 @@ def _uncertainty(calibration: Calibration) -> float:
     return float(np.sqrt(np.mean(errors)))
 
 
+CONE = 30.0
+"""
+Largest angle between poses and their mean direction of a robot that cannot be turned over [°].
+
+Robots with wheels or tracks tilt by 10° to 25°. No number of poses within 30° determines model 10:
+the dilution is above 300 for 60 poses. Poses further apart come from a sensor that can be turned.
+
+"""
+
+_WIDE = 75.0
+"""Angle above which poses are no longer described as near one direction [°]."""
+
 _MOST_NAMED = 3
 """Largest number of undetermined combinations in a message."""
+
+
+@dataclass(frozen=True)
+class Cone:
+    """The mean direction of poses, a (3,) unit vector, and their largest angle from it [°]."""
+
+    axis: Floats
+    degrees: float
+
+
+def cone_of(directions: Floats) -> Cone:
+    """Return the mean of (n, 3) unit vectors, n >= 1, and their largest angle from it."""
+    axis = unit(directions.mean(axis=0)[np.newaxis])[0]
+    cosine = float(np.clip(np.min(directions @ axis), -1.0, 1.0))
+    return Cone(axis, float(np.degrees(np.arccos(cosine))))
+
+
+def lies_in_cone(directions: Floats) -> bool:
+    """
+    Return whether (n, 3) unit vectors are those of a robot that cannot be turned over.
+
+    Poses in a ring, in a plane or at right angles are further apart than `CONE`.
+
+    """
+    return bool(len(directions) and cone_of(directions).degrees <= CONE)
 
 
 def determines(name: str, directions: Floats, noise: Floats | None = None) -> bool:
@@ -318,10 +390,10 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     few = len(directions) < poses_needed(NORM_MODELS[0])
     open_ = () if few else identifiability(name, directions, noise).undetermined
     raise RefusedFitError(
-        f'{_shape(name, directions)}, expected at least {poses_needed(name)} poses spread over '
-        f'the sphere for model {name}'
+        f'{shape_words(name, directions)}, expected at least {poses_needed(name)} poses spread '
+        f'over the sphere for model {name}'
         f'{f"; not determined: {combination_words(open_)}" if open_ else ""}',
-        f'{_add(missing_poses(name, directions, noise))}, hold it still and continue{offer}')
+        f'{turn_words(missing_poses(name, directions, noise))}, hold it still and continue{offer}')
 
 
 def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tuple[str, ...]:
@@ -346,15 +418,15 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
         return ()
     open_ = identifiability(largest, directions, noise).undetermined
     return (f'the poses do not determine {combination_words(open_)}, so model {chosen} is the '
-            f'largest possible: it omits {_and(left_out(chosen, largest))}, '
+            f'largest possible: it omits {joined(left_out(chosen, largest))}, '
             f'{_commonly(chosen, largest, directions, noise)}; to determine them, '
-            f'{_add(missing_poses(largest, directions, noise))}',)
+            f'{turn_words(missing_poses(largest, directions, noise))}',)
 
 
 def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:
     """Return a text that offers a smaller model, with the effects that it omits."""
     offer = (f', or use model {smaller}, which these poses determine: it omits '
-             f'{_and(left_out(smaller, name))}')
+             f'{joined(left_out(smaller, name))}')
     if name == '12':
         return offer
     return f'{offer}, {_commonly(smaller, name, directions, noise)}'
@@ -371,38 +443,37 @@ def combination_words(open_: Sequence[Combination]) -> str:
     words = [each.words for each in open_[:_MOST_NAMED]]
     if len(open_) > _MOST_NAMED:
         words.append(f'{len(open_) - _MOST_NAMED} more')
-    return _and(words)
+    return joined(words)
 
 
-def _add(missing: Sequence[str]) -> str:
+def turn_words(missing: Sequence[str]) -> str:
     """Return how to turn the sensor for the missing poses."""
     if len(missing) <= 1:
         return f'turn the sensor so that {"".join(missing) or "another side"} points up'
-    return f'turn the sensor so that in turn {_and(missing)} point up'
+    return f'turn the sensor so that in turn {joined(missing)} point up'
 
 
-def _and(words: Sequence[str]) -> str:
+def joined(words: Sequence[str]) -> str:
     """Join words by commas and 'and'."""
     return ' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))
 
 
-def _shape(name: str, directions: Floats) -> str:
+def shape_words(name: str, directions: Floats) -> str:
     """Return a text about what is wrong with these directions."""
     count = len(directions)
     if count < 2:
         return counted(count, 'pose')
-    mean = directions.mean(axis=0)
-    unit = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    cone = np.degrees(np.arccos(np.clip(np.min(directions @ unit), -1.0, 1.0)))
     if distinct(directions) == 1:
         return f'the {count} poses all have the same orientation'
     if count < poses_needed(name):
         return f'{count} poses'
     if determines(name, directions):
         return f'some of the {count} poses are too noisy'
-    if cone < 75.0:
-        return f'the {count} poses lie within {cone:.0f}° of one direction'
-    if np.linalg.svd(directions - mean, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
+    cone = cone_of(directions)
+    if cone.degrees < _WIDE:
+        return f'the {count} poses lie within {cone.degrees:.0f}° of one direction'
+    centred = directions - directions.mean(axis=0)
+    if np.linalg.svd(centred, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
         return f'the {count} poses lie in a plane'
     return (f'the {count} poses have {distinct(directions)} directions that leave a region of '
             'the sphere uncovered')

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from .calibration import Calibration, Rejected
 from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_warnings, in_g, quality_of
-from ..errors import RefusedFitError
+from ..errors import listed, RefusedFitError
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
 from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Point, solve
 from ..estimate.geometry import (
@@ -38,7 +38,7 @@ from ..estimate.geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
-from ..estimate.outliers import fit_norm, start_of
+from ..estimate.outliers import fit_norm, originals, start_of
 from ..model import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..sphere import unit
 from ..table import Floats, Poses
@@ -47,7 +47,16 @@ from ..units import MG, Units
 Method = Literal['ml', 'algebraic']
 METHODS = get_args(Method)
 
+PRIOR = 'prior'
+"""Method of a calibration whose values are partly those of a common sensor; see `.partial`."""
+
+STORED_METHODS = (*METHODS, PRIOR)
+"""Methods of stored calibrations; the user selects one of `METHODS`."""
+
 _LEVEL = 0.03
+
+_MOST_NAMED = 3
+"""Largest number of groups of equal rows in a warning."""
 
 
 def directions_of(poses: Poses, units: Units) -> Floats:
@@ -87,9 +96,11 @@ class NormFit:
     fit : Fit
         Fit to the poses kept.
     kept : (k,) array of int
-        Indices of the poses kept.
+        Indices of the poses kept, without copies.
+    left_out : (d,) array of int
+        Indices of the outliers, with their copies.
     directions : (k, 3) array
-        Their approximate directions of up.
+        Approximate directions of up of the poses kept.
     warnings : tuple of str
         Warnings for the user.
 
@@ -99,6 +110,7 @@ class NormFit:
     reason: str
     fit: Fit
     kept: NDArray[np.intp]
+    left_out: NDArray[np.intp]
     directions: Floats
     warnings: tuple[str, ...]
 
@@ -154,29 +166,52 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
         If the poses do not determine the model.
 
     """
-    poses_g = _only_norm(poses_g)
-    noise = pose_noise(poses_g.noise, directions)
-    dilutions = _dilutions(model, directions, noise)
-    kept = np.arange(len(poses_g))
+    poses_g = only_norm(poses_g)
+    dilutions = _dilutions(model, directions, pose_noise(poses_g.noise, directions))
+    original = originals(poses_g) if method == 'ml' else np.arange(len(poses_g))
+    kept = np.unique(original)
     fits: dict[str, Fit] = {}
     if method == 'ml':
         largest = list(dilutions)[-1]
-        fit, kept = _fit_norm(largest, poses_g)
-        fits[largest] = fit
-    left, directions = poses_g.take(kept), directions[kept]
+        fits[largest], among = _fit_norm(largest, poses_g.take(kept))
+        kept = kept[among]
+    left, used = poses_g.take(kept), directions[kept]
+    noise = pose_noise(left.noise, used)
     if len(kept) < len(poses_g):
-        noise = pose_noise(left.noise, directions)
-        dilutions = _dilutions(model, directions, noise)
+        dilutions = _dilutions(model, used, noise)
     fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
     name, reason = ((model, f'model {model} was requested') if model != 'auto'
                     else _choose(fits))
-    warnings = fit_warnings(fits[name], dilutions[name])
+    warnings = (*copy_warning(original, poses_g), *fit_warnings(fits[name], dilutions[name]))
     if model == 'auto':
-        warnings = (*warnings, *unseen(list(dilutions)[-1], directions, noise))
-    return NormFit(name, reason, fits[name], kept, directions, warnings)
+        warnings = (*warnings, *unseen(list(dilutions)[-1], used, noise))
+    return NormFit(name, reason, fits[name], kept, np.flatnonzero(~np.isin(original, kept)), used,
+                   warnings)
 
 
-def _only_norm(poses_g: Poses) -> Poses:
+def copy_warning(original: NDArray[np.intp], poses: Poses) -> tuple[str, ...]:
+    """
+    Return a warning about the rows that count as one pose, or none.
+
+    Parameters
+    ----------
+    original : (n,) array of int
+        As `accel_calib.estimate.outliers.originals` returns it.
+    poses : Poses
+        The poses, with their rows.
+
+    """
+    first, count = np.unique(original, return_counts=True)
+    groups = [listed('row', poses.row[original == each].tolist())
+              for each in first[count > 1][:_MOST_NAMED]]
+    if not groups:
+        return ()
+    more = int(np.sum(count > 1)) - len(groups)
+    return (f'equal rows count as one pose: {"; ".join(groups)}'
+            f'{f"; and {more} more" if more else ""}',)
+
+
+def only_norm(poses_g: Poses) -> Poses:
     """Return the poses with the columns that a fit by |force| = 1 g uses."""
     kept = ('reading', 'std', 'count')
     return Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
@@ -280,11 +315,14 @@ def _by_chance(small: Fit, large: Fit) -> float:
 
 def _rejections(poses_g: Poses, found: NormFit) -> tuple[Rejected, ...]:
     """Return the outliers, with their distance from 1 g in the fit of the other poses."""
-    out = np.setdiff1d(np.arange(len(poses_g)), found.kept)
-    if len(out) == 0:
+    return rejected_by(found.fit.model, poses_g.take(found.left_out))
+
+
+def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
+    """Return outliers with their distance from 1 g under a model."""
+    if not len(poses_g):
         return ()
-    left = poses_g.take(out)
-    away = np.linalg.norm(sensor_force(found.fit.model, left.reading, {}), axis=1) - 1.0
+    away = np.linalg.norm(sensor_force(model, poses_g.reading, {}), axis=1) - 1.0
     return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
                           'in the fit of the others')
-                 for row, error in zip(left.row, away, strict=True))
+                 for row, error in zip(poses_g.row, away, strict=True))

@@ -41,6 +41,16 @@ is lower triangular. The angles need not be small.
 then rotated (`lower_triangular`). `TIES` maps its nine parameters to the twelve values of the
 model.
 
+**Step.** A step of model 10 along the quadrics through the readings.
+
+With A = W⁻², b = A V and k = VᵀA V, |W⁻¹ (reading - V)| = 1 is
+
+    readingᵀ A' reading - 2 b'ᵀ reading = 1,   A' = A / (1 - k),  b' = b / (1 - k)
+
+which is linear in A' and b'. In V and W it is not. Precise poses that do not determine all values
+leave a thin curved sheet of them, on which a straight step is only short. A step that is straight
+in A' and b' stays on the sheet.
+
 """
 
 from __future__ import annotations
@@ -52,7 +62,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import counted, RefusedFitError
-from ..model import MODELS, parameter_names
+from ..model import MODELS, parameter_names, with_linear_part, with_vector
 from ..table import Floats
 
 _RIDGE = 1e-12
@@ -217,6 +227,46 @@ def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
         gain = np.sqrt(field_squared / values)  # the middle value is positive: NaN where B² is not
         mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
         return mat_w, (vectors @ along[..., np.newaxis])[..., 0]
+
+
+def along_quadrics(values: Floats, step: Floats) -> Floats:
+    """
+    Return the values of model 10 after a step that is straight in A' and b'.
+
+    Parameters
+    ----------
+    values, step : (9,) array
+        Values of model 10, and the step to first order.
+
+    Returns
+    -------
+    (9,) array
+        The values after the step; NaN where the quadric is no ellipsoid.
+
+    """
+    with np.errstate(all='ignore'):
+        try:
+            mat_w, vec_v = _stepped(values, step)
+        except np.linalg.LinAlgError:
+            return np.full(len(values), np.nan)
+    return with_linear_part((mat_w + mat_w.T) / 2.0, vec_v).vector[:len(values)]
+
+
+def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
+    """Return W and V after a step; arguments as in `along_quadrics`."""
+    mat_w, vec_v = with_vector(MODELS['10'], values).linear_part
+    turned, step_v = with_vector(MODELS['10'], step).linear_part
+    step_w = turned - _IDENTITY
+    mat_a = np.linalg.inv(mat_w @ mat_w)
+    step_a = -mat_a @ (step_w @ mat_w + mat_w @ step_w) @ mat_a
+    vec_b, step_b = mat_a @ vec_v, step_a @ vec_v + mat_a @ step_v
+    left = 1.0 - vec_v @ vec_b
+    change = (step_v @ vec_b + vec_v @ step_b) / left
+    mat_a = (mat_a * (1.0 + change) + step_a) / left
+    vec_b = (vec_b * (1.0 + change) + step_b) / left
+    centre = np.linalg.solve(mat_a, vec_b)
+    squared, axes = np.linalg.eigh(mat_a / (1.0 + centre @ vec_b))
+    return (axes / np.sqrt(squared)) @ axes.T, centre
 
 
 _FACE_COSINE = np.cos(np.radians(20.0))

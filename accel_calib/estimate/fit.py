@@ -12,6 +12,14 @@ The bounds of each parameter limit its contribution to a reading to `Effect.plau
 shape constant stays near the values that the search tries. The effects of V and W have no bounds
 here: native readings can have any offset, and known orientations any rotation.
 
+**Prior.** Poses that do not determine all values are fitted with the spread of common sensors.
+
+Each value then has an additional row, 0 = value / spread, in units of the noise (maximum a
+posteriori). The rows are part of the cost and of JᵀJ, but not of the residuals of the poses: chi²
+and the degrees of freedom are those of the poses. The number of values that the poses determine is
+the sum of their leverages. The covariance is the posterior covariance, and includes the prior.
+The variance factor of the noise is given, because it determines the weight of the prior.
+
 **Solver.** Damped least squares (Levenberg 1944, Marquardt 1963) within bounds.
 
 `scipy.optimize.least_squares` solves the same problem. For a dozen poses it takes several times as
@@ -29,6 +37,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, noise_of, variance_factor
 from ..effects import CHANGES, effect_named, LADDER
 from ..errors import RefusedFitError
@@ -37,7 +46,7 @@ from ..sphere import unit
 from ..table import Floats, Poses
 
 _MOST_STEPS = 60
-_FIRST_DAMPING = 1e-3
+_FIRST_DAMPING = 1e3   # relative to the smallest determined square
 _LARGEST_DAMPING = 1e9
 
 _NEAR = 1e-12
@@ -50,7 +59,9 @@ _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
 
 _SINGULAR_STEP = 1e-6
-"""Relative square of a singular value below which the residuals do not determine a combination."""
+_SINGULAR_WITH_PRIOR = 1e-12
+"""Relative square of a singular value below which the residuals do not determine a combination; a
+prior determines all of them."""
 
 
 class NotConvergedError(RefusedFitError):
@@ -67,6 +78,7 @@ class Point(NamedTuple):
     residual: Floats
     columns: Floats
     source: Any = None
+    singular: float = _SINGULAR_STEP
 
     @property
     def cost(self) -> float:
@@ -79,8 +91,8 @@ NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
 """A point without a prediction; its cost is infinite."""
 
 
-def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats
-          ) -> tuple[Floats, Point]:
+def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
+          move: Callable[[Floats, Floats], Floats] = np.add) -> tuple[Floats, Point]:
     """
     Compute the values that minimise the sum of squared residuals.
 
@@ -92,6 +104,8 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         Start values.
     lower, upper : (q,) array
         Bounds of the values.
+    move : callable
+        Values and step to first order -> values after the step; by default their sum.
 
     Returns
     -------
@@ -106,6 +120,7 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     """
     values = np.clip(start, lower, upper)
     now, damping = point_at(values), 0.0
+    first = _FIRST_DAMPING * now.singular
     if not np.isfinite(now.cost):
         raise NotConvergedError
     for _ in range(_MOST_STEPS):
@@ -114,13 +129,13 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
             break
         step = full if damping == 0.0 else _step(now, free, damping)[0]
-        tried_at = np.clip(values + step, lower, upper)
+        tried_at = np.clip(move(values, step), lower, upper)
         tried = point_at(tried_at)
         if tried.cost < now.cost:
             values, now, damping = tried_at, tried, damping / 10.0
-            damping = 0.0 if damping < _FIRST_DAMPING else damping
+            damping = 0.0 if damping < first else damping
         else:
-            damping = max(10.0 * damping, _FIRST_DAMPING)
+            damping = max(10.0 * damping, first)
     _, fall = _step(now, _free(values, now, lower, upper), 0.0)
     spare = max(len(now.residual) - len(values), 1)
     if not fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING:
@@ -148,7 +163,7 @@ def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, 
     columns = columns / size
     scales, axes = np.linalg.eigh(columns.T @ columns)
     downhill = axes.T @ (columns.T @ now.residual)
-    determined = scales > _SINGULAR_STEP * scales[-1]
+    determined = scales > now.singular * scales[-1]
     along = np.where(determined, downhill, 0.0) / (np.where(determined, scales, 1.0) + damping)
     return axes @ along / size, float(along @ downhill)
 
@@ -161,6 +176,9 @@ _OPEN = 1e-3
 
 _SMALLEST = 1e-12
 """A parameter with a smaller contribution has no bound [1/g]."""
+
+_WHOLE = 1e-6
+"""Rounding error of a sum of leverages."""
 
 _SHAPE_ROOM = 5.0
 """Factor by which a fitted shape constant may exceed the range that the search tries."""
@@ -179,18 +197,30 @@ class ByPose:
         Derivative of the prediction, padded with 0.
     rows : (n,) array of int
         Number of equations of each pose.
+    prior : Point or None
+        Residuals and columns of the prior; None without a prior.
 
     """
 
     residual: Floats
     columns: Floats
     rows: NDArray[np.int64]
+    prior: Point | None = None
 
     @cached_property
     def spread(self) -> Floats:
         """(q, q) array, (JᵀJ)⁻¹."""
         flat = self.flat
-        return np.linalg.pinv(flat.T @ flat, hermitian=True)
+        normal = flat.T @ flat
+        if self.prior is not None:
+            normal = normal + self.prior.columns.T @ self.prior.columns
+        return np.linalg.pinv(normal, hermitian=True)
+
+    @property
+    def downhill(self) -> Floats:
+        """(q,) array, Jᵀ times the residuals; zero at the solution."""
+        along = self.flat.T @ self.residual.ravel()
+        return along if self.prior is None else along + self.prior.columns.T @ self.prior.residual
 
     @property
     def flat(self) -> Floats:
@@ -222,6 +252,10 @@ class Fit:
         Maps the free values to ``model.vector``.
     at_bound : bool
         Whether a value is at a bound.
+    prior : Point or None
+        Residuals and columns of the prior, in units of the noise; None without a prior.
+    factor : float or None
+        Known variance factor; None: from the residuals.
 
     """
 
@@ -231,6 +265,8 @@ class Fit:
     columns: Floats
     ties: Floats
     at_bound: bool = False
+    prior: Point | None = None
+    factor: float | None = None
 
     @cached_property
     def residual(self) -> Floats:
@@ -244,8 +280,11 @@ class Fit:
 
     @property
     def dof(self) -> int:
-        """Return the number of independent equations minus that of free values."""
-        return self.equations.count - self.columns.shape[1]
+        """Return the number of independent equations minus that of free, determined values."""
+        if self.prior is None:
+            return self.equations.count - self.columns.shape[1]
+        determined = float(np.sum((self.columns @ self.by_pose.spread) * self.columns))
+        return int(self.equations.count - determined + _WHOLE)
 
     @cached_property
     def chi2(self) -> float:
@@ -270,14 +309,14 @@ class Fit:
         if len(pose) == count:
             order = np.argsort(pose)
             return ByPose(self.residual[order][:, np.newaxis],
-                          self.columns[order][:, np.newaxis], rows)
+                          self.columns[order][:, np.newaxis], rows, self.prior)
         order = np.argsort(pose, kind='stable')
         slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
         residual = np.zeros((count, int(rows.max())))
         columns = np.zeros((*residual.shape, self.columns.shape[1]))
         residual[pose[order], slot] = self.residual[order]
         columns[pose[order], slot] = self.columns[order]
-        return ByPose(residual, columns, rows)
+        return ByPose(residual, columns, rows, self.prior)
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
@@ -295,11 +334,21 @@ class Fit:
     @cached_property
     def covariance(self) -> Floats:
         """(p, p) array, covariance of ``model.vector`` [g²]; 0 for values that are not fitted."""
-        size = np.linalg.norm(self.columns, axis=0)
+        columns = self.columns
+        if self.prior is not None:
+            columns = np.vstack([columns, self.prior.columns])
+        size = np.linalg.norm(columns, axis=0)
         size[size == 0.0] = 1.0
-        factor = self.ties @ (np.linalg.pinv(self.columns / size) / size[:, np.newaxis])
+        factor = self.ties @ (np.linalg.pinv(columns / size) / size[:, np.newaxis])
         spread: Floats = factor @ factor.T
-        return spread * variance_factor(self.chi2, self.dof, self.noise_known)
+        return spread * self.variance_factor
+
+    @property
+    def variance_factor(self) -> float:
+        """Ratio of the stated variance to the variance predicted by the noise."""
+        if self.factor is not None:
+            return self.factor
+        return variance_factor(self.chi2, self.dof, self.noise_known)
 
 
 def free_of(effects: tuple[str, ...]) -> Floats:
@@ -320,7 +369,8 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
 
 
-def estimate(start: Model, poses_g: Poses) -> Fit:
+def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
+             factor: float | None = None) -> Fit:
     """
     Fit a model.
 
@@ -330,6 +380,12 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
         Effects with their start values, ΔR = I.
     poses_g : Poses
         Poses in g, of known, shared or unknown orientation, with the context of the effects.
+    prior : (q,) array, optional
+        Standard deviation of each fitted value over common sensors, whose mean is zero. The
+        effects are then those of model 10. By default there is no prior.
+    factor : float, optional
+        Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
+        that of the residuals in the covariance.
 
     Returns
     -------
@@ -344,6 +400,7 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
     """
     fitted, noise = fitted_values(start.effects), noise_of(poses_g)
     vector = start.vector.copy()
+    weight = None if prior is None else np.sqrt(1.0 if factor is None else factor) / prior
 
     def model_at(values: Floats) -> Model:
         vector[fitted] = values
@@ -354,7 +411,8 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
         with np.errstate(all='ignore'):
             try:
                 near = equations(model, poses_g, noise)
-                return Point(near.residual, near.columns(model)[:, fitted], near)
+                return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
+                                   values, weight)
             except np.linalg.LinAlgError:
                 return NOWHERE
 
@@ -362,10 +420,21 @@ def estimate(start: Model, poses_g: Poses) -> Fit:
         return judge(start, poses_g)
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
-    values, found = solve(point_at, start.vector[fitted], lower, upper)
+    values, found = solve(point_at, start.vector[fitted], lower, upper,
+                          np.add if prior is None else along_quadrics)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
-    return Fit(model_at(values), poses_g, found.source, found.columns,
-               free_of(start.effects), at_bound)
+    count = len(found.source.residual)
+    own = None if prior is None else Point(found.residual[count:], found.columns[count:])
+    return Fit(model_at(values), poses_g, found.source, found.columns[:count],
+               free_of(start.effects), at_bound, own, factor)
+
+
+def _with_prior(point: Point, values: Floats, weight: Floats | None) -> Point:
+    """Return a point with the rows of the prior at these values after those of the poses."""
+    if weight is None:
+        return point
+    return Point(np.concatenate([point.residual, -values * weight]),
+                 np.vstack([point.columns, np.diag(weight)]), point.source, _SINGULAR_WITH_PRIOR)
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:

@@ -21,12 +21,19 @@ is suspicious, subsets are therefore fitted in closed form. The subset with the 
 squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
 agrees with it.
 
+**Copies.** Rows of a table that are one measurement, entered several times.
+
+Copies agree with each other far better than their noise allows. Counted as separate poses, they
+would make the noise seem smaller than it is, and the other poses would look like outliers. They
+count as one pose. Two rests in the same orientation are no copies: by chance, only one pair in
+5000 differs by less than `_ALIKE` of the noise on all axes.
+
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from math import comb
 
 import numpy as np
@@ -47,6 +54,19 @@ LARGEST_SHARE = 0.25
 _LEAST_OWN = 1e-6
 """1 - leverage below this: this pose alone determines a parameter, and cannot be tested."""
 
+_ALIKE = 0.1
+"""Largest difference between the readings of copies, relative to the noise of a pose. Differences
+up to half of it always count as none."""
+
+_EQUAL_G = 1e-7
+"""The same if the noise is not known [g]."""
+
+_DECIMALS = 7
+"""Number of decimals in which the context of copies is equal."""
+
+_OF_READING = ('reading', 'std', 'count', 'label')
+"""Columns that are not context."""
+
 _MANY = 200
 
 _MEDIAN_OF_CHI2 = {1: 0.454936, 3: 2.365974}
@@ -57,6 +77,36 @@ _DOUBT_BELOW = 0.01
 
 _DOUBTED = 1.0
 """Degrees of freedom that contradicted noise counts as."""
+
+
+def originals(poses_g: Poses) -> NDArray[np.intp]:
+    """
+    Find the copies among poses.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        Poses in g. Context, such as the temperature, is compared, too.
+
+    Returns
+    -------
+    (n,) array of int
+        Index of the first pose that each pose is equal to; its own index if it is not a copy.
+
+    """
+    found, noise = np.arange(len(poses_g)), noise_of(poses_g)
+    cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
+    place = poses_g.reading / cell
+    if np.all(np.diff(np.sort(place[:, 0])) > 1.0):
+        return found
+    context = [values.round(_DECIMALS) for key, values in poses_g.columns.items()
+               if key not in _OF_READING]
+    # Two readings half a cell apart are in the same cell of at least one of these grids.
+    for shift in product((0.0, 0.5), repeat=3):
+        rows = np.column_stack([np.floor(place + shift), *context])
+        _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        found = np.minimum(found, first[which.ravel()])
+    return found[found]
 
 
 @dataclass(frozen=True)
@@ -161,8 +211,7 @@ def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
     """Remove the most extreme pose repeatedly, and update the fit to first order."""
     spread = data.spread
     flat = data.flat
-    residual = data.residual - (flat @ (spread @ (flat.T @ data.residual.ravel()))).reshape(
-        data.residual.shape)
+    residual = data.residual - (flat @ (spread @ data.downhill)).reshape(data.residual.shape)
     own, left = data.own(spread), np.ones(len(residual), bool)
     poses, sizes = [], []
     rss = [float(np.sum(residual ** 2))]

@@ -3,6 +3,7 @@
 
 """Files of pose tables, recordings and calibrations, with one reader and one writer each."""
 
+from .atomic import copy_atomically, remove_leftovers
 from .bag import is_bag
 from .bag_correction import correct_bag, Progress
 from .calibration_yaml import read_calibration, write_calibration
@@ -15,6 +16,6 @@ from .tables import (
            write_table,
 )
 
-__all__ = ['OpenRecording', 'Progress', 'correct_bag', 'is_bag', 'open_recording',
-           'read_calibration', 'read_poses', 'read_recording', 'read_samples',
-           'write_calibration', 'write_table']
+__all__ = ['OpenRecording', 'Progress', 'copy_atomically', 'correct_bag', 'is_bag',
+           'open_recording', 'read_calibration', 'read_poses', 'read_recording', 'read_samples',
+           'remove_leftovers', 'write_calibration', 'write_table']

@@ -6,10 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import glob
 import os
 from pathlib import Path
 import shutil
 from typing import TextIO
+
+_SUFFIX = '.tmp'
 
 
 def previous(path: Path) -> Path:
@@ -37,25 +40,40 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
         If the folder is missing or cannot be written. The file is then unchanged.
 
     """
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    temporary = _temporary(path)
     try:
         with temporary.open('w', encoding='utf-8', newline='') as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
         if keep_before and path.exists():
-            _keep(path)
+            copy_atomically(path, previous(path))
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
     _flush_folder(path.parent)
 
 
-def _keep(path: Path) -> None:
-    """Copy the file to the name of the previous file, completely or not at all."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.before')
-    shutil.copy2(path, temporary)
-    temporary.replace(previous(path))
+def copy_atomically(path: Path, target: Path) -> None:
+    """Copy a file within its folder, completely or not at all; raise OSError if it fails."""
+    temporary = _temporary(target)
+    try:
+        shutil.copy2(path, temporary)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(path: Path) -> list[Path]:
+    """Remove temporary files that killed processes left beside a file; return their paths."""
+    found = sorted(path.parent.glob(f'.{glob.escape(path.name)}.*{_SUFFIX}'))
+    for each in found:
+        each.unlink(missing_ok=True)
+    return found
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f'.{path.name}.{os.getpid()}{_SUFFIX}')
 
 
 def _flush_folder(folder: Path) -> None:

@@ -28,8 +28,15 @@ from .bag import (
 )
 from ..calibrate import Calibration, check_sensor
 from ..errors import InputError
-from ..messages.correction import corrected
-from ..messages.layout import doubles_at, IMU_DOUBLES, Messages, put_doubles, samples_of
+from ..messages.correction import corrected, output_frame
+from ..messages.layout import (
+    doubles_at,
+    IMU_DOUBLES,
+    Messages,
+    put_doubles,
+    renamed,
+    samples_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,6 +118,7 @@ class _Correction:
 
     def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str) -> None:
         self._calibration, self._bag, self._sensor = calibration, bag, sensor
+        self._frame_id = output_frame(calibration, sensor)
         needed = 'temperature' in calibration.model.needs and bag.topics(TEMPERATURE)
         self._track = temperature_track(bag) if needed else None
         self.topic, self.done = topic, 0
@@ -125,7 +133,7 @@ class _Correction:
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         put_doubles(messages, corrected(self._calibration, doubles, context))
         self.done += len(messages)
-        return messages
+        return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 
 
 def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: Progress) -> int:

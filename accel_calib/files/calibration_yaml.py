@@ -29,12 +29,15 @@ from ..calibrate import (
     EDITED,
     FRAMES,
     gated,
+    GyroBias,
     in_g,
-    METHODS,
     MODEL_NAMES,
     Quality,
     Rejected,
+    SampleNoise,
+    STORED_METHODS,
 )
+from ..calibrate.mounting import mounting_figures
 from ..effects import EFFECTS
 from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
 from ..estimate.fit import judge
@@ -71,8 +74,10 @@ def format_calibration(calibration: Calibration) -> str:
                            **dict(zip(EFFECTS[name].values, values.tolist(), strict=True))}
                     for name, values in model.values.items()},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
+        **({'mounting': mounting_figures(model.rotation, calibration.sensor)}
+           if calibration.is_levelled else {}),
         'covariance': calibration.covariance.tolist(),
-        'quality': asdict(calibration.quality),
+        'quality': asdict(calibration.quality), **_rest_noise(calibration),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
         'warnings': [line for line in calibration.warnings if line != EDITED],
         'poses': {'row': calibration.poses.row.tolist(),
@@ -82,6 +87,24 @@ def format_calibration(calibration: Calibration) -> str:
     text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99,
                      default_flow_style=None)
     return f'{text.rstrip()}{_CHECKSUM}{_digest(text.rstrip())}\n'
+
+
+def _rest_noise(calibration: Calibration) -> dict[str, Any]:
+    """Return the gyro bias and the noise of a sample, where they are known; null for NaN."""
+    gyro, noise, content = calibration.gyro, calibration.noise, {}
+    if gyro is not None:
+        content['gyro_bias'] = {
+            'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', 'bias': gyro.bias.tolist(),
+            'sd': gyro.sd.tolist(), 'slope': gyro.slope.tolist(),
+            'temperature': None if np.isnan(gyro.temperature) else float(gyro.temperature),
+            'temperatures': [float(each) for each in gyro.temperatures], 'rests': int(gyro.rests)}
+    if noise is not None:
+        content['noise'] = {
+            'what': 'standard deviation of one sample; force in the unit of the readings, rate in '
+                    'rad/s',
+            **{name: [None if np.isnan(each) else float(each) for each in getattr(noise, name)]
+               for name in ('force', 'rate')}}
+    return content
 
 
 def _digest(text: str) -> str:
@@ -172,7 +195,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
     rejected = [Rejected(_whole(each, 'row'), _text(each, 'reason'))
                 for each in _list(content, 'rejected')]
     calibration = Calibration(
-        name=_one_of(content, 'model', _NAMES), method=_one_of(content, 'method', METHODS),
+        name=_one_of(content, 'model', _NAMES), method=_one_of(content, 'method', STORED_METHODS),
         model=Model(values, _array(content, 'rotation', (3, 3))),
         units=Units(_one_of(units, 'readings', UNIT_NAMES), _number(units, 'per_g')),
         sensor=_text(content, 'sensor'), stream=str(content.get('stream', '')),
@@ -180,7 +203,8 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         covariance=_array(content, 'covariance', (size, size), finite=False),
         quality=_quality(_mapping(content, 'quality')), poses=_poses(_mapping(content, 'poses')),
         rejected=tuple(rejected), reason=_text(content, 'reason'),
-        warnings=tuple(_text({'warning': line}, 'warning') for line in _list(content, 'warnings')))
+        warnings=tuple(_text({'warning': line}, 'warning') for line in _list(content, 'warnings')),
+        gyro=_gyro_bias(content), noise=_sample_noise(content))
     return _from_version_1(calibration) if content['version'] == 1 else calibration
 
 
@@ -208,6 +232,26 @@ def _quality(content: Mapping[str, Any]) -> Quality:
         each.name: None if each.name in optional and content[each.name] is None
         else _number(content, each.name) for each in fields(Quality)}
     return Quality(**figures)
+
+
+def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
+    """Return the gyro bias; None for files without it, such as those of earlier releases."""
+    if content.get('gyro_bias') is None:
+        return None
+    known = _mapping(content, 'gyro_bias')
+    bias, sd, slope = (_array(known, key, (3,)) for key in ('bias', 'sd', 'slope'))
+    temperature = np.nan if known['temperature'] is None else _number(known, 'temperature')
+    limits = tuple(_number({'temperatures': each}, 'temperatures')
+                   for each in _list(known, 'temperatures'))
+    return GyroBias(bias, sd, _whole(known, 'rests'), float(temperature), slope, limits)
+
+
+def _sample_noise(content: Mapping[str, Any]) -> SampleNoise | None:
+    """Return the noise of a sample; None for files without it."""
+    if content.get('noise') is None:
+        return None
+    known = _mapping(content, 'noise')
+    return SampleNoise(*(_array(known, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
 def _poses(content: Mapping[str, Any]) -> Poses:
@@ -297,9 +341,9 @@ def read_calibration(path: Path) -> Calibration:
     return parse_calibration(text, str(path))
 
 
-def write_calibration(path: Path, calibration: Calibration) -> None:
+def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
     """
-    Write a calibration; the previous file is kept as ``<name>.before``.
+    Write a calibration; the previous file is kept as ``<name>.before`` unless excluded.
 
     Raises
     ------
@@ -310,4 +354,4 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
     """
     text = format_calibration(gated(calibration))
-    write_atomically(path, lambda file: file.write(text), keep_before=True)
+    write_atomically(path, lambda file: file.write(text), keep_before=keep_before)

@@ -1,0 +1,384 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A sensor that cannot be turned over gets what its poses carry, with an honest uncertainty."""
+
+from dataclasses import replace
+import re
+
+from accel_calib.calibrate import (
+    carried_words,
+    directions_of,
+    fit_partial,
+    fit_poses,
+    level,
+    lies_in_cone,
+    METHODS,
+    mounting_only,
+    outlook,
+    PRIOR,
+    STORED_METHODS,
+    verify,
+)
+from accel_calib.calibrate.gate import gated
+from accel_calib.calibrate.partial import carried, typical_spread
+from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.estimate.closed_form import along_quadrics
+from accel_calib.estimate.fit import estimate
+from accel_calib.files import read_calibration, write_calibration
+from accel_calib.model import Model, MODELS, predict, sensor_force, with_vector
+from accel_calib.refine import refine
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import spread_directions, unit
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+
+G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
+UP = spread_directions(200)
+
+
+def near_up(rng, count, degrees, axis=(0.0, 0.0, 1.0)):
+    """Return random directions within this angle of an axis, which is a face of the sensor."""
+    cosine = rng.uniform(np.cos(np.radians(degrees)), 1.0, count)
+    heading, sine = rng.uniform(0.0, 2.0 * np.pi, count), np.sqrt(1.0 - cosine ** 2)
+    about_z = np.column_stack([sine * np.cos(heading), sine * np.sin(heading), cosine])
+    return np.roll(about_z, int(np.argmax(axis)) - 2, axis=1)
+
+
+def common_sensor(rng):
+    """Return a random sensor with values as the prior has them."""
+    return with_vector(MODELS['10'], rng.normal(size=9) * typical_spread())
+
+
+def tilting(seed, count=7, degrees=10.0, noise_g=0.003):
+    """Return a common sensor, and poses of a robot that tilts; 0.3 mg of noise per pose."""
+    rng = np.random.default_rng(seed)
+    model = common_sensor(rng)
+    return model, simulate_poses(model, near_up(rng, count, degrees), rng, noise_g=noise_g)
+
+
+def errors(calibration, model, up):
+    """Return the errors of the corrected |a|, and their stated standard deviations [g]."""
+    force = calibration.correct(predict(model, up, {}))
+    stated = np.einsum('ni,nij,nj->n', up, calibration.force_covariance(up), up)
+    return np.linalg.norm(force, axis=1) - 1.0, np.sqrt(stated)
+
+
+@pytest.mark.parametrize('count', [1, 7])
+def test_stated_uncertainty_holds_over_the_whole_sphere(count):
+    held = []
+    for seed in range(200):
+        model, poses = tilting((seed, count), count)
+        error, stated = errors(fit_partial(poses, G), model, UP)
+        held.append(np.mean(np.abs(error) < 1.96 * stated))
+    assert 0.9 < np.mean(held) < 0.995
+
+
+@pytest.mark.parametrize(('count', 'degrees'), [(5, 10.0), (12, 25.0)])
+def test_corrected_length_is_right_within_the_cone(count, degrees):
+    held, sizes = [], []
+    for seed in range(60):
+        model, poses = tilting((seed, count, 1), count, degrees)
+        inside = near_up(np.random.default_rng(seed), 50, degrees)
+        error, stated = errors(fit_partial(poses, G), model, inside)
+        held.append(np.mean(np.abs(error) < 1.96 * stated))
+        sizes.append(np.sqrt(np.mean(error ** 2)))
+    assert np.mean(held) > 0.88
+    assert np.median(sizes) < 1e-3
+
+
+@pytest.mark.parametrize('count', [1, 7])
+def test_each_value_is_within_its_stated_deviation(count):
+    ratios = []
+    for seed in range(100):
+        model, poses = tilting((seed, count, 2), count)
+        found = fit_partial(poses, G)
+        ratios.append((found.model.vector - model.vector) / np.sqrt(np.diag(found.covariance)))
+    sizes = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert np.all((sizes > 0.8) & (sizes < 1.2))
+
+
+def test_poses_that_tell_nothing_leave_the_spread_of_common_sensors():
+    _, poses = tilting(1, 1)
+    deviation = np.sqrt(np.diag(fit_partial(poses, G).covariance))
+    names = ('offset.x', 'offset.y', 'axis_gain.x', 'axis_gain.y', 'cross_axis.xy')
+    which = [fit_partial(poses, G).parameters.index(name) for name in names]
+    np.testing.assert_allclose(deviation[which], typical_spread()[which], rtol=0.05)
+    along = fit_partial(poses, G).offset_sd[2]
+    assert along == pytest.approx(0.1 * 0.03 / np.hypot(0.1, 0.03), rel=0.1)
+
+
+def test_many_poses_over_the_sphere_outweigh_the_prior():
+    rng = np.random.default_rng(4)
+    poses = simulate_poses(common_sensor(rng), spread_directions(24), rng)
+    full = fit_poses(poses, G, model='10')
+    start = with_vector(MODELS['10'], np.zeros(9))
+    found = estimate(start, poses.take(slice(None)), typical_spread())
+    deviation = np.sqrt(np.diag(full.covariance))
+    assert np.all(np.abs(found.model.vector - full.model.vector) < 0.1 * deviation)
+    assert found.dof == 15
+    np.testing.assert_allclose(found.covariance, full.covariance, rtol=0.2, atol=1e-10)
+
+
+@pytest.mark.parametrize('std', [1.0, 0.3, 0.1])
+def test_poses_that_repeat_worse_than_stated_get_a_larger_uncertainty(std):
+    along, lost = [], 0
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        model = common_sensor(rng)
+        poses = simulate_poses(model, near_up(rng, 12, 10.0), rng)
+        found = fit_partial(poses.with_columns(std=std * poses['std']), G)
+        lost += len(found.rejected)
+        error, stated = errors(found, model, np.array([[0.0, 0.0, 1.0]]))
+        along.append(float(error[0] / stated[0]))
+    assert 0.3 < np.sqrt(np.mean(np.square(along))) < 1.6
+    assert lost <= 2
+
+
+def test_poses_without_noise_columns_are_fitted_with_a_warning():
+    model, poses = tilting(3, 12)
+    found = fit_partial(Poses({'reading': poses.reading}, poses.row), G)
+    assert any('no std and count' in line for line in found.warnings)
+    error, stated = errors(found, model, np.array([[0.0, 0.0, 1.0]]))
+    assert abs(error[0]) < 3.0 * stated[0] < 5e-3
+
+
+def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
+    lost = missed = 0
+    for seed in range(40):
+        model, poses = tilting((seed, 3), 9, 15.0)
+        lost += len(fit_partial(poses, G).rejected)
+        poses.reading[4] *= 1.05
+        found = fit_partial(poses, G)
+        missed += [each.row for each in found.rejected] != [5]
+        error, stated = errors(found, model, UP)
+        assert np.mean(np.abs(error) < 4.0 * stated) > 0.95
+    assert lost <= 1
+    assert missed <= 1
+
+
+def test_equal_rows_count_as_one_pose():
+    _, poses = tilting(5)
+    again = poses.take(np.array([*range(7), 2, 2]))
+    again = Poses(again.columns, np.arange(1, 10))
+    once, found = fit_partial(poses, G), fit_partial(again, G)
+    np.testing.assert_allclose(found.model.vector, once.model.vector, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6)
+    assert len(found.used_poses) == 9
+    assert 'equal rows count as one pose: rows 3, 8, 9' in found.warnings
+
+
+def test_result_does_not_depend_on_the_axis_that_points_up():
+    for axis in np.eye(3):
+        rng = np.random.default_rng(8)
+        poses = simulate_poses(Model({}), near_up(rng, 3, 1.0, axis), rng)
+        about = carried(fit_partial(poses, G))
+        assert about.cone.axis @ axis > 0.99
+        assert about.offset_along_g == pytest.approx(0.0287, rel=0.1)
+        assert about.gain[int(np.argmax(axis))] == pytest.approx(0.0287, rel=0.1)
+
+
+def test_words_have_numbers_for_what_is_known_and_open():
+    _, poses = tilting(6)
+    found = fit_partial(poses, G)
+    about, words = carried(found), carried_words(found)
+    assert f'the 7 poses lie within {about.cone.degrees:.0f}° of one direction' in words
+    assert f'is known to {1e3 * about.along_g:.2g} mg' in words
+    assert about.along_g < 5e-4 < 0.02 < about.elsewhere_g
+    for pattern in (r'offset along gravity ±\d+ mg', r'across it ±\d+ mg \(\d\.\d° of tilt',
+                    r'gain ±\d\.\d % on x, ±\d\.\d % on y and ±\d\.\d % on z',
+                    r'elsewhere on the sphere \|a\| is known to \d+ mg',
+                    r'turn the sensor so that in turn the .* point up'):
+        assert re.search(pattern, words), pattern
+        assert re.search(pattern, '; '.join(found.warnings)), pattern
+    assert found.reason in words
+    assert '\n' not in words
+
+
+def test_one_pose_and_a_mounting_have_words_of_their_own():
+    _, poses = tilting(7, 1)
+    assert carried_words(fit_partial(poses, G)).startswith('1 pose: along gravity')
+    assert '100 mg' in carried_words(mounting_only(poses, G))
+    rng = np.random.default_rng(0)
+    full = fit_poses(simulate_poses(common_sensor(rng), spread_directions(12), rng), G)
+    assert carried_words(full) == ''
+
+
+def test_stated_tilt_before_levelling_is_that_of_common_sensors():
+    ratios = []
+    for seed in range(100):
+        model, poses = tilting((seed, 9))
+        found = fit_partial(poses, G)
+        up = np.array([[0.0, 0.0, 1.0]])
+        seen = unit(sensor_force(found.model, predict(model, up, {}), {}))[0]
+        ratios.append(np.degrees(seen[:2]) / carried(found).tilt_deg)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.1
+
+
+@pytest.mark.parametrize(('up', 'expected'), [
+    (near_up(np.random.default_rng(1), 7, 10.0), True),
+    (near_up(np.random.default_rng(1), 40, 28.0), True),
+    (np.eye(3)[:1], True),
+    (np.eye(3)[:2], False),
+    (np.column_stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)]), False),
+    (spread_directions(12), False),
+    (np.zeros((0, 3)), False),
+])
+def test_only_poses_near_one_direction_are_those_of_a_sensor_that_cannot_be_turned(up, expected):
+    assert lies_in_cone(up) is expected
+
+
+def test_poses_that_determine_the_model_are_not_fitted_with_a_prior():
+    rng = np.random.default_rng(2)
+    poses = simulate_poses(common_sensor(rng), spread_directions(12), rng)
+    with pytest.raises(ValueError, match='use fit_poses'):
+        fit_partial(poses, G)
+
+
+def test_poses_of_a_cone_are_refused_by_a_full_fit_and_offered_the_partial_one():
+    _, poses = tilting(8, 12)
+    with pytest.raises(RefusedFitError, match='within .*° of one direction'):
+        fit_poses(poses, G, model='10')
+    assert lies_in_cone(directions_of(poses, G))
+    assert fit_partial(poses, G).method == PRIOR
+
+
+def test_readings_in_m_s2_lead_to_the_same_calibration():
+    _, poses = tilting(9)
+    scaled = poses.with_columns(reading=MPS2.from_g(poses.reading), std=MPS2.from_g(poses['std']))
+    found, expected = fit_partial(scaled, MPS2), fit_partial(poses, G)
+    np.testing.assert_allclose(found.model.vector, expected.model.vector, atol=1e-9)
+    assert carried_words(found) == carried_words(expected)
+
+
+@pytest.mark.parametrize('make', [fit_partial, mounting_only])
+def test_native_readings_are_refused_because_their_scale_is_not_known(make):
+    _, poses = tilting(10)
+    with pytest.raises(InputError, match='native units.*expected readings in m/s2 or g') as err:
+        make(poses, NATIVE)
+    assert 'turn the sensor' in err.value.advice
+
+
+@pytest.mark.parametrize('make', [fit_partial, mounting_only])
+def test_readings_in_another_unit_are_refused(make):
+    _, poses = tilting(10)
+    with pytest.raises(InputError, match='expected about 9.807 at rest in m/s2'):
+        make(poses, MPS2)
+
+
+@pytest.mark.parametrize('make', [fit_partial, mounting_only])
+def test_a_sensor_that_was_never_at_rest_is_refused(make):
+    _, poses = tilting(10)
+    moved = poses.with_columns(std=np.full_like(poses.reading, 100.0))
+    with pytest.raises(RefusedFitError, match='found 0 sound poses of 7 rows'):
+        make(moved, G)
+
+
+def test_a_reading_of_another_length_is_left_out_and_named():
+    _, poses = tilting(10)
+    expected = fit_partial(poses.take(poses.row != 3), G)
+    poses.reading[2] = 0.0
+    found = fit_partial(poses, G)
+    assert [(each.row, each.reason) for each in found.rejected] == [
+        (3, 'the length of the reading is 0 g, expected about 1 g')]
+    np.testing.assert_allclose(found.model.vector, expected.model.vector)
+
+
+def test_doubtful_poses_are_used_only_if_there_are_no_others():
+    _, poses = tilting(11)
+    doubtful = poses.with_columns(doubtful=np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert [each.row for each in fit_partial(doubtful, G).rejected] == [2]
+    assert len(fit_partial(doubtful.take(np.array([1])), G).used_poses) == 1
+
+
+def test_a_mounting_levels_the_raw_reading():
+    rng = np.random.default_rng(12)
+    tilt = np.radians(12.0)
+    reading = 1.07 * np.array([[np.sin(tilt), 0.0, np.cos(tilt)]])
+    found = level(mounting_only(Poses({'reading': reading}, np.array([1])), G), reading[0], 'ros')
+    np.testing.assert_allclose(found.correct(reading), [[0.0, 0.0, 1.07]], atol=1e-12)
+    others = rng.normal(size=(5, 3))
+    np.testing.assert_allclose(np.linalg.norm(found.correct(others), axis=1),
+                               np.linalg.norm(others, axis=1))
+    assert found.name == 'ideal'
+    assert not found.model.effects
+    assert any('not calibrated' in line and '100 mg' in line and '6°' in line
+               for line in found.warnings)
+
+
+def test_level_and_the_offset_along_gravity_come_from_one_rest():
+    _, poses = tilting(13, 1, 0.1)
+    found = level(fit_partial(poses, G), poses.reading[0], 'ros')
+    np.testing.assert_allclose(found.correct(poses.reading), [[0.0, 0.0, 1.0]], atol=1e-3)
+    assert 'sum of offset and gain' in carried_words(found)
+
+
+def test_outlook_asks_for_more_poses_and_states_no_uncertainty_without_values():
+    _, poses = tilting(14)
+    assert outlook(mounting_only(poses, G)).uncertainty_mg is None
+    after = outlook(fit_partial(poses, G))
+    assert after.uncertainty_mg == pytest.approx(43.0, rel=0.3)
+    assert after.next_pose.direction is not None
+
+
+@pytest.mark.parametrize('make', [fit_partial, mounting_only])
+def test_the_gate_accepts_both_and_refuses_readings_that_no_sensor_has(make):
+    _, poses = tilting(15)
+    found = make(poses, G)
+    assert gated(found).warnings == found.warnings
+    with pytest.raises(RefusedFitError, match='rotation'):
+        gated(level_broken(found))
+
+
+def level_broken(calibration):
+    """Return a calibration whose ΔR is a mirror image."""
+    return replace(calibration, model=Model(calibration.model.values, -np.eye(3)))
+
+
+@pytest.mark.parametrize('make', [fit_partial, mounting_only])
+def test_both_are_stored_and_read(make, tmp_path):
+    _, poses = tilting(16)
+    found = level(make(poses, G, sensor='imu_link', date='2026-05-01'), poses.reading[0], 'ros')
+    write_calibration(tmp_path / 'cal.yaml', found)
+    read = read_calibration(tmp_path / 'cal.yaml')
+    assert (read.name, read.method, read.warnings) == (found.name, PRIOR, found.warnings)
+    np.testing.assert_allclose(read.covariance, found.covariance)
+    np.testing.assert_allclose(read.correct(UP), found.correct(UP))
+    assert carried_words(read) == carried_words(found)
+
+
+def test_the_prior_is_no_choice_of_the_user():
+    assert METHODS == ('ml', 'algebraic')
+    assert set(STORED_METHODS) == {*METHODS, PRIOR}
+
+
+def test_a_partial_fit_is_better_than_none_and_refine_completes_it():
+    model, poses = tilting(17)
+    rng = np.random.default_rng(17)
+    far = simulate_poses(model, spread_directions(24), rng)
+    partial, mounting = fit_partial(poses, G), mounting_only(poses, G)
+    assert verify(partial, far).rms_after_mg < verify(mounting, far).rms_after_mg
+    found = refine(far, G, base=partial)
+    assert not found.refusal
+    assert found.remaining_gap_mg < 0.5
+    assert verify(found.calibration, far).rms_after_mg < 0.5
+
+
+def test_a_step_along_quadrics_keeps_readings_on_the_ellipsoid():
+    rng = np.random.default_rng(18)
+    values = common_sensor(rng).vector
+    up = unit(rng.normal(size=(4, 3)))  # 4 poses leave 5 directions of the 9 values
+    reading = predict(with_vector(MODELS['10'], values), up, {})
+
+    def length(vector):
+        return np.linalg.norm(sensor_force(with_vector(MODELS['10'], vector), reading, {}), axis=1)
+
+    columns = np.array([(length(values + 1e-6 * one) - length(values - 1e-6 * one)) / 2e-6
+                        for one in np.eye(9)]).T
+    step = np.linalg.svd(columns)[2][4:].T @ rng.normal(size=5) * 0.03
+    np.testing.assert_allclose(length(along_quadrics(values, step)), 1.0, atol=1e-8)
+    assert np.max(np.abs(length(values + step) - 1.0)) > 1e-4
+    small = 1e-5 * step
+    np.testing.assert_allclose(along_quadrics(values, small) - values, small, atol=1e-9)
