@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
 from shared import sensor
 import yaml
 
@@ -197,8 +198,12 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, calibration, tmp_
                 continue
             old, new = (reader.deserialize(raw, IMU) for reader, raw in ((before, raw0),
                                                                          (after, raw1)))
-            assert str((old.header, old.orientation)) == str((new.header, new.orientation))
             rotation = calibration.model.rotation
+            assert old.header.stamp == new.header.stamp
+            assert new.header.frame_id == old.header.frame_id + '_levelled' * turned
+            before_turn, after_turn = (Rotation.from_quat(
+                [getattr(each.orientation, axis) for axis in 'xyzw']) for each in (old, new))
+            assert (before_turn * Rotation.from_matrix(rotation)).approx_equal(after_turn, 1e-9)
             for name, expected in (
                     ('linear_acceleration', lambda x: calibration.correct(x[np.newaxis])[0]),
                     ('angular_velocity', lambda x, rotation=rotation: x @ rotation)):

@@ -7,16 +7,19 @@ from dataclasses import replace
 import struct
 
 from accel_calib.calibrate import fit_poses, level
+from accel_calib.calibrate.rest_noise import SampleNoise
 from accel_calib.errors import InputError
 from accel_calib.messages import layout as imu
-from accel_calib.messages.correction import corrected, motion_of, Rewriter
+from accel_calib.messages.correction import corrected, motion_of, output_frame, Rewriter
 from accel_calib.messages.layout import (
     doubles_at,
     frame_ids,
     joined,
     layout_of,
     layout_with,
+    renamed,
     samples_of,
+    stamps_of,
 )
 from accel_calib.model import Model, predict
 from accel_calib.simulate import simulate_poses
@@ -24,6 +27,7 @@ from accel_calib.sphere import random_directions, rotation_from_rpy, spread_dire
 from accel_calib.units import STANDARD_GRAVITY, units_of
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from shared import sensor
 
 UNITS = units_of('m/s2')
@@ -50,7 +54,8 @@ def levelled(calibration):
 
 def messages(count=6):
     fields = np.random.default_rng(2).normal(size=(count, imu.IMU_DOUBLES))
-    for part in (imu.ANGULAR_VELOCITY_COVARIANCE, imu.ACCELERATION_COVARIANCE):
+    for part in (imu.ORIENTATION_COVARIANCE, imu.ANGULAR_VELOCITY_COVARIANCE,
+                 imu.ACCELERATION_COVARIANCE):
         root = fields[:, part].reshape(-1, 3, 3) * 0.01
         fields[:, part] = (root @ np.swapaxes(root, 1, 2)).reshape(-1, 9)
     return fields
@@ -70,11 +75,87 @@ def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     found = corrected(levelled, fields)
     np.testing.assert_allclose(found[:, imu.ANGULAR_VELOCITY],
                                fields[:, imu.ANGULAR_VELOCITY] @ rotation)
-    turned = found[:, imu.ANGULAR_VELOCITY_COVARIANCE].reshape(-1, 3, 3)
-    given = fields[:, imu.ANGULAR_VELOCITY_COVARIANCE].reshape(-1, 3, 3)
-    np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
+    for part in (imu.ANGULAR_VELOCITY_COVARIANCE, imu.ORIENTATION_COVARIANCE):
+        turned, given = found[:, part].reshape(-1, 3, 3), fields[:, part].reshape(-1, 3, 3)
+        np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
+    before = Rotation.from_quat(fields[:, imu.ORIENTATION])
+    after = Rotation.from_quat(found[:, imu.ORIENTATION])
+    np.testing.assert_allclose(after.apply(found[:, imu.ANGULAR_VELOCITY]),
+                               before.apply(fields[:, imu.ANGULAR_VELOCITY]))
+
+
+def test_an_orientation_marked_as_missing_does_not_change(levelled):
+    fields = messages()
+    fields[:, imu.ORIENTATION_COVARIANCE] = 0.0
+    fields[:, imu.ORIENTATION_COVARIANCE.start] = -1.0
     kept = np.r_[imu.ORIENTATION, imu.ORIENTATION_COVARIANCE]
-    np.testing.assert_array_equal(found[:, kept], fields[:, kept])
+    np.testing.assert_array_equal(corrected(levelled, fields)[:, kept], fields[:, kept])
+
+
+def test_a_covariance_with_nan_becomes_unknown_and_the_others_stay(levelled):
+    fields = messages()
+    fields[:, imu.ACCELERATION_COVARIANCE.start + 4] = np.nan
+    found = corrected(levelled, fields)
+    np.testing.assert_array_equal(found[:, imu.ACCELERATION_COVARIANCE], 0.0)
+    assert np.all(np.isfinite(found))
+
+
+def test_corrected_messages_have_the_frame_they_are_in(calibration, levelled):
+    assert output_frame(calibration, 'imu_link', 'base') == 'imu_link'
+    assert output_frame(levelled, 'imu_link') == 'imu_link_levelled'
+    assert output_frame(levelled, 'imu_link', 'base') == 'base'
+    assert output_frame(levelled.in_sensor_frame, 'imu_link', 'base') == 'imu_link'
+
+
+def test_unknown_covariances_are_filled_with_the_noise(levelled):
+    noise = SampleNoise(np.array([0.01, 0.02, 0.03]), np.array([1e-3, 2e-3, 3e-3]))
+    rng = np.random.default_rng(5)
+    for kind in ('unknown', 'known', 'absent', 'full'):
+        fields = every(random_message(rng, 'imu'))
+        for part in (imu.ACCELERATION_COVARIANCE, imu.ANGULAR_VELOCITY_COVARIANCE):
+            fields[0, part] = covariance(kind, rng)
+        data = random_message(rng, 'imu')[:-296] + fields.tobytes()
+        found = every(Rewriter(layout_of(data), levelled, 1.0, STANDARD_GRAVITY, 'imu', noise)(
+            data, np.nan))
+        if kind == 'unknown':
+            fields[0, imu.ACCELERATION_COVARIANCE] = np.diag(noise.force ** 2).ravel()
+            fields[0, imu.ANGULAR_VELOCITY_COVARIANCE] = np.diag(noise.rate ** 2).ravel()
+        np.testing.assert_allclose(found, corrected(levelled, fields), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize('turned', [False, True])
+def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(calibration, levelled,
+                                                                      turned):
+    used, bias = levelled if turned else calibration, np.array([0.01, -0.02, 0.03])
+    data = random_message(np.random.default_rng(6), 'imu')
+    fields = every(data)
+    for first, known in ((4e-4, True), (-1.0, False)):
+        fields[0, imu.ANGULAR_VELOCITY_COVARIANCE.start] = first
+        data = data[:-296] + fields.tobytes()
+        rewriter = Rewriter(layout_of(data), used, 1.0, STANDARD_GRAVITY, 'imu')
+        rewriter.bias = tuple(bias)
+        rate = every(rewriter(data, np.nan))[0, imu.ANGULAR_VELOCITY]
+        expected = fields[0, imu.ANGULAR_VELOCITY] - bias * known
+        np.testing.assert_allclose(rate, used.rotation.T @ expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize('ros2', [False, True])
+@pytest.mark.parametrize('name', NAMES)
+def test_messages_get_another_frame_id(ros2, name):
+    rng = np.random.default_rng(7)
+    raws = [random_message(rng, 'imu_link') for _ in range(4)]
+    if ros2:
+        raws[1] = swapped(raws[1])
+    else:  # the serialization of ROS 1: four bytes of seq, no NUL, no padding
+        raws = [raw[:12] + struct.pack('<I', 8) + b'imu_link' + raw[-296:] for raw in raws]
+    before = joined(raws, 37, 'imu', ros2=ros2)
+    after = renamed(before, name)
+    again = joined([bytes(each) for each in after.each()], 37, 'imu', ros2=ros2)
+    for found in (after, again):
+        assert frame_ids(found) == [name]
+        np.testing.assert_array_equal(stamps_of(found), stamps_of(before))
+        np.testing.assert_array_equal(doubles_at(found, slice(0, 37)),
+                                      doubles_at(before, slice(0, 37)))
 
 
 def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
@@ -168,7 +249,7 @@ def with_effects(calibration, *, effects, turned):
 
 @pytest.mark.parametrize('effects', [False, True])
 @pytest.mark.parametrize('turned', [False, True])
-@pytest.mark.parametrize('frame_id', ['', 'base_link'])
+@pytest.mark.parametrize('frame_id', ['imu_link', 'base_link'])
 def test_single_messages_and_arrays_are_corrected_equally(calibration, effects, turned,
                                                           frame_id):
     calibration = with_effects(calibration, effects=effects, turned=turned)
@@ -184,9 +265,8 @@ def test_single_messages_and_arrays_are_corrected_equally(calibration, effects, 
         expected = corrected(calibration, every(data), context)
         np.testing.assert_allclose(every(found)[:, :28], expected[:, :28], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(every(found)[:, 28:], expected[:, 28:], rtol=1e-9, atol=1e-15)
-        name = frame_id or layout.frame_id
-        assert frame_ids(joined([found], 37, 'imu')) == [name]
-        assert (found[4:12], layout_of(found)) == (data[4:12], layout_with(name))
+        assert frame_ids(joined([found], 37, 'imu')) == [frame_id]
+        assert (found[4:12], layout_of(found)) == (data[4:12], layout_with(frame_id))
         motion = motion_of(found, rewriter.layout, np.array([0.1, -0.2, 9.8]))
         np.testing.assert_allclose(
             doubles_at(joined([motion], 3, 'motion'), slice(0, 3)),
@@ -196,7 +276,7 @@ def test_single_messages_and_arrays_are_corrected_equally(calibration, effects, 
 def test_readings_in_g_become_m_per_s2(calibration):
     calibration = replace(calibration, units=units_of('g'))
     data = random_message(np.random.default_rng(8), 'imu')
-    found = Rewriter(layout_of(data), calibration, STANDARD_GRAVITY, STANDARD_GRAVITY, '')(
+    found = Rewriter(layout_of(data), calibration, STANDARD_GRAVITY, STANDARD_GRAVITY, 'imu')(
         data, np.nan)
     force = calibration.correct(every(data)[:, imu.ACCELERATION]) * STANDARD_GRAVITY
     np.testing.assert_allclose(every(found)[:, imu.ACCELERATION], force, rtol=1e-12)
@@ -207,7 +287,7 @@ def test_each_message_is_corrected_at_its_own_temperature(calibration):
     calibration = replace(calibration, model=Model(values), covariance=np.eye(
         len(calibration.covariance) + 3) * 1e-8)
     data = random_message(np.random.default_rng(7))
-    rewriter = Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, '')
+    rewriter = Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, 'imu')
     for temperature in (20.0, 20.0, 35.0, 20.0):
         expected = corrected(calibration, every(data), {'temperature': np.array([temperature])})
         np.testing.assert_allclose(every(rewriter(data, temperature)), expected, rtol=1e-9)
@@ -218,7 +298,7 @@ def test_each_message_is_corrected_at_its_own_temperature(calibration):
 def test_no_force_beyond_100_g_is_published(calibration):
     data = bytearray(random_message(np.random.default_rng(9), 'imu'))
     layout = layout_of(bytes(data))
-    rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, '')
+    rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, 'imu')
     place = layout.place(imu.ACCELERATION)
     for reading in (1e3, -1e300):
         struct.pack_into('<3d', data, place, 0.0, reading, 9.8)

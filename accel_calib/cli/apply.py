@@ -28,6 +28,9 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='stored calibration')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
                       help='CSV table or bag to write, of the same kind as the recording')
+    made.add_argument('--no-rotate', action='store_true', help='correct offset and gain alone, '
+                      'and stay in the frame of the sensor; otherwise a levelled calibration '
+                      'turns everything in a message, and its frame_id ends with _levelled')
     made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
     made.set_defaults(run=run)
 
@@ -35,6 +38,8 @@ def add_to(made: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Correct the recording, and print the number of samples."""
     calibration = options.stored_calibration(args.calibration)
+    if args.no_rotate:
+        calibration = calibration.in_sensor_frame
     if is_bag(args.recording):
         with progress('messages') as moved:
             count = correct_bag(args.recording, calibration, args.output, args.topic, moved)

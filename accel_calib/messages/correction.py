@@ -4,24 +4,40 @@
 """
 Correction of sensor_msgs/Imu messages by a calibration.
 
-The acceleration is corrected; stamp and orientation do not change. If ΔR is a rotation of the
-frame, angular velocity and covariances are rotated, too. The conventions for the covariance of the
-acceleration are kept (first element -1: no data; all zero: unknown). A known covariance is
-transformed by A = ΔRᵀ W⁻¹, and the covariance of the calibration is added.
+One rule holds for the node and for recordings. A corrected message has offset, gain and the
+mounting ΔR applied. If ΔR is a rotation of the frame, everything in the message is turned into the
+levelled frame, and the message has the frame_id of that frame:
+
+==================  ======================================================================
+acceleration        ΔRᵀ W⁻¹ (reading - V), and the other effects of the calibration
+angular velocity    ΔRᵀ rate
+orientation         q ⊗ q(ΔR), the attitude of the levelled frame in the same world
+covariances         A C Aᵀ with A = ΔRᵀ, for the acceleration ΔRᵀ W⁻¹; all three are stated
+                    about the x, y and z axes of the message (sensor_msgs/Imu)
+frame_id            `output_frame`
+==================  ======================================================================
+
+A calibration without a mounting (`Calibration.in_sensor_frame`) leaves the frame unchanged. Then
+only the acceleration and its covariance differ from the raw message. The stamp never changes.
+
+The conventions for covariances are kept: a first element of -1 means no data, and all zero means
+unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
+added to a known covariance of the acceleration.
 
 **Single messages.** Correction of single serialized Imu messages.
 
-The result is the same as that of `accel_calib.messages.correction`, but computed with Python
-floats (`accel_calib.one_reading`); a test compares both. Covariances rarely change from message to
+The result is the same as that of `corrected`, but computed with Python floats
+(`accel_calib.one_reading`); a test compares both. Covariances rarely change from message to
 message, so each covariance is transformed only once.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 import struct
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +52,8 @@ from .layout import (
     LITTLE_ENDIAN,
     NAME_AT,
     NINE,
+    ORIENTATION,
+    ORIENTATION_COVARIANCE,
     STAMP,
     STAMP_AT,
     THREE,
@@ -44,7 +62,11 @@ from ..calibrate import Calibration, of_samples
 from ..effects import Context
 from ..errors import InputError
 from ..one_reading import AtReading, OneReading, Triple
+from ..sphere import quaternion_of
 from ..table import Floats
+
+if TYPE_CHECKING:
+    from ..calibrate import SampleNoise
 
 
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None
@@ -72,26 +94,52 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
     result = doubles.copy()
     force = calibration.correct(doubles[:, ACCELERATION], known)
     result[:, ACCELERATION] = force
-    if not np.array_equal(rotation, np.eye(3)):
+    if calibration.is_levelled:
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
-        rate_covariance = doubles[:, ANGULAR_VELOCITY_COVARIANCE]
-        stated = is_known(rate_covariance)
-        result[stated, ANGULAR_VELOCITY_COVARIANCE] = transformed(
-            rotation.T, rate_covariance[stated])
-    force_covariance = doubles[:, ACCELERATION_COVARIANCE]
-    stated = is_known(force_covariance)
+        _transform(result, ANGULAR_VELOCITY_COVARIANCE, rotation.T)
+        present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
+        result[present, ORIENTATION] = _turned(doubles[present, ORIENTATION].T,
+                                               quaternion_of(rotation)).T
+        _transform(result, ORIENTATION_COVARIANCE, rotation.T)
+    stated = _transform(result, ACCELERATION_COVARIANCE,
+                        rotation.T @ np.linalg.inv(calibration.gain))
     if np.any(stated):
-        inverse = rotation.T @ np.linalg.inv(calibration.gain)
-        own = transformed(inverse, force_covariance[stated])
         rows = {key: values[stated] for key, values in known.items()}
         added = calibration.force_covariance(force[stated], rows)
-        result[stated, ACCELERATION_COVARIANCE] = own + added.reshape(-1, 9)
+        result[stated, ACCELERATION_COVARIANCE] += added.reshape(-1, 9)
     return result
 
 
+def output_frame(calibration: Calibration, frame_id: str, chosen: str = '') -> str:
+    """
+    Return the frame_id of corrected messages.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    frame_id : str
+        frame_id of the raw messages.
+    chosen : str
+        Name of the levelled frame; empty: ``<frame_id>_levelled``.
+
+    """
+    return (chosen or f'{frame_id}_levelled') if calibration.is_levelled else frame_id
+
+
+def _transform(doubles: Floats, part: slice, matrix: Floats) -> NDArray[np.bool_]:
+    """Transform a covariance of (n, 37) doubles in place; return where it is known."""
+    given = doubles[:, part]
+    absent, known = given[:, 0] == -1.0, is_known(given)
+    doubles[known, part] = transformed(matrix, given[known])
+    doubles[~known & ~absent, part] = 0.0
+    return known
+
+
 def is_known(covariance: Floats) -> NDArray[np.bool_]:
-    """Return which (n, 9) covariances are neither -1 (no data) nor all zero (unknown)."""
-    return (covariance[:, 0] != -1.0) & np.any(covariance != 0.0, axis=1)
+    """Return which (n, 9) covariances are finite, and neither -1 (no data) nor all zero."""
+    return ((covariance[:, 0] != -1.0) & np.any(covariance != 0.0, axis=1)
+            & np.all(np.isfinite(covariance), axis=1))
 
 
 def transformed(matrix: Floats, covariance: Floats) -> Floats:
@@ -99,12 +147,25 @@ def transformed(matrix: Floats, covariance: Floats) -> Floats:
     return (matrix @ covariance.reshape(-1, 3, 3) @ matrix.T).reshape(-1, 9)
 
 
+def _turned(orientation: Any, turn: Sequence[float]) -> Floats:
+    """Return the product of quaternions (x, y, z, w), each component a float or an array."""
+    return np.array(_product(*orientation, *turn))
+
+
+def _product(x: Any, y: Any, z: Any, w: Any, p: float, q: float, r: float, s: float
+             ) -> tuple[Any, Any, Any, Any]:
+    return (w * p + x * s + y * r - z * q, w * q - x * r + y * s + z * p,
+            w * r + x * q - y * p + z * s, w * s - x * p - y * q - z * r)
+
+
 LARGEST_G = 100.0
 """Larger corrected forces are not published [g]. The range of common accelerometers is 16 to 40 g;
 shock sensors cannot be calibrated by gravity."""
 
-_FORCE, _MOTION, _ALL = (struct.Struct(each) for each in ('<12d', '<3d72s3d', '<3d72s12d'))
+_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in (
+    '<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
 _ABSENT = struct.pack('<d', -1.0)
+_UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)
 _PER_MESSAGE = {'time', 'rate'}
 
@@ -124,38 +185,45 @@ class Rewriter:
     gravity : float
         Local gravity [m/s²].
     frame_id : str
-        New frame_id; empty: keep the frame_id.
+        frame_id of the corrected messages.
+    noise : SampleNoise, optional
+        Noise of the samples, stated in messages whose covariance is unknown.
 
     Attributes
     ----------
     layout : Layout
         Layout of the corrected messages.
+    bias : (float, float, float)
+        Bias that is subtracted from the angular velocity [rad/s].
 
     """
 
     def __init__(self, layout: Layout, calibration: Calibration, scale: float, gravity: float,
-                 frame_id: str) -> None:
-        rotation = calibration.model.rotation
-        self._rotation = rotation
-        self._turns = not np.array_equal(rotation, np.eye(3))
-        self._turn = rotation.T.tolist()
-        self._inverse = rotation.T @ np.linalg.inv(calibration.gain) * scale
+                 frame_id: str, noise: SampleNoise | None = None) -> None:
+        self.bias: Triple = _NONE
+        self._turns = calibration.is_levelled
+        self._turn = tuple(calibration.rotation.T.ravel().tolist())
+        self._quaternion = quaternion_of(calibration.rotation)
+        self._inverse = calibration.rotation.T @ np.linalg.inv(calibration.gain) * scale
         self._calibration = OneReading(calibration, scale)
         self._needs = calibration.model.needs
         self._per_message = bool(_PER_MESSAGE.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
         self._warm = math.nan
         self._largest = LARGEST_G * gravity
-        self._given = layout
+        self._given, self.layout = layout, layout_with(frame_id)
+        self._force, self._force_spread = (layout.place(ACCELERATION),
+                                           layout.place(ACCELERATION_COVARIANCE))
         self._rate = layout.place(ANGULAR_VELOCITY)
         self._rate_spread = layout.place(ANGULAR_VELOCITY_COVARIANCE)
-        self._force = layout.place(ACCELERATION)
-        self._force_spread = layout.place(ACCELERATION_COVARIANCE)
-        self.layout = layout_with(frame_id) if frame_id else layout
-        padding = self.layout.begin - self.layout.name_end
-        self._name = self.layout.name + bytes(padding) if frame_id else b''
-        self._seen_force = self._seen_rate = self._turned_rate = b''
+        self._renamed = self.layout.name != layout.name
+        self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
+        self._fill_force = _UNKNOWN if noise is None else _diagonal(noise.force)
+        self._fill_rate = _UNKNOWN if noise is None else _diagonal(noise.rate)
+        self._seen_force = self._seen_rate = self._seen_orientation = b''
+        self._new_rate = self._new_force = self._new_orientation = b''
         self._own: list[float] | None = None
+        self._has_orientation = self._has_rate = True
 
     def __call__(self, data: bytes, temperature: float) -> bytes | None:
         """
@@ -179,7 +247,8 @@ class Rewriter:
             If context is missing, or the corrected force is not plausible.
 
         """
-        p, q, r, spread, x, y, z = _MOTION.unpack_from(data, self._rate)
+        given = _WHOLE.unpack_from(data, self._given.begin)
+        x, y, z = given[-3:]
         if not math.isfinite(x + y + z):
             return None
         at = self._at
@@ -193,23 +262,43 @@ class Rewriter:
         covariance = data[self._force_spread:]
         if covariance != self._seen_force:
             self._see_force(covariance)
-        if not self._turns:
-            front = self._front(data, self._force)
-            if self._own is None:
-                return front + THREE.pack(a, b, c) + covariance
-            return front + _FORCE.pack(a, b, c, *at.with_spread(force, self._own))
+        before = self._turned(data, given) if self._turns else self._unturned(data, given)
+        if self._own is None:
+            return before + THREE.pack(a, b, c) + self._new_force
+        return before + _FORCE.pack(a, b, c, *at.with_spread(force, self._own))
+
+    def _unturned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
+        """Return the message before the acceleration, in the frame of the sensor."""
+        p, q, r, spread = given[5:9]
         if spread != self._seen_rate:
             self._see_rate(spread)
-        rates = [i * p + j * q + k * r for i, j, k in self._turn]
-        front = self._front(data, self._rate)
-        if self._own is None:
-            return front + _MOTION.pack(*rates, self._turned_rate, a, b, c) + covariance
-        return front + _ALL.pack(*rates, self._turned_rate, a, b, c,
-                                 *at.with_spread(force, self._own))
+        u, v, w = self.bias
+        if not (u or v or w) and self._new_rate == spread:
+            return self._header(data, self._force)
+        if self._has_rate:
+            p, q, r = p - u, q - v, r - w
+        return self._header(data, self._rate) + THREE.pack(p, q, r) + self._new_rate
 
-    def _front(self, data: bytes, end: int) -> bytes:
-        """Return the message up to a place, with the new frame_id if there is one."""
-        if not self._name:
+    def _turned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
+        """Return the message before the acceleration, in the levelled frame."""
+        x, y, z, w, orientation_spread, p, q, r, spread = given[:9]
+        if spread != self._seen_rate:
+            self._see_rate(spread)
+        if orientation_spread != self._seen_orientation:
+            self._see_orientation(orientation_spread)
+        if self._has_rate:
+            u, v, t = self.bias
+            p, q, r = p - u, q - v, r - t
+        if self._has_orientation:
+            x, y, z, w = _product(x, y, z, w, *self._quaternion)
+        d, e, f, g, h, i, j, k, m = self._turn
+        return self._header(data, self._given.begin) + _FRONT.pack(
+            x, y, z, w, self._new_orientation, d * p + e * q + f * r, g * p + h * q + i * r,
+            j * p + k * q + m * r, self._new_rate)
+
+    def _header(self, data: bytes, end: int) -> bytes:
+        """Return the message up to a place, with the new frame_id."""
+        if not self._renamed:
             return data[:end]
         return LITTLE_ENDIAN + data[STAMP_AT:NAME_AT] + self._name + data[self._given.begin:end]
 
@@ -229,13 +318,26 @@ class Rewriter:
     def _see_force(self, covariance: bytes) -> None:
         """Cache the transformed covariance of the acceleration."""
         self._seen_force = covariance
-        self._own = _transformed(self._inverse, covariance)
+        self._own = _transformed(self._inverse, covariance, self._fill_force)
+        self._new_force = covariance if covariance[:8] == _ABSENT else _UNKNOWN
 
     def _see_rate(self, covariance: bytes) -> None:
         """Cache the transformed covariance of the angular velocity."""
         self._seen_rate = covariance
-        turned = _transformed(self._rotation.T, covariance)
-        self._turned_rate = covariance if turned is None else NINE.pack(*turned)
+        self._has_rate = covariance[:8] != _ABSENT
+        self._new_rate = self._in_new_axes(covariance, self._fill_rate)
+
+    def _see_orientation(self, covariance: bytes) -> None:
+        """Cache the transformed covariance of the orientation."""
+        self._seen_orientation = covariance
+        self._has_orientation = covariance[:8] != _ABSENT
+        self._new_orientation = self._in_new_axes(covariance, _UNKNOWN)
+
+    def _in_new_axes(self, covariance: bytes, fill: bytes) -> bytes:
+        turned = _transformed(np.reshape(self._turn, (3, 3)), covariance, fill)
+        if turned is not None:
+            return NINE.pack(*turned)
+        return covariance if covariance[:8] == _ABSENT else _UNKNOWN
 
 
 def _implausible(force: Triple) -> InputError:
@@ -244,13 +346,21 @@ def _implausible(force: Triple) -> InputError:
                       f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
 
 
-def _transformed(matrix: Floats, covariance: bytes) -> list[float] | None:
-    """Return A C Aᵀ of a covariance, or None if the covariance is absent or unknown."""
-    numbers = np.frombuffer(covariance, '<f8')[np.newaxis]
-    if not is_known(numbers)[0]:
-        return None
-    found: list[float] = transformed(matrix, numbers)[0].tolist()
-    return found
+def _diagonal(deviation: Floats) -> bytes:
+    """Return the covariance of independent axes; unknown if a deviation is not known."""
+    if not np.all(np.isfinite(deviation)):
+        return _UNKNOWN
+    return np.diag(np.square(deviation)).astype('<f8').tobytes()
+
+
+def _transformed(matrix: Floats, covariance: bytes, fill: bytes) -> list[float] | None:
+    """Return A C Aᵀ, with `fill` for an unknown covariance; None if it is not known then."""
+    for candidate in (covariance, fill) if covariance[:8] != _ABSENT else ():
+        numbers = np.frombuffer(candidate, '<f8')[np.newaxis]
+        if is_known(numbers)[0]:
+            found: list[float] = transformed(matrix, numbers)[0].tolist()
+            return found
+    return None
 
 
 def motion_of(data: bytes, layout: Layout, gravity: Floats) -> bytes:

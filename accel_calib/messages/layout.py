@@ -251,6 +251,23 @@ def put_doubles(messages: Messages, values: Floats) -> None:
     sliding_window_view(messages.data, rows.shape[1], writeable=True)[messages.begin] = rows
 
 
+def renamed(messages: Messages, frame_id: str) -> Messages:
+    """Return Imu messages with another frame_id, in a new buffer."""
+    letters = frame_id.encode() + (b'\0' if messages.ros2 else b'')
+    begin = int(begin_of(len(letters), ros2=messages.ros2))
+    size = begin + 8 * IMU_DOUBLES
+    rows = np.zeros((len(messages), size), np.uint8)
+    rows[:, :LETTERS_AT] = _rows_at(messages.data, messages.start, LETTERS_AT)
+    length = np.where(messages.swapped, np.uint32(len(letters)).byteswap(), len(letters))
+    rows[:, NAME_AT:LETTERS_AT] = length.astype('<u4')[:, np.newaxis].view(np.uint8)
+    rows[:, LETTERS_AT:LETTERS_AT + len(letters)] = np.frombuffer(letters, np.uint8)
+    rows[:, begin:] = _rows_at(messages.data, messages.begin, size - begin)
+    start, head = np.arange(len(messages)) * size, messages.head.copy()
+    head[:, 3] = len(letters)
+    return Messages(rows.ravel(), start, start + size, head, start + begin,
+                    messages.swapped, messages.ros2)
+
+
 def samples_of(messages: Messages) -> dict[str, Floats]:
     """
     Return Imu messages as columns of `accel_calib.table`.
