@@ -16,6 +16,7 @@ from accel_calib.model import Model
 from accel_calib.session import CalibratorSettings, findings, Job, Log, Session
 from accel_calib.session.health import Level
 from accel_calib.session.store import Identity, load, Lock, Store, store_of, StoreInUseError
+from accel_calib.session.stream_statistics import StreamStatistics
 from accel_calib.sphere import rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
     turned = readings(spread_directions(12))
     one, other = Driver(sensor='left/imu'), Driver(sensor='left_imu')
     one.feed(turned)
-    assert one.done(one.session.fit())
+    assert one.done(one.session.commands.fit())
     other.feed(turned[:10])
     assert other.session.active.calibration is None
     assert len(other.session.live.book.poses()) == 0
@@ -164,7 +165,8 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert not second.session.publishes
     assert second.finding('calibration').level == Level.ERROR
     assert 'is used by the node with process id' in second.finding('calibration').words
-    for command in (second.session.fit, second.session.save, second.session.load):
+    commands = second.session.commands
+    for command in (commands.fit, commands.save, commands.load):
         with pytest.raises(AccelCalibError, match='is used by the node with process id'):
             command()
     assert path.read_bytes() == before
@@ -205,7 +207,7 @@ def test_damaged_calibration_is_renamed_and_the_poses_are_used(
     assert 'known.yaml.damaged1' in again.finding('calibration').words
     assert path.with_name('known.yaml.damaged1').read_text() == text
     assert len(again.session.live.book.poses()) == 12
-    assert again.done(again.session.fit())
+    assert again.done(again.session.commands.fit())
     assert again.finding('calibration').level == Level.OK
 
 
@@ -219,7 +221,7 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
     assert "sensor 'another'" in driver.finding('calibration').words
     assert (tmp_path / 'use.yaml').read_text() == other
     assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
-    assert driver.done(driver.session.fit())
+    assert driver.done(driver.session.commands.fit())
     assert (tmp_path / 'use.yaml.other1').read_text() == other
     assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
     assert len(read_poses(tmp_path / 'use_poses.csv')) == 12
@@ -262,7 +264,7 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.foreign == 1
-    assert 'dropped 1 message of another sensor' in driver.finding('values').words
+    assert 'dropped 1 message of another sensor' in driver.finding('stream').words
 
 
 def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
@@ -270,7 +272,7 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     driver = Driver()
     turned = readings(spread_directions(12))
     driver.feed(turned)
-    assert driver.done(driver.session.fit())
+    assert driver.done(driver.session.commands.fit())
     driver.now += 3.0
     assert driver.feed(turned[:50], 'another') == 50
     assert driver.session.sensor == 'another'
@@ -289,15 +291,15 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     rest = readings([[0, 0, 1]], dwell=6.0)
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match='no Imu message yet'):
-            getattr(driver.session, name)()
+            getattr(driver.session.commands, name)()
     driver.feed(rest[:150])
     driver.now += 6.0
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match=r'arrived 6\.0 s ago, expected one within'):
-            getattr(driver.session, name)()
+            getattr(driver.session.commands, name)()
     driver.feed(rest[150:160])
-    assert driver.done(driver.session.capture_pose()).startswith('1 pose:')
-    assert 'levelled by this pose' in driver.done(driver.session.set_level())
+    assert driver.done(driver.session.commands.capture_pose()).startswith('1 pose:')
+    assert 'levelled by this pose' in driver.done(driver.session.commands.set_level())
 
 
 def test_the_heading_is_set_with_the_nose_down_and_kept(
@@ -310,22 +312,22 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
     flat, nose_down = mounting @ [0.0, 0.0, 1.0], mounting @ [-0.6, 0.0, 0.8]
     driver.feed(readings([nose_down], dwell=6.0)[:200])
     with pytest.raises(InputError, match=r'not levelled; .*~/set_level first'):
-        driver.session.set_heading()
+        driver.session.commands.set_heading()
 
     def yaw() -> float:
         x = driver.session.active.calibration.rotation[:, 0]  # type: ignore[union-attr]
         return float(np.degrees(np.arccos(x @ mounting[:, 0])))
 
     driver.feed(readings([flat], dwell=6.0)[:200])
-    driver.done(driver.session.set_level())
+    driver.done(driver.session.commands.set_level())
     assert yaw() > 50.0
     with pytest.raises(InputError, match=r'within 10° of the flat pose'):
-        driver.session.set_heading()
+        driver.session.commands.set_heading()
     driver.feed(readings([nose_down], dwell=6.0)[:200])
-    assert 'the heading is set by this pose' in driver.done(driver.session.set_heading())
+    assert 'the heading is set by this pose' in driver.done(driver.session.commands.set_heading())
     assert yaw() < 1.0
     driver.feed(readings([flat], dwell=6.0)[:200])
-    driver.done(driver.session.set_level())
+    driver.done(driver.session.commands.set_level())
     assert yaw() < 1.0
 
 
@@ -362,7 +364,104 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
     driver = Driver(repeated='keep')
     driver.feed(readings(cone))
     with pytest.raises(AccelCalibError) as refusal:
-        driver.done(driver.session.refine())
+        driver.done(driver.session.commands.refine())
     assert '\n' not in str(refusal.value)
     assert driver.session.active.calibration is None
     assert not list(home.glob('*.yaml'))
+
+
+# Guidance
+
+
+def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> None:
+    driver = Driver()
+    driver.feed(readings(spread_directions(5)))
+    before = driver.session.advice
+    driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
+    assert driver.session.advice == before
+    assert driver.logged('info').count('this rest repeats an earlier pose') == 1
+
+
+def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
+    driver = Driver()
+    for count, direction in enumerate(spread_directions(12), 1):
+        driver.feed(readings([direction]))
+        if 'call ~/fit' not in driver.session.advice:
+            assert count < 12
+            continue
+        assert driver.done(driver.session.commands.fit())
+    assert driver.session.advice == 'the calibration uses these poses'
+
+
+def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> None:
+    driver = Driver()
+    driver.feed(readings(spread_directions(30)))
+    lines = len(driver.log)
+    driver.feed(readings(spread_directions(30)[:10]))
+    assert not [line.words for line in driver.log[lines:] if 'pose' in line.words]
+
+
+# Automatic fits
+
+
+def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
+        home: Path, readings: Readings) -> None:
+    driver = Driver(auto_fit=True)
+    driver.feed(readings(spread_directions(12)))
+    first = driver.session.active.calibration
+    assert first is not None
+    driver.feed(readings(spread_directions(31)[:8]))
+    driver.now += 60.0
+    driver.session.tick()
+    driver.handle()
+    assert driver.session.fitted_poses > 12  # a fit has been made, and agrees
+    assert driver.session.active.calibration is first
+    assert len(list(home.glob('*.before*'))) == 1
+
+
+def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Readings) -> None:
+    driver = Driver(auto_fit=True, auto_fit_poses=30)
+    driver.feed(readings(spread_directions(14)))
+    assert driver.done(driver.session.commands.fit())
+    fitted = driver.session.active.calibration
+    refined = replace(fitted, model=Model({**fitted.model.values, 'quadratic': np.zeros(3)}),
+                      covariance=np.eye(len(fitted.covariance) + 3) * 1e-8)
+    driver.session.adopt(refined)
+    driver.feed(readings(spread_directions(33)))
+    assert driver.session.fitted_poses >= 30
+    assert driver.session.active.calibration is refined
+
+
+# The stream
+
+
+def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
+    """Return statistics of batches of stamps that arrive with pauses."""
+    now = 100.0
+    found = StreamStatistics(lambda: now)
+    for stamps in batches:
+        now += pause
+        rows = np.full((len(stamps), 9), np.nan)
+        rows[:, 0], rows[:, 1:4] = stamps, 1.0
+        found.add(rows, now)
+    return found
+
+
+def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
+    times = [np.arange(60) / 200.0 + 0.3 * k for k in range(30)]
+    found = statistics_of(*times)
+    assert found.rate == pytest.approx(200.0)
+    assert not found.stamp_fault
+    assert 'zero' in statistics_of(*(0.0 * each for each in times)).stamp_fault
+    assert 'constant' in statistics_of(*(0.0 * each + 5.0 for each in times)).stamp_fault
+    assert 'out of order' in statistics_of(*(each[::-1] for each in times)).stamp_fault
+    again = [*times, *(each + 9.0 for each in times)]  # a bag is played again
+    assert not statistics_of(*times, *again).stamp_fault
+    assert statistics_of(*times[:1]).rate == 0.0
+
+
+def test_settings_of_the_mounting_must_not_contradict_each_other() -> None:
+    with pytest.raises(InputError, match='both mounting_rpy and base_frame'):
+        Driver(mounting_rpy=[0.0, 0.0, 1.0], base_frame='base_link')
+    with pytest.raises(InputError, match='publish_tf would make'):
+        Driver(publish_tf=True, base_frame='base_link', output_frame_id='base_link')

@@ -4,16 +4,18 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the entry point. `live_capture` captures poses, and `active_calibration` contains the
+`session` is the entry point, and `commands` contains what the user can ask for. `live_capture`
+captures poses, `guidance` says which pose is next, and `active_calibration` contains the
 calibration in use. `store` manages files. `work` contains the computations, which run in
-`worker_process`. `health` describes the state. `settings` defines the parameters.
+`worker_process`. `stream_statistics` and `health` describe the stream and the state. `settings` defines
+the parameters.
 
 """
 
-from .events import Event, Job, Log, ShowPoses, Still
+from .events import Event, Job, Log, Mounting, ShowPoses, Still
 from .health import Finding, findings, Health, worst
 from .session import Session
 from .settings import CalibratorSettings
 
-__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'Session',
-           'ShowPoses', 'Still', 'findings', 'worst']
+__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'Mounting',
+           'Session', 'ShowPoses', 'Still', 'findings', 'worst']

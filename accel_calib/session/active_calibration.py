@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from .live_capture import LONG_REST, overlap
-from ..calibrate import Calibration
+from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
 from ..effects import Context
 from ..monitor import compared, Drift, monitor, rests_of
@@ -34,6 +34,12 @@ _SHORT_REST = 30.0
 
 _NONE = np.zeros((1, 3))
 
+_LARGEST_BIAS = 0.1
+"""Largest bias of a gyro [rad/s]; MEMS gyros have up to 5 °/s."""
+
+_LARGEST_BIAS_STEP = 0.02
+"""Largest change of a stored bias from rest to rest [rad/s]."""
+
 
 class ActiveCalibration:
     """
@@ -43,11 +49,15 @@ class ActiveCalibration:
     ----------
     gravity : float
         Local gravity [m/s²].
+    rotates : bool
+        Whether corrected messages are turned into the levelled frame.
 
     Attributes
     ----------
     calibration : Calibration or None
         The calibration in use.
+    applied : Calibration or None
+        The calibration that corrects messages: without the mounting if `rotates` is false.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
     scale : float
@@ -57,12 +67,13 @@ class ActiveCalibration:
 
     """
 
-    def __init__(self, gravity: float) -> None:
-        self._g = gravity
+    def __init__(self, gravity: float, *, rotates: bool = True) -> None:
+        self._g, self._rotates = gravity, rotates
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self.drift: Drift | None = None
         self.calibration: Calibration | None = None
+        self.applied: Calibration | None = None
         self.scale = 1.0
         self.enabled = True
         self.rest: Dwell | None = None
@@ -75,7 +86,39 @@ class ActiveCalibration:
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
         self.scale = 1.0 if calibration is None else output_scale(calibration, self._g)
+        self.set_rotates(self._rotates)
+
+    def set_rotates(self, rotates: bool) -> None:
+        """Turn corrected messages into the levelled frame, or leave them in that of the sensor."""
+        self._rotates, self.applied = rotates, self.calibration
+        if self.calibration is not None and not rotates:
+            self.applied = self.calibration.in_sensor_frame
         self._hold()
+
+    @property
+    def gyro(self) -> GyroBias | None:
+        """
+        Bias of the gyro: of the last rest if it agrees with the stored one, or the stored one.
+
+        A platform that turns steadily is still for the accelerometer. A large change of the rate
+        is therefore not a bias.
+
+        """
+        stored = None if self.calibration is None else self.calibration.gyro
+        now = None if self.rest is None else gyro_bias_of_rest(self.rest)
+        if now is None:
+            return stored
+        if stored is None:
+            return now
+        step = np.abs(now.bias - stored.at(now.temperature))
+        return now if np.all(step < _LARGEST_BIAS_STEP) else stored
+
+    @property
+    def noise(self) -> SampleNoise | None:
+        """Noise of the samples: that of the calibration, or otherwise of the last rest."""
+        if self.calibration is not None and self.calibration.noise is not None:
+            return self.calibration.noise
+        return None if self.rest is None else SampleNoise(self.rest.std, self.rest.rate_std)
 
     @property
     def has_changed(self) -> bool:
@@ -135,9 +178,9 @@ class ActiveCalibration:
     def _force(self, rest: Dwell) -> Floats | None:
         """Return the corrected force of a rest [m/s²], or None if it cannot be corrected."""
         context = self._context(rest)
-        if self.calibration is None or context is None:
+        if self.applied is None or context is None:
             return None
-        return self.calibration.correct(rest.mean[np.newaxis], context)[0] * self.scale
+        return self.applied.correct(rest.mean[np.newaxis], context)[0] * self.scale
 
     def _context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
@@ -153,6 +196,18 @@ class ActiveCalibration:
         if self.gravity is None:
             return math.nan
         return float(np.linalg.norm(self.gravity)) / self._g - 1.0
+
+
+def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
+    """Return the bias of the gyro from one rest; None without a plausible angular rate."""
+    rate = rest.context.get('rate')
+    if rate is None or not np.all(np.isfinite(rest.rate_std)) or np.any(
+            np.abs(rate) > _LARGEST_BIAS):
+        return None
+    temperature = float(np.asarray(rest.context.get('temperature', math.nan)))
+    known = () if math.isnan(temperature) else (temperature, temperature)
+    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), 1,
+                    temperature, np.zeros(3), known)
 
 
 def context_of_rest(rest: Dwell, units: Units) -> Context:

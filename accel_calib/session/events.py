@@ -63,4 +63,12 @@ class ShowPoses:
     frame_id: str
 
 
-Event = Log | Still | ShowPoses | Job
+@dataclass(frozen=True)
+class Mounting:
+    """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
+
+    rotation: Floats
+    frame_id: str
+
+
+Event = Log | Mounting | Still | ShowPoses | Job

@@ -6,85 +6,32 @@ The state of the calibrator and its evaluation.
 
 ``/diagnostics`` and ``~/self_test`` report `Health`.
 
-**Statistics.** Statistics of a stream of messages.
-
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 import math
-from time import monotonic
 
+import numpy as np
+
+from .stream_statistics import SILENT, StreamStatistics
+from ..calibrate import GyroBias, SampleNoise
 from ..errors import counted
 from ..monitor import Drift, status
 from ..table import Floats
 from ..units import MG
-
-
-class StreamStatistics:
-    """
-    Statistics of a stream of messages; rates use a steady clock.
-
-    Attributes
-    ----------
-    messages : int
-        Number of messages.
-    not_finite, foreign, implausible : int
-        Numbers of dropped messages: readings that are not finite, messages of another sensor, and
-        corrected messages that are not plausible.
-    stamp : float
-        Stamp of the last message [s].
-    arrived : float
-        Time of its arrival, by the steady clock [s].
-    temperature : float
-        Last temperature [°C]; NaN: none.
-    reading : (3,) array
-        Last reading.
-    rate : float
-        Messages per second between the last two ticks.
-
-    """
-
-    def __init__(self) -> None:
-        self.messages = self.not_finite = self.foreign = self.implausible = 0
-        self.stamp = self.temperature = math.nan
-        self.arrived = self._dropped_at = -math.inf
-        self.reading: Floats | None = None
-        self.rate = 0.0
-        self._tick_at, self._messages_at_tick = monotonic(), 0
-
-    def add(self, rows: Floats, arrived: float) -> None:
-        """Count messages; parameters as in `Session.push`."""
-        self.messages += len(rows)
-        self.stamp, self.reading, self.arrived = float(rows[-1, 0]), rows[-1, 1:4], arrived
-
-    def drop(self, name: str, count: int = 1) -> None:
-        """Count dropped messages; `name` is ``not_finite``, ``foreign`` or ``implausible``."""
-        setattr(self, name, getattr(self, name) + count)
-        if name != 'implausible':  # its raw message is already counted
-            self.messages += count
-        self._dropped_at = monotonic()
-
-    @property
-    def dropped_ago(self) -> float:
-        """Time since the last dropped message [s]; infinite if there was none."""
-        return monotonic() - self._dropped_at
-
-    def tick(self) -> None:
-        """Update the rate from the messages since the last tick."""
-        now = monotonic()
-        self.rate = (self.messages - self._messages_at_tick) / max(now - self._tick_at, 1e-3)
-        self._tick_at, self._messages_at_tick = now, self.messages
-
 
 _DROPPED_SHOWN_FOR = 60.0
 """Duration of the warning after a dropped message [s]."""
 
 _LIKELY_G = (0.2, 5.0)
 """Range of |a| [g]; outside of it the unit is probably wrong."""
+
+_UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
+"""Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
 
 class Level(IntEnum):
@@ -104,6 +51,10 @@ class Health:
     ----------
     sensor, state, problem : str
         Name of the sensor; current state; reason why messages are not corrected, or empty.
+    topic : str
+        Topic of the raw messages, with namespace and remapping.
+    publishers : tuple of str
+        Names of the nodes that publish on this topic.
     calibration : str
         Model and date, or empty.
     outside : str
@@ -132,12 +83,20 @@ class Health:
         Largest standard deviation of a still axis [m/s², or native].
     next_pose : str
         The next pose, or that more poses no longer help.
+    mounting : str
+        The mounting, or empty if it is not known.
+    gyro : GyroBias or None
+        Bias of the gyro; None if it is not known.
+    noise : SampleNoise or None
+        Noise of the samples; None if it is not known.
 
     """
 
     sensor: str
     state: str
     problem: str
+    topic: str
+    publishers: tuple[str, ...]
     calibration: str
     outside: str
     file: str
@@ -153,6 +112,9 @@ class Health:
     last_interruption: str
     threshold: float
     next_pose: str
+    mounting: str
+    gyro: GyroBias | None
+    noise: SampleNoise | None
 
 
 @dataclass(frozen=True)
@@ -165,39 +127,72 @@ class Finding:
 
 
 def findings(health: Health) -> list[Finding]:
-    """Return the findings of all checks."""
-    return [_messages(health), _values(health), _calibration(health), _drift(health),
-            _storage(health)]
+    """Return the findings of all checks, one for each concern."""
+    return [_stream(health), _calibration(health), _drift(health), _storage(health)]
 
 
 def worst(health: Health) -> Finding:
     """Return the most severe finding, or the state if all findings are OK."""
     found = max(findings(health), key=lambda finding: finding.level)
-    return Finding('state', Level.OK, health.state) if found.level == Level.OK else found
+    if found.level == Level.OK:
+        return Finding('state', Level.OK, health.state)
+    return Finding('state', found.level, found.words)
 
 
-def _messages(health: Health) -> Finding:
-    if health.statistics.rate > 0.0:
-        return Finding('messages', Level.OK, f'{health.statistics.rate:.1f} Hz')
-    return Finding('messages', Level.WARN, 'no Imu messages on imu/data_raw: start the driver, or '
-                                           'remap the topic')
+def _stream(health: Health) -> Finding:
+    """Return the first fault of the stream, or its rate."""
+    fault = stream_fault(health.statistics, health.length, health.topic, health.publishers)
+    if fault:
+        return Finding('stream', Level.WARN, fault)
+    return Finding('stream', Level.OK, f'{health.statistics.rate:.1f} Hz on {health.topic}')
 
 
-def _values(health: Health) -> Finding:
-    counts = health.statistics
-    dropped = [words for count, words in (
-        (counts.not_finite, f'dropped {counted(counts.not_finite, "message")} with NaN or '
-                            'infinite readings: check the driver'),
-        (counts.foreign, f'dropped {counted(counts.foreign, "message")} of another sensor: use a '
-                         'separate topic for each sensor'),
-        (counts.implausible, f'dropped {counted(counts.implausible, "corrected message")} with '
-                             'implausible values: check the calibration')) if count]
-    if dropped and counts.dropped_ago < _DROPPED_SHOWN_FOR:
-        return Finding('values', Level.WARN, '; '.join(dropped))
-    if health.length < _LIKELY_G[0] or health.length > _LIKELY_G[1]:
-        return Finding('values', Level.WARN, f'|a| is {health.length:.3g} g, expected about 1 g '
-                                             'at rest: set the parameter units')
-    return Finding('values', Level.OK, 'finite, and about 1 g')
+def stream_fault(statistics: StreamStatistics, length: float, topic: str,
+                 publishers: Sequence[str]) -> str:
+    """Return what is wrong with the messages, and what to do; arguments as in `Health`."""
+    faults = (_publishers(topic, publishers), _silence(statistics, topic, publishers),
+              statistics.stamp_fault, _dropped(statistics), _wrong_unit(statistics, length))
+    return '; '.join(filter(None, faults))
+
+
+def _publishers(topic: str, names: Sequence[str]) -> str:
+    if len(names) < 2:
+        return ''
+    count = 'two' if len(names) == 2 else str(len(names))
+    return (f'{count} publishers on the topic {topic}: {", ".join(names)}; expected one sensor: '
+            'stop the others, or give each sensor its own topic')
+
+
+def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]) -> str:
+    if min(statistics.age, statistics.dropped_ago) <= SILENT:
+        return ''
+    if publishers:
+        return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
+                'the driver')
+    return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
+            'imu/data_raw to its topic')
+
+
+def _dropped(statistics: StreamStatistics) -> str:
+    if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
+        return ''
+    return '; '.join(words for count, words in (
+        (statistics.not_finite, f'dropped {counted(statistics.not_finite, "message")} with NaN or '
+                                'infinite readings: check the driver'),
+        (statistics.foreign, f'dropped {counted(statistics.foreign, "message")} of another '
+                             'sensor: use a separate topic for each sensor'),
+        (statistics.implausible, f'dropped {counted(statistics.implausible, "corrected message")} '
+                                 'with implausible values: check the calibration')) if count)
+
+
+def _wrong_unit(statistics: StreamStatistics, length: float) -> str:
+    if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
+        return ''
+    reading = statistics.reading
+    size = math.nan if reading is None else float(np.linalg.norm(reading))
+    likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
+    return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
+            f'units:={likely}')
 
 
 def _calibration(health: Health) -> Finding:
@@ -223,7 +218,8 @@ def _storage(health: Health) -> Finding:
     if health.writable:
         return Finding('storage', Level.OK, health.file)
     return Finding('storage', Level.ERROR, f'{health.file} cannot be written: correct the '
-                                           'permissions, or set calibration_file')
+                                           'permissions, or restart the node with another '
+                                           'calibration_file')
 
 
 def figures(health: Health) -> Iterable[tuple[str, str]]:
@@ -248,6 +244,13 @@ def figures(health: Health) -> Iterable[tuple[str, str]]:
     yield 'last interruption', health.last_interruption or 'none'
     yield 'temperature [°C]', _number(counts.temperature)
     yield 'still below [m/s² or native]', f'{health.threshold:.4g}'
+    yield 'mounting', health.mounting or 'not known'
+    if health.gyro is not None:
+        yield 'gyro bias [rad/s]', _vector(health.gyro.at(counts.temperature))
+        yield 'gyro bias, standard deviation [rad/s]', _vector(health.gyro.sd)
+    if health.noise is not None:
+        yield 'noise of acceleration [m/s² or native]', _vector(health.noise.force)
+        yield 'noise of angular velocity [rad/s]', _vector(health.noise.rate)
 
 
 def _drift_figures(drift: Drift | None) -> Iterable[tuple[str, str]]:
@@ -262,6 +265,10 @@ def _drift_figures(drift: Drift | None) -> Iterable[tuple[str, str]]:
     if drift.temperatures:
         low, high = drift.temperatures
         yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
+
+
+def _vector(values: Floats) -> str:
+    return ', '.join(f'{value:.4g}' for value in values)
 
 
 def _number(value: float) -> str:

@@ -20,7 +20,7 @@ a pose, the pose is marked as doubtful, and the fit leaves it out if possible.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -166,8 +166,9 @@ def _dwell_of(poses: Poses, k: int) -> Dwell:
     std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
     context = {key: poses[key][k] for key in _CONTEXT if key in poses}
     doubtful = 'doubtful' in poses and bool(poses['doubtful'][k])
+    rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
     return Dwell(time, time, time, poses.reading[k], std, count, max(1, round(count)), context,
-                 -1 - k, doubtful)
+                 -1 - k, doubtful, rate_std)
 
 
 LONG_REST = 300.0
@@ -232,9 +233,9 @@ class LiveCapture:
         self._looked = self._known_until = self._was_still = 0.0
         self._judged_at = float('inf')
 
-    def push(self, samples: Floats, capture: bool) -> list[Change]:
+    def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
-        Add samples.
+        Add samples, and yield the changes, each before the next samples are added.
 
         Parameters
         ----------
@@ -243,15 +244,16 @@ class LiveCapture:
         capture : bool
             Whether every rest becomes a pose.
 
-        Returns
-        -------
-        list of Change
-            The changes; empty for most blocks.
+        Yields
+        ------
+        Change
+            A change; most blocks have none.
 
         """
-        found = [self._after(self.detector.push(piece), float(piece[-1, 0]), capture)
-                 for piece in _pieces(samples)]
-        return [change for change in found if change is not None]
+        for piece in _pieces(samples):
+            change = self._after(self.detector.push(piece), float(piece[-1, 0]), capture)
+            if change is not None:
+                yield change
 
     def interrupt(self, capture: bool) -> list[Change]:
         """End the ongoing rest, because the stream is interrupted; parameters as in `push`."""

@@ -13,54 +13,42 @@ age of the last message uses a steady clock.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import math
-from pathlib import Path
 from time import monotonic
 
 import numpy as np
 
-from .active_calibration import ActiveCalibration, context_of_rest
-from .events import Compute, Event, Job, Log, Severity, ShowPoses, Still
-from .health import Health, StreamStatistics
+from .active_calibration import ActiveCalibration
+from .commands import Commands
+from .events import Compute, Event, Job, Log, Mounting, Severity, ShowPoses, Still
+from .guidance import Guide, Progress
+from .health import Health, stream_fault
 from .live_capture import Change, LiveCapture
 from .settings import CalibratorSettings, capture_settings
-from .store import load, Loaded, SensorFiles, Store
-from .work import (
-    asked_for,
-    fitted,
-    next_action,
-    poses_up,
-    refined,
-    story,
-    summary,
-    title,
-)
-from ..calibrate import Calibration, FLAT, level, NextPose, set_heading
-from ..capture import Dwell
+from .store import load, Loaded, SensorFiles, writing_advice
+from .stream_statistics import SILENT, StreamStatistics
+from .work import asked_for, is_partial, noise_of, poses_up, title
+from ..calibrate import Calibration, NextPose, with_given_mounting
+from ..calibrate.mounting import mounting_of, mounting_words
 from ..effects import Context
-from ..errors import (
-    AccelCalibError,
-    counted,
-    InputError,
-    RefusedFitError,
-    StoredCalibrationError,
-)
+from ..errors import AccelCalibError, counted, InputError
+from ..estimate.geometry import coverage
 from ..monitor import status
-from ..refine import Refinement
 from ..table import Floats, Poses
 from ..units import units_of
 
-_OLD = 0.5
-"""Largest age of the last message for a capture [s]."""
-
-_SILENT = 2.0
-"""Time without messages after which messages of another sensor are accepted [s]."""
-
 _AGAIN = 10.0
-"""Shortest time between two equal log lines about single messages [s]."""
+"""Shortest time between two equal log lines about single messages or a silent stream [s]."""
 
-_NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
+_FAULT_AGAIN = 60.0
+"""Shortest time between two equal log lines about another fault of the stream [s]."""
+
+_KIND = 20
+"""Number of letters that distinguish the kinds of faults."""
+
+_AUTO_FIT_EVERY = 60.0
+"""Shortest time between two automatic fits [s]."""
 
 
 class Session:
@@ -76,6 +64,15 @@ class Session:
     clock : callable
         Steady clock [s].
 
+    Attributes
+    ----------
+    commands : Commands
+        What the user can ask for.
+    preview : Calibration or None
+        A calibration that waits for ~/save or ~/undo.
+    publishers : tuple of str
+        Names of the nodes that publish the messages.
+
     Raises
     ------
     InputError
@@ -85,19 +82,26 @@ class Session:
 
     def __init__(self, settings: CalibratorSettings, topic: str,
                  clock: Callable[[], float] = monotonic) -> None:
-        self.settings = settings
+        self.settings, self.topic, self.clock = settings, topic, clock
         self.units = units_of(settings.units, settings.gravity)
         self.live = LiveCapture(capture_settings(settings), self.units)
-        self.active = ActiveCalibration(settings.gravity)
-        self.statistics = StreamStatistics()
+        self.active = ActiveCalibration(settings.gravity, rotates=settings.rotate)
+        self.statistics = StreamStatistics(clock)
         self.files = SensorFiles(settings, topic)
+        self.guide = Guide()
+        self.commands = Commands(self)
         self.frame_id: str | None = None
         self.problem = ''
-        self.next_pose = ''
-        self._clock = clock
+        self.publishers: tuple[str, ...] = ()
+        self.preview: Calibration | None = None
+        self.fitted_poses = 0
+        _check_frames(settings)
+        self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._loaded: set[str] = set()
-        self._still = False
-        self._fitted_poses = 0
+        self._still = self._auto_fit_waits = False
+        self._still_since = math.nan
+        self._reported, self._reported_at = '', -math.inf
+        self._auto_fit_at = -math.inf
         self._events: list[Event] = []
         if settings.sensor or settings.calibration_file:
             store = self.files.take(settings.sensor)
@@ -115,6 +119,15 @@ class Session:
     def publishes(self) -> bool:
         """Whether messages may be published: not while another node uses the files."""
         return self.files.store is None or self.files.locked
+
+    def set_settings(self, settings: CalibratorSettings) -> None:
+        """Replace the settings that can change while the node runs."""
+        before, self.settings = self.settings, settings
+        if settings.rotate != before.rotate:
+            self.active.set_rotates(settings.rotate)
+        if settings.model != before.model:
+            self.guide.asked = None
+            self._show_poses(store=False)
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order."""
@@ -136,7 +149,7 @@ class Session:
         if self.frame_id is None:
             self._bind(frame_id)
             return True
-        if self._clock() - self.statistics.arrived > _SILENT:
+        if self.clock() - self.statistics.arrived > SILENT:
             self._log('warning', f'the messages now have frame_id {frame_id!r} instead of '
                                  f'{self.frame_id!r}: switching to this sensor')
             self._switch_to(frame_id)
@@ -186,32 +199,47 @@ class Session:
         """Set the temperature of the following messages [°C]."""
         self.statistics.temperature = temperature
 
-    def _change(self, changes: list[Change]) -> None:
+    def _change(self, changes: Iterable[Change]) -> None:
         """Process the changes that samples caused."""
+        for change in changes:
+            self._report_still()
+            self._process(change)
+        self._report_still()
+
+    def _report_still(self) -> None:
         if self.live.detector.still is not self._still:
             self._still = not self._still
+            self._still_since = self.statistics.stamp - self.settings.still_window
             self._events.append(Still(self._still))
+
+    def _process(self, change: Change) -> None:
+        """Update the drift monitor and the poses."""
         least = self.settings.drift_warn / self.settings.gravity
-        for change in changes:
-            before = self.active.has_changed
-            if change.rest is not None:
-                self.active.update(change.rest, least)
-            for dwell in change.ended:
-                self.active.end(dwell, least)
-            if self.active.drift is not None and self.active.has_changed is not before:
-                self._log('warning', status(self.active.drift))
-            if change.doubted:
-                self._log('warning', f'the sensor may have moved during '
-                          f'{counted(change.doubted, "pose")}, according to later rests; a fit '
-                          'leaves out such poses if the others are sufficient')
-            if change.poses:
-                self._poses_changed(ended=bool(change.ended))
+        before = self.active.has_changed
+        if change.rest is not None:
+            self.active.update(change.rest, least)
+        for dwell in change.ended:
+            self.active.end(dwell, least)
+        if self.active.drift is not None and self.active.has_changed is not before:
+            self._log('warning', status(self.active.drift))
+        if change.doubted:
+            self._log('warning', f'the sensor may have moved during '
+                      f'{counted(change.doubted, "pose")}, according to later rests; a fit '
+                      'leaves out such poses if the others are sufficient')
+        if change.poses:
+            new = change.rest is not None and self.guide.is_new_rest(change.rest.start)
+            self.poses_changed(ended=bool(change.ended), new_rest=new)
 
     # The sensor and its files
 
     def _bind(self, frame_id: str) -> None:
         """Set the sensor from the first message."""
         self.frame_id = frame_id
+        self._log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}')
+        if frame_id and frame_id == self.settings.output_frame_id:
+            self._log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
+                      'turns levelled messages twice; choose another output_frame_id, or set '
+                      'rotate to false')
         if self.files.store is None or self._loaded - {self.sensor}:
             self._begin_again()
         elif not self.settings.sensor:
@@ -227,8 +255,9 @@ class Session:
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.live = LiveCapture(capture_settings(self.settings), self.units)
-        self.active = ActiveCalibration(self.settings.gravity)
-        self._fitted_poses = 0
+        self.active = ActiveCalibration(self.settings.gravity, rotates=self.settings.rotate)
+        self.guide, self.preview = Guide(), None
+        self.fitted_poses = 0
         store = self.files.take(self.sensor)
         self._check_lock()
         if store is not None:
@@ -248,253 +277,167 @@ class Session:
             self.live.book.add_stored(loaded.poses)
             self._log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
         if loaded.calibration is not None:
-            self._adopt(loaded.calibration)
+            self.adopt(loaded.calibration)
+            self.fitted_poses = len(loaded.calibration.poses)
         self.problem = loaded.problem
         for line in filter(None, (loaded.problem, *loaded.notes)):
             self._log('error', line)
         self._show_poses(store=False)
         return ''
 
-    def _adopt(self, calibration: Calibration | None) -> None:
-        """Use this calibration for the correction."""
+    def adopt(self, calibration: Calibration | None) -> None:
+        """Use this calibration for the correction, with the given mounting if there is one."""
+        self.preview, self.problem = None, ''
+        if calibration is None:
+            self.active.adopt(None)
+            return
+        stored, calibration = calibration, self.with_given(calibration)
+        if stored.is_levelled and not np.allclose(stored.rotation[:, 2],
+                                                  calibration.rotation[:, 2]):
+            self._log('warning', 'the stored mounting differs from the given one by more than 10° '
+                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.active.adopt(calibration)
-        self.problem = ''
-        if calibration is not None:
-            self._log('info', f'correcting with {title(calibration)}')
-            for line in calibration.warnings:
-                self._log('warning', line)
+        self._log('info', f'correcting with {title(calibration)}')
+        for line in calibration.warnings:
+            self._log('warning', line)
+        if calibration.is_levelled:
+            self._events.append(Mounting(calibration.rotation, self.frame_id or self.sensor))
+
+    def set_mounting(self, rotation: Floats) -> None:
+        """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
+        if self._given is not None and np.allclose(self._given, rotation):
+            return
+        self._given = rotation
+        self._log('info', mounting_words(rotation, self.frame_id or '', self.settings.base_frame))
+        if self.active.calibration is not None:
+            self.adopt(self.active.calibration)
+
+    def with_given(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with the given mounting, if there is one."""
+        if self._given is None:
+            return calibration
+        return with_given_mounting(calibration, self._given)
+
+    def present_context(self) -> Context:
+        """Return the temperature as one row of context, if known."""
+        temperature = self.statistics.temperature
+        return {} if math.isnan(temperature) else {'temperature': np.array([temperature])}
+
+    def offer(self, calibration: Calibration) -> None:
+        """Publish this calibration on ~/preview only."""
+        self.preview = calibration
 
     def tick(self) -> None:
-        """Update rates and try to lock the files; to be called about once per second."""
-        self.statistics.tick()
+        """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
             self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
+        self._report_stream()
+        self._auto_fit()
+
+    def _report_stream(self) -> None:
+        """Log a fault of the stream when it appears, and again while it lasts."""
+        fault = stream_fault(self.statistics, self.length_g(), self.topic, self.publishers)
+        silent = self.statistics.age > SILENT
+        again = self.clock() - self._reported_at >= (_AGAIN if silent else _FAULT_AGAIN)
+        if fault and (again or fault[:_KIND] != self._reported):
+            waiting = not self.statistics.messages
+            self._log('info' if waiting else 'warning', f'waiting: {fault}' if waiting else fault)
+            self._reported, self._reported_at = fault[:_KIND], self.clock()
+        elif not fault and self._reported:
+            self._log('info', f'messages arrive as expected, {self.statistics.rate:.1f} Hz')
+            self._reported = ''
 
     def close(self) -> None:
         """Unlock the files."""
         self.files.release()
 
-    # Commands
-
-    def capture_pose(self) -> str:
-        """Capture the ongoing rest as a pose."""
-        self._check_fresh()
-        dwell = self.live.capture_now()
-        if dwell is None:
-            raise self._not_still()
-        self._poses_changed(ended=False)
-        poses = self.live.book.poses()
-        asked = asked_for(poses, self.units, self.settings.model)
-        return (f'{counted(len(poses), "pose")}: the sensor has been still for '
-                f'{dwell.end - dwell.start:.1f} s; {next_action(asked)}')
-
-    def undo_pose(self) -> str:
-        """Remove the last pose."""
-        if not self.live.undo():
-            raise InputError('there are no poses to remove', 'capture a pose first')
-        self._poses_changed(ended=False)
-        count = len(self.live.book.poses())
-        return f'the last pose is removed; remaining: {counted(count, "pose")}'
-
-    def fit(self) -> Job:
-        """Fit the poses; use and store the calibration."""
-        store, before = self.files.usable(), self.active.calibration
-        self.live.refresh()
-        given = (self.live.book.poses(), self.units, self.settings, self.sensor, before,
-                 self._present_context())
-
-        def run(compute: Compute) -> tuple[Calibration, OSError | None]:
-            calibration = compute(fitted, *given)
-            return calibration, compute(_stored, store, calibration)
-
-        def finish(found: tuple[Calibration, OSError | None]) -> str:
-            self._use(*found)
-            return f'{summary(found[0])}; stored in {store.calibration}'
-
-        return Job(run, finish)
-
-    def refine(self) -> Job:
-        """Refine the calibration; use and store the refined calibration."""
-        store, before = self.files.usable(), self.active.calibration
-        self.live.refresh()
-        given = self.live.book.poses(), self.units, self.sensor, before
-
-        def run(compute: Compute) -> tuple[Refinement, OSError | None]:
-            refinement = compute(refined, *given)
-            if refinement.refusal:
-                return refinement, None
-            return refinement, compute(_stored, store, refinement.calibration)
-
-        def finish(found: tuple[Refinement, OSError | None]) -> str:
-            refinement, not_stored = found
-            if refinement.refusal:
-                raise RefusedFitError(f'{story(refinement)}; not used: {refinement.refusal[0]}',
-                                      refinement.refusal[1])
-            self._use(refinement.calibration, not_stored)
-            return f'{story(refinement)}; stored in {store.calibration}'
-
-        return Job(run, finish)
-
-    def set_level(self) -> Job:
-        """Level the mounting from the ongoing rest."""
-        calibration, rest = self._calibration_and_rest()
-        levelled = level(calibration, rest.mean, self.settings.frame,
-                         context_of_rest(rest, self.units))
-        return self._job_to_use(levelled, 'the mounting is levelled by this pose')
-
-    def set_heading(self) -> Job:
-        """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        calibration, rest = self._calibration_and_rest()
-        if not calibration.is_levelled:
-            raise InputError('the mounting is not levelled', 'place the robot flat and call '
-                             '~/set_level first, then tilt its nose down')
-        headed = set_heading(calibration, rest.mean, context_of_rest(rest, self.units))
-        return self._job_to_use(headed, 'the heading is set by this pose')
-
-    def _calibration_and_rest(self) -> tuple[Calibration, Dwell]:
-        """Return the calibration in use and the ongoing rest."""
-        if self.active.calibration is None:
-            raise _NO_CALIBRATION
-        self._check_fresh()
-        rest = self.live.detector.current()
-        if rest is None:
-            raise self._not_still()
-        return self.active.calibration, rest
-
-    def _job_to_use(self, calibration: Calibration, words: str) -> Job:
-        """Return the job that stores and uses a calibration with a new mounting."""
-        store = self.files.usable()
-
-        def finish(not_stored: OSError | None) -> str:
-            self._use(calibration, not_stored)
-            warnings = [each for each in calibration.warnings if each.startswith(FLAT)]
-            return '; '.join([f'{words}; stored in {store.calibration}', *warnings])
-
-        return Job(lambda compute: _stored(store, calibration), finish)
-
-    def save(self) -> Job:
-        """Store calibration and poses."""
-        store, calibration = self.files.usable(), self.active.calibration
-        if calibration is None:
-            raise _NO_CALIBRATION
-        poses = self.live.book.poses()
-
-        def run(compute: Compute) -> None:
-            store.save_calibration(calibration)
-            store.save_poses(poses)
-
-        return Job(run, lambda none: f'stored in {store.calibration} and {store.poses}')
-
-    def load(self) -> Job:
-        """Read the stored calibration again; if it is refused, the calibration in use is kept."""
-        store = self.files.usable()
-
-        def finish(calibration: Calibration | None) -> str:
-            if calibration is None:
-                raise StoredCalibrationError(f'{store.calibration} does not exist',
-                                             'call ~/fit, or copy a calibration there')
-            self._adopt(calibration)
-            return f'read {store.calibration}'
-
-        return Job(lambda compute: store.load_calibration(), finish)
-
-    def reset(self) -> Job:
-        """Remove poses and calibration; the stored files are renamed."""
-        store = self.files.usable()
-
-        def finish(kept: list[Path]) -> str:
-            self.live.clear()
-            self._adopt(None)
-            self._fitted_poses = 0
-            self._poses_changed(ended=False)
-            return 'poses and calibration are removed' + ''.join(
-                f'; the stored file is kept as {path.name}' for path in kept)
-
-        return Job(lambda compute: store.set_aside(), finish)
-
-    def enable(self, on: bool) -> str:
-        """Switch the correction on or off."""
-        self.active.enabled = on
-        return 'messages are corrected' if on else 'raw messages are published unchanged'
-
-    def _use(self, calibration: Calibration, not_stored: OSError | None) -> None:
-        """Use a calibration, and report it if it could not be stored."""
-        self._adopt(calibration)
-        if not_stored is not None:
-            raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
-                             'correct the permissions and call ~/save, or set calibration_file')
-
-    def _present_context(self) -> Context:
-        """Return the temperature as one row of context, if known."""
-        temperature = self.statistics.temperature
-        return {} if math.isnan(temperature) else {'temperature': np.array([temperature])}
-
-    def _check_fresh(self) -> None:
-        """Check that the last message is recent."""
-        age = self._clock() - self.statistics.arrived
-        if not self.statistics.messages:
-            raise InputError('there is no Imu message yet', 'start the driver')
-        if age > _OLD:
-            raise InputError(f'the last Imu message arrived {age:.1f} s ago, expected one within '
-                             f'{_OLD:g} s', 'check the driver and try again')
-
-    def _not_still(self) -> InputError:
-        """Return the error for a sensor that is not at rest."""
-        least, length = self.settings.min_dwell, self._length_g()
-        if abs(length - 1.0) > self.settings.still_norm_tolerance:
-            return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                              'hold the sensor still; if it is still, set the parameter units')
-        if not self.live.detector.still:
-            return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
-                              'check ~/still')
-        return InputError(f'the sensor has been still for less than {least:g} s',
-                          'hold it still for longer')
-
     # Poses and state
 
-    def _poses_changed(self, *, ended: bool) -> None:
-        """Draw and store the poses, and fit if auto_fit is set."""
-        self._show_poses(store=self.files.locked)
+    def poses_changed(self, *, ended: bool, new_rest: bool = False) -> None:
+        """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
+        self._show_poses(store=self.files.locked, new_rest=new_rest)
         count = len(self.live.book.poses())
-        enough = self.settings.auto_fit and count >= self.settings.auto_fit_poses
-        if enough and self.files.locked and (ended or count > self._fitted_poses):
-            self._fitted_poses = count
-            self._events.append(self.fit())
+        if ended or count > self.fitted_poses:
+            self._auto_fit_waits = True
+        self._auto_fit()
 
-    def _show_poses(self, *, store: bool) -> None:
+    def _auto_fit(self) -> None:
+        """Start an automatic fit if one is due."""
+        enough = len(self.live.book.poses()) >= self.settings.auto_fit_poses
+        due = self.clock() - self._auto_fit_at >= _AUTO_FIT_EVERY
+        if (self.settings.auto_fit and self._auto_fit_waits and enough and due
+                and self.files.locked):
+            self._auto_fit_waits, self._auto_fit_at = False, self.clock()
+            self._events.append(self.commands.auto_fit())
+
+    def _show_poses(self, *, store: bool, new_rest: bool = False) -> None:
         """Add a job that draws the poses with the next pose, and stores them."""
         poses, units, model = self.live.book.poses(), self.units, self.settings.model
         where = self.files.store if store else None
+        guide, count = self.guide, len(poses)
+        added = guide.added(count)
+        due = added != 0 or guide.asked is None
 
-        def run(compute: Compute) -> tuple[OSError | None, NextPose]:
+        def run(compute: Compute) -> tuple[OSError | None, NextPose | None]:
             not_stored = None
             try:
                 if where is not None:
                     where.save_poses(poses)
             except OSError as error:
                 not_stored = error
-            here = asked_for(poses, units, model) if not len(poses) else None
-            return not_stored, here or compute(asked_for, poses, units, model)
+            if not due:
+                return not_stored, None
+            if not count:
+                return not_stored, asked_for(poses, units, model)
+            return not_stored, compute(asked_for, poses, units, model)
 
-        def finish(found: tuple[OSError | None, NextPose]) -> str:
-            not_stored, asked = found
+        def finish(found: tuple[OSError | None, NextPose | None]) -> str:
+            not_stored, asked = found[0], found[1] or guide.asked
             if not_stored is not None:
-                self._log('error', f'the poses could not be stored: {not_stored}; correct the '
-                          'permissions, or set calibration_file', once_in=_AGAIN)
-            before, self.next_pose = self.next_pose, next_action(asked)
-            if len(poses) and self.next_pose != before:
-                self._log('info', f'{counted(len(poses), "pose")}; {self.next_pose}')
-            self._events.append(ShowPoses(poses_up(poses, units), asked, self.frame_id or ''))
-            return ''
+                self._log('error', f'the poses could not be stored: {not_stored}; '
+                          f'{writing_advice(not_stored)}', once_in=_AGAIN)
+            if asked is None:
+                return ''  # the sensor has changed in the meantime
+            up = poses_up(poses, units)
+            guide.adopt(asked, count, noise_of(poses, units), coverage(up) if count else 0.0)
+            self._events.append(ShowPoses(up, asked, self.frame_id or ''))
+            return guide.line(poses, units, added=added > 0) if new_rest else ''
 
         self._events.append(Job(run, finish))
+
+    @property
+    def _all_used(self) -> bool:
+        """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
+        return 0 < self.guide.poses == self.fitted_poses
+
+    @property
+    def advice(self) -> str:
+        """What to do next with the poses."""
+        if self._all_used:
+            return 'the calibration uses these poses'
+        return self.guide.advice
+
+    def progress(self) -> Progress:
+        """Return the progress of the calibration."""
+        guide, asked = self.guide, self.guide.asked
+        silent = self.statistics.age > SILENT
+        threshold = self.live.detector.threshold
+        direction = None if asked is None or self._all_used else asked.direction
+        return Progress(
+            still=self._still and not silent,
+            stillness=math.nan if silent else self.statistics.spread / threshold,
+            dwell=self.statistics.stamp - self._still_since if self._still else 0.0,
+            min_dwell=self.settings.min_dwell, poses=guide.poses,
+            total=0 if asked is None else asked.total, coverage=guide.coverage,
+            accuracy=math.nan if asked is None else asked.error * guide.noise_g,
+            advice=self.advice, direction=() if direction is None else tuple(direction.tolist()))
 
     def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:
         self._events.append(Log(severity, words, once_in))
 
-    def _length_g(self) -> float:
-        """Return |a| of the last message [g]; NaN if not known."""
+    def length_g(self) -> float:
+        """Return |a| of the last messages [g]; NaN if not known."""
         reading = self.statistics.reading
         if reading is None or self.units.name == 'native':
             return math.nan
@@ -510,39 +453,38 @@ class Session:
             rest_ago = 0.0 if detector.still else max(
                 0.0, self.statistics.stamp - active.rest.end)
         return Health(
-            sensor=self.sensor, state=self._state(), problem=self.problem,
+            sensor=self.sensor, state=self._state(), problem=self.problem, topic=self.topic,
+            publishers=self.publishers,
             calibration='' if active.calibration is None else title(active.calibration),
             outside='' if active.calibration is None else _outside(
                 active.calibration, {'temperature': self.statistics.temperature,
                                      'time': self.statistics.stamp}),
             file='' if store is None else str(store.calibration),
             writable=store is None or store.is_writable(),
-            statistics=self.statistics, length=self._length_g(), rest_ago=rest_ago,
+            statistics=self.statistics, length=self.length_g(), rest_ago=rest_ago,
             residual=active.residual, drift=active.drift, poses=len(poses),
             doubtful=_doubtful(poses), interruptions=len(breaks),
             last_interruption=f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else '',
-            threshold=detector.threshold, next_pose=self.next_pose)
+            threshold=detector.threshold, next_pose=self.advice,
+            mounting='' if active.calibration is None or not active.calibration.is_levelled
+            else mounting_words(active.calibration.rotation, self.frame_id or '',
+                                self.settings.base_frame),
+            gyro=active.gyro, noise=active.noise)
 
     def _state(self) -> str:
         if not self.publishes:
             return 'another node uses the files, nothing is published'
         if not self.active.enabled:
             return 'correction switched off, raw messages are published'
+        if self.preview is not None:
+            return 'a new calibration waits for ~/save or ~/undo'
         if self.active.calibration is not None:
-            return 'correcting'
+            return ('correcting, with a calibration of a part of the orientations'
+                    if is_partial(self.active.calibration) else 'correcting')
         if not self.statistics.messages:
             return 'waiting for the first message'
         return ('no calibration, raw messages are published' if self.settings.passthrough
                 else 'no calibration, nothing is published')
-
-
-def _stored(store: Store, calibration: Calibration) -> OSError | None:
-    """Store a calibration; return the error if it cannot be stored."""
-    try:
-        store.save_calibration(calibration)
-    except OSError as error:
-        return error
-    return None
 
 
 def _doubtful(poses: Poses) -> int:
@@ -557,3 +499,15 @@ def _outside(calibration: Calibration, now: dict[str, float]) -> str:
             found.append(f'{key} is {now[key]:.4g}, but the range of the calibration is {low:.4g} '
                          f'to {high:.4g}')
     return '; '.join(found)
+
+
+def _check_frames(settings: CalibratorSettings) -> None:
+    """Refuse settings of the mounting that contradict each other."""
+    if any(settings.mounting_rpy) and settings.base_frame:
+        raise InputError('both mounting_rpy and base_frame are set, expected one of them',
+                         'remove one')
+    if settings.publish_tf and settings.output_frame_id and (
+            settings.output_frame_id == settings.base_frame):
+        raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
+                         'robot, a child of the frame of the sensor',
+                         'set publish_tf to false, or choose another output_frame_id')

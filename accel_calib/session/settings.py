@@ -185,9 +185,29 @@ class CalibratorSettings:
         live=True)
     frame: FrameName = parameter(
         'ros', 'Levelled frame for ~/set_level', choices=FRAMES)
+    rotate: bool = parameter(
+        True, 'Turn corrected messages into the levelled frame once the mounting is known. false: '
+        'correct offset and gain alone, and stay in the frame of the sensor', live=True)
     output_frame_id: str = parameter(
-        '', 'frame_id of corrected messages. Empty: the frame_id of the incoming messages',
+        '', 'frame_id of messages in the levelled frame. Empty: <frame_id>_levelled', live=True)
+    mounting_rpy: list[float] = parameter(
+        [0.0, 0.0, 0.0], 'Mounting of the sensor on the robot, as in the origin of a URDF: roll, '
+        'pitch and yaw of the sensor in the frame of the robot [rad]. ~/set_level corrects its '
+        'tilt and keeps its heading. Zeros: not given')
+    base_frame: str = parameter(
+        '', 'Frame of the robot. The mounting is then taken from the static transforms between '
+        'this frame and that of the sensor, on /tf_static. Empty: not used')
+    publish_tf: bool = parameter(
+        False, 'Publish the levelled frame on /tf_static, as a child of the frame of the sensor')
+    gyro_bias: bool = parameter(
+        False, 'Subtract the bias of the gyro, measured at rest, from the angular velocity',
         live=True)
+    fill_covariance: bool = parameter(
+        False, 'State the noise of the samples, measured at rest, in messages with unknown '
+        'covariance', live=True)
+    confirm: bool = parameter(
+        False, 'Publish a new calibration or mounting on ~/preview only, until ~/save accepts it '
+        'or ~/undo discards it', live=True)
     calibration_file: str = parameter(
         '', 'File of the calibration; the poses are stored in the same folder. Empty: '
         '$ROS_HOME/accel_calib/<topic>@<frame_id>.yaml, or <sensor>.yaml if sensor is set; '
@@ -197,8 +217,8 @@ class CalibratorSettings:
     auto_capture: bool = parameter(
         True, 'Capture a pose at each rest of the sensor', live=True)
     auto_fit: bool = parameter(
-        False, 'Fit automatically after auto_fit_poses poses and after each further pose',
-        live=True)
+        False, 'Fit automatically after auto_fit_poses poses, at most once per minute, and use '
+        'the result if it differs from the calibration by more than its uncertainty', live=True)
     auto_fit_poses: int = parameter(12, 'Number of poses before the first automatic fit',
                                     limits=(4, 1000), live=True)
     still_window: float = parameter(

@@ -15,7 +15,9 @@ used, or that belong to another sensor, are renamed and never overwritten.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import errno
 import fcntl
+import glob
 import hashlib
 import itertools
 import os
@@ -25,7 +27,14 @@ import re
 from .settings import CalibratorSettings
 from ..calibrate import Calibration, check_sensor
 from ..errors import AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError
-from ..files import read_calibration, read_poses, write_calibration, write_table
+from ..files import (
+    copy_atomically,
+    read_calibration,
+    read_poses,
+    remove_leftovers,
+    write_calibration,
+    write_table,
+)
 from ..table import Poses
 from ..units import UnitName
 
@@ -34,6 +43,9 @@ _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
 _UNSAFE_OF_VERSION_1 = re.compile(r'[^A-Za-z0-9._-]+')
 _NAMELESS = 'imu'
 _LONGEST = 120
+
+MOST_STEPS = 100
+"""Number of earlier calibrations that are kept for ~/undo; older ones are removed."""
 
 
 class StoreInUseError(AccelCalibError):
@@ -154,15 +166,66 @@ class Store:
         return poses
 
     def save_calibration(self, calibration: Calibration) -> None:
-        """Write the calibration, and keep the previous file; raise OSError if it fails."""
+        """Write the calibration, and keep the file before as a step; raise OSError if it fails."""
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
+        self._keep_step()
+        write_calibration(self.calibration, replace(
+            calibration, sensor=self.identity.sensor, stream=self.identity.topic),
+            keep_before=False)
+
+    def _keep_step(self) -> None:
+        """Copy the file for `step_back`, or store an empty step if there is no file."""
         if self.calibration.exists():
             try:
                 self.load_calibration()
             except AccelCalibError:
                 aside(self.calibration, 'other')
-        write_calibration(self.calibration, replace(
-            calibration, sensor=self.identity.sensor, stream=self.identity.topic))
+        steps = self.steps()
+        step = self._step(1 + max(steps, default=0))
+        if self.calibration.exists():
+            copy_atomically(self.calibration, step)
+        else:
+            step.touch()
+        for old in steps[:len(steps) + 1 - MOST_STEPS]:
+            self._step(old).unlink(missing_ok=True)
+
+    def steps(self) -> list[int]:
+        """Return the numbers of the kept steps, oldest first."""
+        names = self.calibration.parent.glob(f'{glob.escape(self.calibration.name)}.before*')
+        numbers = (path.name.removeprefix(f'{self.calibration.name}.before') for path in names)
+        return sorted(int(number) for number in numbers if number.isdecimal())
+
+    def _step(self, number: int) -> Path:
+        return self.calibration.with_name(f'{self.calibration.name}.before{number}')
+
+    def step_back(self) -> Calibration | None:
+        """
+        Return to the calibration before the last stored one; None if there was none.
+
+        The last stored file is kept as ``<name>.undone<k>``.
+
+        Raises
+        ------
+        InputError
+            If there is no earlier step.
+        StoredCalibrationError
+            If the earlier calibration cannot be used.
+        OSError
+            If a file cannot be read or written.
+
+        """
+        steps = self.steps()
+        if not steps:
+            raise InputError('there is no earlier calibration', 'nothing can be undone')
+        step = self._step(steps[-1])
+        if self.calibration.exists():
+            copy_atomically(self.calibration, free_name(self.calibration, 'undone'))
+        if step.stat().st_size:
+            step.replace(self.calibration)
+            return self.load_calibration()
+        self.calibration.unlink(missing_ok=True)
+        step.unlink()
+        return None
 
     def save_poses(self, poses: Poses) -> None:
         """Write the poses, or remove the file if there are none; raise OSError if it fails."""
@@ -174,6 +237,8 @@ class Store:
 
     def set_aside(self) -> list[Path]:
         """Rename both files, and return the new paths; raise OSError if it fails."""
+        if self.calibration.exists():
+            self._keep_step()
         return [aside(path, 'reset') for path in (self.calibration, self.poses) if path.exists()]
 
     def is_writable(self) -> bool:
@@ -215,7 +280,8 @@ class Lock:
             self.release()
             raise StoreInUseError(
                 f'{store.calibration} is used by the node with process id {holder or "unknown"}',
-                'stop that node, or set calibration_file or sensor for this node') from None
+                'stop that node, or restart this node with another calibration_file or sensor'
+            ) from None
         os.ftruncate(self._handle, 0)
         os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
 
@@ -251,6 +317,8 @@ class Loaded:
 def load(store: Store) -> Loaded:
     """Read a store; damaged files are renamed."""
     notes = take_over(store)
+    for path in (store.calibration, store.poses):
+        remove_leftovers(path)
     calibration, poses, problem = None, None, ''
     try:
         calibration = store.load_calibration()
@@ -325,10 +393,24 @@ def take_over(store: Store) -> list[str]:
 
 def aside(path: Path, word: str) -> Path:
     """Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path."""
-    names = (path.with_name(f'{path.name}.{word}{k}') for k in itertools.count(1))
-    free = next(name for name in names if not name.exists())
+    free = free_name(path, word)
     path.replace(free)
     return free
+
+
+def free_name(path: Path, word: str) -> Path:
+    """Return ``<name>.<word><k>`` with the first free k."""
+    names = (path.with_name(f'{path.name}.{word}{k}') for k in itertools.count(1))
+    return next(name for name in names if not name.exists())
+
+
+def writing_advice(error: OSError) -> str:
+    """Return what to do about a file that cannot be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return 'free space on the disk'
+    if error.errno == errno.EROFS:
+        return 'mount the file system for writing, or restart the node with calibration_file'
+    return 'correct the permissions, or restart the node with another calibration_file'
 
 
 class SensorFiles:

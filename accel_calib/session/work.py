@@ -6,27 +6,40 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 import numpy as np
 
+from .active_calibration import gyro_bias_of_rest
 from .settings import CalibratorSettings
 from ..calibrate import (
     Calibration,
     directions_of,
+    fit_partial,
     fit_poses,
     level,
+    lies_in_cone,
     next_pose,
     NextPose,
+    PRIOR,
 )
 from ..calibrate.mounting import flat_direction
+from ..capture import Dwell, poses_from
 from ..effects import Context
 from ..errors import counted, listed, RefusedFitError
 from ..estimate.geometry import pose_noise
 from ..model import Model
 from ..refine import refine, Refinement
+from ..sphere import spread_directions
 from ..table import Floats, Poses
-from ..units import Units
+from ..units import MG, Units
 from ..words import now, residual_words, verdict_words
+
+_DIRECTIONS = 100
+"""Number of directions over which two calibrations are compared."""
+
+_FEWEST_IN_CONE = 4
+"""Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
 
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
@@ -60,8 +73,15 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
         If the readings are clearly in another unit.
 
     """
-    calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
-                            sensor=sensor, date=now())
+    try:
+        calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
+                                sensor=sensor, date=now())
+    except RefusedFitError:
+        up = poses_up(poses, units)
+        kept = before is not None and not is_partial(before)
+        if kept or len(up) < _FEWEST_IN_CONE or not lies_in_cone(up):
+            raise
+        calibration = fit_partial(poses, units, sensor=sensor, date=now())
     if before is None or not before.is_levelled:
         return calibration
     flat = flat_direction(before.frame) * before.force_per_g
@@ -69,6 +89,69 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
     headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
                      frame=before.frame)
     return level(headed, reading, before.frame, context)
+
+
+def is_partial(calibration: Calibration) -> bool:
+    """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
+    return calibration.method == PRIOR or not calibration.model.effects
+
+
+def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
+    """
+    Return a calibration from one rest: the offset along gravity, and the bias of the gyro.
+
+    Parameters
+    ----------
+    rest : Dwell
+        The rest.
+    units : Units
+        Unit of the readings.
+    sensor : str
+        Name of the sensor.
+    before : Calibration or None
+        The previous calibration. The offset and gain of a full fit are kept.
+
+    """
+    if before is None or is_partial(before):
+        rotation = np.eye(3) if before is None else before.rotation
+        found = fit_partial(poses_from([rest]), units, sensor=sensor, date=now())
+        before = replace(found, model=Model(found.model.values, rotation))
+    return replace(before, gyro=gyro_bias_of_rest(rest) or before.gyro)
+
+
+def change_words(before: Calibration | None, after: Calibration) -> str:
+    """Return what changes with a new calibration, as one line; empty without an earlier one."""
+    if before is None:
+        return ''
+    offset = after.units.to_g(after.offset - before.offset) * MG
+    gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
+    turn = before.rotation.T @ after.rotation
+    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))))
+    effects = sorted(set(before.model.effects) ^ set(after.model.effects))
+    words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
+             f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']
+    words += [f'{"with" if name in after.model.effects else "without"} {name}' for name in effects]
+    return f'changes {", ".join(words)}'
+
+
+def has_changed(before: Calibration | None, after: Calibration) -> bool:
+    """Return whether a fit differs from the calibration by more than its own uncertainty."""
+    if before is None or is_partial(before):
+        return True
+    up = spread_directions(_DIRECTIONS)
+    (gain, offset), (gain_before, offset_before) = (
+        each.model.linear_part for each in (after, before))
+    change = up @ (gain - gain_before).T + offset - offset_before
+    covariance = after.force_covariance(up * after.force_per_g) / after.force_per_g ** 2
+    return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
+
+
+def noise_of(poses: Poses, units: Units) -> float:
+    """Return the median noise of the poses [g]; NaN if it is not known."""
+    noise = pose_noise(poses.noise, poses_up(poses, units)) if len(poses) else None
+    if noise is None or units.name == 'native' or len(noise) != len(poses):
+        return math.nan
+    return float(np.median(units.to_g(noise)))
 
 
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
@@ -119,18 +202,9 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
     """Return the next pose, or that more poses no longer help."""
     up = poses_up(poses, units)
-    noise = pose_noise(poses.noise, up)
-    noise_g = None
-    if noise is not None and units.name != 'native':
-        noise_g = float(np.median(units.to_g(noise)))
-    return next_pose(up, '10' if model == 'auto' else model, noise, noise_g=noise_g)
-
-
-def next_action(asked: NextPose) -> str:
-    """Return a text about the next action of the user."""
-    if asked.direction is None:
-        return f'{asked.words}; call ~/fit'
-    return asked.words if np.isinf(asked.error) else f'{asked.words}, or call ~/fit'
+    noise_g = noise_of(poses, units)
+    return next_pose(up, '10' if model == 'auto' else model, pose_noise(poses.noise, up),
+                     noise_g=None if math.isnan(noise_g) else noise_g)
 
 
 def summary(calibration: Calibration) -> str:
@@ -141,6 +215,8 @@ def summary(calibration: Calibration) -> str:
     words = [f'model {calibration.name} from {len(calibration.used_poses)} of '
              f'{counted(len(calibration.poses), "pose")}: residual {quality.rms_before_mg:.2f} mg '
              f'before, {quality.rms_after_mg:.3f} mg after{floor}']
+    if is_partial(calibration):
+        words.append(calibration.reason)
     words += [f'pose {rejected.row} left out: {rejected.reason}'
               for rejected in calibration.rejected]
     return '; '.join([*words, *calibration.warnings])

@@ -1,0 +1,368 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The commands of a session: what the services of the node do.
+
+A command returns an answer, or a `Job` for long work, or raises an error that says what to do. If
+the parameter ``confirm`` is set, a new calibration is only offered: it is published on ~/preview,
+until ~/save stores it or ~/undo discards it.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .active_calibration import context_of_rest
+from .events import Compute, Job
+from .guidance import next_action
+from .store import Store, writing_advice
+from .work import (
+    asked_for,
+    at_rest,
+    change_words,
+    fitted,
+    has_changed,
+    refined,
+    story,
+    summary,
+)
+from ..calibrate import (
+    ARBITRARY_HEADING,
+    Calibration,
+    carried_words,
+    FLAT,
+    level,
+    mounting_only,
+    set_heading,
+)
+from ..calibrate.mounting import mounting_words
+from ..capture import Dwell, poses_from
+from ..effects import LADDER
+from ..errors import counted, InputError, RefusedFitError, StoredCalibrationError
+from ..refine import Refinement
+from ..words import now
+
+if TYPE_CHECKING:
+    from .session import Session
+
+_OLD = 0.5
+"""Largest age of the last message for a capture [s]."""
+
+_NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
+
+
+class Commands:
+    """The commands of a session, which is the only argument."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._refused = ''
+
+    # Poses
+
+    def capture_pose(self) -> str:
+        """Capture the ongoing rest as a pose."""
+        session = self._session
+        self._check_fresh()
+        dwell = session.live.capture_now()
+        if dwell is None:
+            raise self._not_still()
+        session.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
+        session.poses_changed(ended=False)
+        poses = session.live.book.poses()
+        asked = asked_for(poses, session.units, session.settings.model)
+        return (f'{counted(len(poses), "pose")}: the sensor has been still for '
+                f'{dwell.end - dwell.start:.1f} s; {next_action(asked)}')
+
+    def undo_pose(self) -> str:
+        """Remove the last pose."""
+        if not self._session.live.undo():
+            raise InputError('there are no poses to remove', 'capture a pose first')
+        self._session.poses_changed(ended=False)
+        count = len(self._session.live.book.poses())
+        return f'the last pose is removed; remaining: {counted(count, "pose")}'
+
+    # Calibrations
+
+    def fit(self) -> Job:
+        """Fit the poses; use and store the calibration."""
+        return self._fit(lambda before, found: True)
+
+    def auto_fit(self) -> Job:
+        """Fit the poses; use the result if it differs by more than its uncertainty."""
+        job = self._fit(lambda before, found: _is_linear(before) and has_changed(before, found))
+
+        def finish(found: object) -> str:
+            try:
+                words, self._refused = job.finish(found), ''
+            except RefusedFitError as error:
+                before, self._refused = self._refused, str(error)
+                if self._refused == before:
+                    return ''
+                raise
+            return words
+
+        return Job(job.run, finish)
+
+    def _fit(self, is_used: Callable[[Calibration | None, Calibration], bool]) -> Job:
+        session, store = self._session, self._session.files.usable()
+        before = self._present()
+        session.live.refresh()
+        poses = session.live.book.poses()
+        given = (poses, session.units, session.settings, session.sensor, before,
+                 session.present_context())
+        offered = session.settings.confirm
+
+        def run(compute: Compute) -> tuple[Calibration, bool, OSError | None] | RefusedFitError:
+            try:
+                calibration = compute(fitted, *given)
+            except RefusedFitError as error:
+                return error
+            used = is_used(before, calibration)
+            stored = used and not offered
+            return calibration, used, compute(_stored, store, calibration) if stored else None
+
+        def finish(found: tuple[Calibration, bool, OSError | None] | RefusedFitError) -> str:
+            if isinstance(found, RefusedFitError):
+                raise found
+            calibration, used, not_stored = found
+            session.fitted_poses = len(poses)
+            if not used:
+                return ''
+            words = [summary(calibration), change_words(before, calibration)]
+            return self._use(calibration, not_stored, words, offered=offered)
+
+        return Job(run, finish)
+
+    def refine(self) -> Job:
+        """Refine the calibration; use and store the refined calibration."""
+        session, store = self._session, self._session.files.usable()
+        before = self._present()
+        session.live.refresh()
+        given = session.live.book.poses(), session.units, session.sensor, before
+        offered = session.settings.confirm
+
+        def run(compute: Compute) -> tuple[Refinement, OSError | None]:
+            refinement = compute(refined, *given)
+            if refinement.refusal or offered:
+                return refinement, None
+            return refinement, compute(_stored, store, refinement.calibration)
+
+        def finish(found: tuple[Refinement, OSError | None]) -> str:
+            refinement, not_stored = found
+            if refinement.refusal:
+                raise RefusedFitError(f'{story(refinement)}; not used: {refinement.refusal[0]}',
+                                      refinement.refusal[1])
+            words = [story(refinement), change_words(before, refinement.calibration)]
+            return self._use(refinement.calibration, not_stored, words, offered=offered)
+
+        return Job(run, finish)
+
+    def set_level(self) -> Job:
+        """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
+        session, rest = self._session, self._rest()
+        calibration = self._present()
+        if calibration is None:
+            calibration = session.with_given(mounting_only(
+                poses_from([rest]), session.units, sensor=session.sensor, date=now()))
+        return self._job_to_use(self._levelled(calibration, rest),
+                                ['the mounting is levelled by this pose'])
+
+    def set_heading(self) -> Job:
+        """Set the heading of the mounting from the ongoing rest, with the nose down."""
+        calibration = self._present()
+        if calibration is None or not calibration.is_levelled:
+            raise InputError('the mounting is not levelled', 'place the robot flat and call '
+                             '~/set_level first, then tilt its nose down')
+        rest = self._rest()
+        headed = set_heading(calibration, rest.mean, context_of_rest(rest, self._session.units))
+        return self._job_to_use(headed, ['the heading is set by this pose'])
+
+    def calibrate_at_rest(self) -> Job:
+        """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
+        session, rest = self._session, self._rest()
+        before = self._present()
+        calibration = session.with_given(at_rest(rest, session.units, session.sensor, before))
+        words = [carried_words(calibration) if before is None or calibration.model is not
+                 before.model else 'offset and gain of the fit are kept']
+        if calibration.gyro is not None:
+            bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
+            words.append(f'gyro bias ({bias}) °/s')
+        return self._job_to_use(self._levelled(calibration, rest), words)
+
+    def _levelled(self, calibration: Calibration, rest: Dwell) -> Calibration:
+        """Return a calibration levelled by a rest; check it against the given mounting."""
+        session = self._session
+        levelled = level(calibration, rest.mean, session.settings.frame,
+                         context_of_rest(rest, session.units))
+        if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
+            raise InputError('this pose differs by more than 10° of tilt from the mounting in '
+                             'mounting_rpy or base_frame', 'place the robot level, or correct the '
+                             'given mounting and restart the node')
+        return levelled
+
+    def _present(self) -> Calibration | None:
+        """Return the calibration that a command starts from: the offered one, or that in use."""
+        return self._session.preview or self._session.active.calibration
+
+    def _job_to_use(self, calibration: Calibration, words: list[str]) -> Job:
+        """Return the job that stores and uses a calibration with a new mounting."""
+        store, offered = self._session.files.usable(), self._session.settings.confirm
+        words = [*words, change_words(self._present(), calibration), *(
+            each for each in calibration.warnings
+            if each.startswith(FLAT) or each == ARBITRARY_HEADING)]
+
+        def finish(not_stored: OSError | None) -> str:
+            return self._use(calibration, not_stored, words, offered=offered)
+
+        return Job(lambda compute: None if offered else _stored(store, calibration), finish)
+
+    def _use(self, calibration: Calibration, not_stored: OSError | None, words: list[str], *,
+             offered: bool) -> str:
+        """Use or offer a calibration, and return the answer."""
+        session = self._session
+        mounting = [] if not calibration.is_levelled else [mounting_words(
+            calibration.rotation, session.frame_id or '', session.settings.base_frame)]
+        if offered:
+            session.offer(calibration)
+            end = ('published on ~/preview only: call ~/save to use and store it, or ~/undo to '
+                   'discard it')
+            return '; '.join(filter(None, [*words, end, *mounting]))
+        session.adopt(calibration)
+        if not_stored is not None:
+            raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
+                             f'{writing_advice(not_stored)}, and call ~/save')
+        stored = f'stored in {session.files.usable().calibration}'
+        return '; '.join(filter(None, [*words, stored, *mounting]))
+
+    # Files
+
+    def save(self) -> Job:
+        """Use the offered calibration if there is one; store calibration and poses."""
+        session, store = self._session, self._session.files.usable()
+        calibration = self._present()
+        if calibration is None:
+            raise _NO_CALIBRATION
+        poses = session.live.book.poses()
+
+        def run(compute: Compute) -> None:
+            store.save_calibration(calibration)
+            store.save_poses(poses)
+
+        def finish(none: None) -> str:
+            if session.preview is calibration:
+                session.adopt(calibration)
+            return f'stored in {store.calibration} and {store.poses}'
+
+        return Job(run, finish)
+
+    def load(self) -> Job:
+        """Read the stored calibration again; if it is refused, the calibration in use is kept."""
+        session, store = self._session, self._session.files.usable()
+
+        def finish(calibration: Calibration | None) -> str:
+            if calibration is None:
+                raise StoredCalibrationError(f'{store.calibration} does not exist',
+                                             'call ~/fit, or copy a calibration there')
+            session.adopt(calibration)
+            return f'read {store.calibration}'
+
+        return Job(lambda compute: store.load_calibration(), finish)
+
+    def undo(self) -> Job | str:
+        """Discard the offered calibration, or return to the one before the last stored one."""
+        session = self._session
+        if session.preview is not None:
+            session.preview = None
+            return 'the calibration on ~/preview is discarded; the one in use is unchanged'
+        store = session.files.usable()
+
+        def finish(calibration: Calibration | None) -> str:
+            before = session.active.calibration
+            session.adopt(calibration)
+            session.fitted_poses = 0
+            if calibration is None:
+                return 'there is no calibration any more, as before the first fit'
+            changes = '' if before is None else f'; {change_words(before, calibration)}'
+            return f'the calibration of {calibration.date or "unknown date"} is in use{changes}'
+
+        return Job(lambda compute: store.step_back(), finish)
+
+    def reset(self) -> Job:
+        """Remove poses and calibration; the stored files are renamed."""
+        session, store = self._session, self._session.files.usable()
+
+        def finish(kept: list[Path]) -> str:
+            session.live.clear()
+            session.adopt(None)
+            session.fitted_poses = 0
+            session.poses_changed(ended=False)
+            return 'poses and calibration are removed' + ''.join(
+                f'; the stored file is kept as {path.name}' for path in kept)
+
+        return Job(lambda compute: store.set_aside(), finish)
+
+    def enable(self, on: bool) -> str:
+        """Switch the correction on or off."""
+        session = self._session
+        session.active.enabled = on
+        if not on:
+            return 'the correction is off: raw messages are published unchanged'
+        if session.active.calibration is None:
+            published = 'raw messages are' if session.settings.passthrough else 'nothing is'
+            return (f'the correction is on, but there is no calibration yet: {published} '
+                    'published; capture poses and call ~/fit')
+        return 'the correction is on: corrected messages are published'
+
+    # Checks
+
+    def _rest(self) -> Dwell:
+        """Return the ongoing rest."""
+        self._check_fresh()
+        rest = self._session.live.detector.current()
+        if rest is None:
+            raise self._not_still()
+        return rest
+
+    def _check_fresh(self) -> None:
+        """Check that the last message is recent."""
+        statistics = self._session.statistics
+        if not statistics.messages:
+            raise InputError('there is no Imu message yet', 'start the driver')
+        if statistics.age > _OLD:
+            raise InputError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
+                             f'one within {_OLD:g} s', 'check the driver and try again')
+
+    def _not_still(self) -> InputError:
+        """Return the error for a sensor that is not at rest."""
+        session = self._session
+        least, length = session.settings.min_dwell, session.length_g()
+        if abs(length - 1.0) > session.settings.still_norm_tolerance:
+            return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
+                              'hold the sensor still; if it is still, restart the node with the '
+                              'right units')
+        if not session.live.detector.still:
+            return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
+                              'check ~/still')
+        return InputError(f'the sensor has been still for less than {least:g} s',
+                          'hold it still for longer')
+
+
+def _is_linear(calibration: Calibration | None) -> bool:
+    """Return whether an automatic fit can replace a calibration: it has only offset and gain."""
+    return calibration is None or all(name in LADDER for name in calibration.model.effects)
+
+
+def _stored(store: Store, calibration: Calibration) -> OSError | None:
+    """Store a calibration; return the error if it cannot be stored."""
+    try:
+        store.save_calibration(calibration)
+    except OSError as error:
+        return error
+    return None

@@ -1,0 +1,195 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Guidance for the person who turns the sensor: one line per pose, and the progress.
+
+The next pose is chosen again only when a pose is added or removed. While a rest lasts, the advice
+therefore stays the same, although the average of its pose still changes.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibrate import NextPose
+from ..errors import InputError
+from ..table import Poses
+from ..units import MG, Units
+
+
+class _Figure(NamedTuple):
+    """The name of a figure, and the functions that write and read its value."""
+
+    name: str
+    write: Callable[[Any], str]
+    read: Callable[[str], Any]
+
+
+_FIGURES = {
+    'still': _Figure('still', lambda still: str(still).lower(),
+                     {'true': True, 'false': False}.__getitem__),
+    'stillness': _Figure('stillness [1: limit]', '{:.3g}'.format, float),
+    'dwell': _Figure('dwell [s]', '{:.1f}'.format, float),
+    'min_dwell': _Figure('min_dwell [s]', '{:g}'.format, float),
+    'poses': _Figure('poses', str, int),
+    'total': _Figure('poses in all, about', str, int),
+    'coverage': _Figure('coverage', '{:.3f}'.format, float),
+    'accuracy': _Figure('expected accuracy [mg]', lambda accuracy: f'{accuracy * MG:.3g}',
+                        lambda text: float(text) / MG),
+    'advice': _Figure('next pose', str, str),
+    'direction': _Figure('next direction',
+                         lambda parts: ' '.join(f'{part:.4f}' for part in parts),
+                         lambda text: tuple(map(float, text.split()))),
+}
+"""Figure of each field of `Progress`."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """
+    The progress of a calibration, for the topic ``~/progress``.
+
+    Parameters
+    ----------
+    still : bool
+        Whether the sensor is still.
+    stillness : float
+        Standard deviation of the last messages, relative to the largest of a still sensor; NaN: no
+        messages.
+    dwell, min_dwell : float
+        Length of the ongoing rest, and shortest rest that becomes a pose [s].
+    poses, total : int
+        Number of poses, and about how many there will be.
+    coverage : float
+        Share of the sphere within 45° of a pose.
+    accuracy : float
+        Expected error of |a| after a fit now [g]; infinite if the poses do not determine it, NaN
+        if the noise is not known.
+    advice : str
+        What to do next.
+    direction : tuple of float
+        Direction to point up, a unit vector in the sensor axes; empty: none.
+
+    """
+
+    still: bool
+    stillness: float
+    dwell: float
+    min_dwell: float
+    poses: int
+    total: int
+    coverage: float
+    accuracy: float
+    advice: str
+    direction: tuple[float, ...]
+
+    def figures(self) -> Iterator[tuple[str, str]]:
+        """Yield names and values."""
+        for field, figure in _FIGURES.items():
+            yield figure.name, figure.write(getattr(self, field))
+
+    @classmethod
+    def from_figures(cls, figures: Mapping[str, str]) -> Progress:
+        """
+        Return the progress with these figures, as `figures` yields them.
+
+        Raises
+        ------
+        InputError
+            If a figure is missing or cannot be read; other figures are ignored.
+
+        """
+        fields = {}
+        for field, (name, _, read) in _FIGURES.items():
+            try:
+                fields[field] = read(figures[name])
+            except (KeyError, ValueError) as err:
+                found = f'{name}: {figures[name]}' if name in figures else f'no figure {name}'
+                raise InputError(
+                    f'the progress of the node has {found}, expected the figures of this version',
+                    'install the same version of accel_calib on both machines') from err
+        return cls(**fields)
+
+
+class Guide:
+    """
+    The next pose, and the lines about captured poses.
+
+    Attributes
+    ----------
+    asked : NextPose or None
+        The next pose, or that more poses no longer help; None before the first choice.
+    poses : int
+        Number of poses for which it was chosen.
+    noise_g : float
+        Median noise of these poses [g]; NaN if not known.
+    coverage : float
+        Share of the sphere within 45° of one of them.
+
+    """
+
+    def __init__(self) -> None:
+        self.asked: NextPose | None = None
+        self.poses, self.coverage = 0, 0.0
+        self.noise_g = math.nan
+        self._count = 0
+        self._rest = -math.inf
+
+    @property
+    def advice(self) -> str:
+        """What to do next; empty before the first choice."""
+        return '' if self.asked is None else next_action(self.asked)
+
+    def added(self, count: int) -> int:
+        """Note this number of poses, and return by how many it has changed."""
+        change, self._count = count - self._count, count
+        return change
+
+    def is_new_rest(self, start: float) -> bool:
+        """Return whether a captured rest with this start has no line yet, and note it."""
+        new = start > self._rest
+        self._rest = max(start, self._rest)
+        return new
+
+    def adopt(self, asked: NextPose, count: int, noise_g: float, coverage: float) -> None:
+        """Use the next pose, with the attributes of the poses for which it was chosen."""
+        self.asked, self.poses, self.noise_g, self.coverage = asked, count, noise_g, coverage
+
+    def line(self, poses: Poses, units: Units, *, added: bool) -> str:
+        """
+        Return the line about a captured pose; empty if there is nothing new to report.
+
+        Parameters
+        ----------
+        poses : Poses
+            The poses; the captured one is the last.
+        units : Units
+            Unit of the readings.
+        added : bool
+            Whether the number of poses has increased; otherwise the rest repeats a pose.
+
+        """
+        if self.asked is None:
+            return ''
+        done = self.asked.direction is None
+        if not added:
+            return '' if done else f'this rest repeats an earlier pose; next: {self.advice}'
+        noise = '' if poses.noise is None or units.name == 'native' else (
+            f', {float(np.mean(units.to_g(poses.noise[-1]))) * MG:.2f} mg')
+        if done and len(poses) > self.asked.total:
+            return f'pose {len(poses)}{noise}'
+        return f'pose {len(poses)} of about {self.asked.total}{noise}, next: {self.advice}'
+
+
+def next_action(asked: NextPose) -> str:
+    """Return a text about the next action of the user."""
+    if asked.direction is None:
+        return f'{asked.words}; call ~/fit'
+    return f'{asked.words}, or call ~/fit' if asked.fits else asked.words
