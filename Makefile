@@ -1,7 +1,8 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-# Everything the targets need is put into .venv, from nothing but Python and make.
+# Everything the targets need is put into .venv, from nothing but Python and make. The tests of TF
+# also need a C++ compiler, and are skipped without one.
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
@@ -36,7 +37,7 @@ help:
 demo: $(VENV)/package
 	@$(BIN)/accel-calib demo
 
-test: $(VENV)/extra-test $(VENV)/package
+test: $(VENV)/extra-test $(VENV)/package $(VENV)/tf2_msgs
 	@PATH="$(CURDIR)/$(BIN):$$PATH" ROS_LOG_DIR="$${ROS_LOG_DIR:-$(CURDIR)/$(VENV)/log}" \
 		$(BIN)/python -m pytest $(PYTEST_ARGS)
 
@@ -64,6 +65,12 @@ $(VENV)/made:
 
 $(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
 	@$(PIP) install --no-build-isolation '.[ros,$*]'
+	@touch $@
+
+# Only for tests.
+$(VENV)/tf2_msgs: $(shell find test/tf2_msgs -type f) $(VENV)/extra-ros
+	@if command -v c++ >/dev/null; then test/tf2_msgs/build.sh $(BIN)/python; \
+		else echo 'There is no C++ compiler: the tests that need tf2_msgs are skipped.'; fi
 	@touch $@
 
 # build/lib keeps modules that the sources no longer have.

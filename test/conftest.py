@@ -76,9 +76,13 @@ class Bench:
         """Start a node of the package as a process."""
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_yaml(value)}')]
+        return self.run('-m', f'accel_calib.ros.{name}', '--ros-args', *given)
+
+    def run(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start Python as a process in the domain of this bench."""
         process = subprocess.Popen(
-            [sys.executable, '-m', f'accel_calib.ros.{name}', '--ros-args', *given], cwd=ROOT,
-            env=self._environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            [sys.executable, *arguments], cwd=ROOT, env=self._environment,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         self._processes.append(process)
         return process
 
@@ -88,7 +92,7 @@ class Bench:
         process = self.start('calibrator', **parameters)
         if self._imu is None:
             self._imu = self.node.create_publisher(Imu, 'imu/data_raw', 100)
-            self._came_out = self.listen(Imu, 'imu/data_calibrated')
+            self.came_out = self.listen(Imu, 'imu/data_calibrated')
         self.spin(lambda: self._imu.get_subscription_count() > 0)
         self.client('self_test')
         return process
@@ -151,8 +155,8 @@ class Bench:
 
         def answered() -> bool:
             nonlocal sent
-            if self._came_out or time.monotonic() - sent > 0.1:
-                self._came_out.clear()
+            if self.came_out or time.monotonic() - sent > 0.1:
+                self.came_out.clear()
                 self.send(make())
                 sent = time.monotonic()
             return bool(future.done())
@@ -185,16 +189,16 @@ class Bench:
         busy. Without a calibration, this needs `passthrough`.
 
         """
-        if not self._came_out:
+        if not self.came_out:
             rng = np.random.default_rng(1)  # moving, until both sides have discovered each other
-            self.exchange(self._came_out, lambda: self.imu(readings[0] + 3.0 * rng.normal(size=3)))
+            self.exchange(self.came_out, lambda: self.imu(readings[0] + 3.0 * rng.normal(size=3)))
             self.spin(lambda ends=time.monotonic() + 0.2: time.monotonic() > ends)
         for start in range(0, len(readings), _BATCH):
             batch = [self.imu(reading) for reading in readings[start:start + _BATCH]]
-            self._came_out.clear()
+            self.came_out.clear()
             for message in batch:
                 self.send(message)
-            self.spin(lambda batch=batch: len(self._came_out) >= len(batch), 5.0)
+            self.spin(lambda batch=batch: len(self.came_out) >= len(batch), 5.0)
 
     def echo(self, messages: Iterable[Any], heard: list[Any]) -> list[Any]:
         """Publish messages, each after the output of the previous one, and return the output."""
@@ -236,6 +240,26 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     made = Bench(tmp_path, next(_DOMAINS))
     yield made
     made.close()
+
+
+@pytest.fixture
+def tf_message() -> Any:
+    """Return the message type of transforms; `make test` builds tf2_msgs."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        pytest.skip('tf2_msgs is not installed; make test builds it')
+    return TFMessage
+
+
+@pytest.fixture
+def without_tf2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide tf2_msgs from this process, and from nodes of a `bench` that is requested after it."""
+    hidden = tmp_path / 'without_tf2'
+    hidden.mkdir()
+    (hidden / 'tf2_msgs.py').touch()  # a module without tf2_msgs.msg
+    monkeypatch.setenv('PYTHONPATH', str(hidden), prepend=os.pathsep)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
 
 
 EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),

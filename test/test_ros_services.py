@@ -13,7 +13,8 @@ from typing import Any
 from accel_calib.files import read_calibration, read_poses
 from accel_calib.model import Model
 from accel_calib.ros.display import pose_markers
-from accel_calib.session.work import asked_for, next_action
+from accel_calib.session.guidance import next_action
+from accel_calib.session.work import asked_for
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
@@ -33,9 +34,10 @@ def count(markers: list[Any], namespace: str = 'poses') -> int:
 
 def test_services_report_what_is_missing(bench: Any) -> None:
     bench.calibrator()
-    for name, words in (('fit', 'no Imu message yet'), ('set_level', 'there is no calibration'),
+    for name, words in (('fit', 'no Imu message yet'), ('set_level', 'no Imu message yet'),
                         ('capture_pose', 'no Imu message yet'), ('undo_pose', 'no poses'),
-                        ('save', 'no Imu message yet'), ('load', 'start the driver')):
+                        ('save', 'no Imu message yet'), ('undo', 'no Imu message yet'),
+                        ('calibrate_at_rest', 'no Imu message yet'), ('load', 'start the driver')):
         answer = bench.call(name)
         assert not answer.success, name
         assert words in answer.message, answer.message
@@ -218,7 +220,7 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     answer = bench.call('self_test')
     assert answer.passed == b'\x00'
     assert 'no Imu messages' in {status.name: status.message for status in answer.status}[
-        'accel_calib: messages']
+        'calibrator: stream']
     bench.exchange(corrected, moving)
     diagnostics.clear()
 

@@ -20,6 +20,7 @@ from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
@@ -40,6 +41,11 @@ def force_of(message: Imu) -> Any:
 def rate_of(message: Imu) -> Any:
     vector = message.angular_velocity
     return np.array([vector.x, vector.y, vector.z])
+
+
+def quaternion_of(message: Imu) -> Rotation:
+    q = message.orientation
+    return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
 def stamps(messages: list[Imu]) -> list[Any]:
@@ -68,13 +74,13 @@ def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored) 
     got = bench.exchange(heard, make)
     assert got.header.frame_id == 'base_link'
     assert got.header.stamp in [message.header.stamp for message in sent]
-    assert got.orientation == sent[0].orientation
-    np.testing.assert_array_equal(got.orientation_covariance, KNOWN)
+    assert quaternion_of(got).inv().approx_equal(
+        (quaternion_of(sent[0]) * Rotation.from_matrix(rotation)).inv(), 1e-9)
     np.testing.assert_allclose(force_of(got), calibration.correct(READING[None])[0], atol=1e-12)
     np.testing.assert_allclose(rate_of(got), rotation.T @ RATE, atol=1e-12)
     known = KNOWN.reshape(3, 3)
-    np.testing.assert_allclose(got.angular_velocity_covariance.reshape(3, 3),
-                               rotation.T @ known @ rotation, atol=1e-15)
+    for found in (got.angular_velocity_covariance, got.orientation_covariance):
+        np.testing.assert_allclose(found.reshape(3, 3), rotation.T @ known @ rotation, atol=1e-15)
     inverse = rotation.T @ np.linalg.inv(gain)
     added = got.linear_acceleration_covariance.reshape(3, 3) - inverse @ known @ inverse.T
     np.testing.assert_allclose(added, calibration.force_covariance(force_of(got)[None])[0],
@@ -91,7 +97,36 @@ def test_covariances_that_mean_absent_or_unknown_are_kept(bench: Any, stored: St
     np.testing.assert_array_equal(got.angular_velocity_covariance, absent)
     np.testing.assert_array_equal(got.orientation_covariance, absent)
     np.testing.assert_array_equal(got.linear_acceleration_covariance, np.zeros(9))
+    assert got.orientation == Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
+    assert got.header.frame_id == 'imu_link_levelled'
+
+
+def test_without_rotation_messages_stay_in_the_frame_of_the_sensor(
+        bench: Any, stored: Stored) -> None:
+    path = stored(flat=FLAT)
+    calibration = read_calibration(path)
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=path, rotate=False, output_frame_id='base_link')
+    got = bench.exchange(heard, lambda: full(bench, angular_velocity_covariance=KNOWN))
     assert got.header.frame_id == 'imu_link'
+    np.testing.assert_allclose(
+        force_of(got), calibration.matrix @ (READING - calibration.offset), atol=1e-12)
+    np.testing.assert_array_equal(rate_of(got), RATE)
+    np.testing.assert_array_equal(got.angular_velocity_covariance, KNOWN)
+    assert got.orientation == Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
+
+
+def test_a_nan_in_a_covariance_makes_it_unknown_and_spoils_nothing_else(
+        bench: Any, stored: Stored) -> None:
+    heard = bench.listen(Imu, 'imu/data_calibrated')
+    bench.calibrator(calibration_file=stored(flat=FLAT))
+    damaged = KNOWN.copy()
+    damaged[4] = np.nan
+    got = bench.exchange(heard, lambda: full(
+        bench, angular_velocity_covariance=KNOWN, linear_acceleration_covariance=damaged))
+    np.testing.assert_array_equal(got.linear_acceleration_covariance, np.zeros(9))
+    assert np.all(np.isfinite(force_of(got)))
+    assert np.all(got.angular_velocity_covariance.reshape(3, 3).diagonal() > 0.0)
 
 
 def test_readings_in_g_are_published_in_metres_per_second_squared(
@@ -150,7 +185,7 @@ def test_raw_messages_are_published_with_passthrough_and_when_switched_off(
         return sent[-1]
 
     assert bench.exchange(heard, make) in sent
-    stored('new.yaml')
+    stored('new.yaml', flat=FLAT)
     assert bench.call('load').success
     bench.exchange(heard, make)
     bench.spin(lambda: heard[-1].header.frame_id == 'base_link')

@@ -5,7 +5,8 @@
 The calibrator node: it converts messages, calls the session, and publishes its events.
 
 `accel_calib.session` contains the state, and `stream` processes Imu messages. Diagnostics use a
-steady clock, so they are also published without ``/clock``.
+steady clock, so they are also published without ``/clock``. `Calibrator` is the same for the plain
+node and for the managed node (`calibrator_lifecycle`).
 
 """
 
@@ -14,11 +15,12 @@ from __future__ import annotations
 from time import monotonic
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
@@ -26,14 +28,19 @@ from visualization_msgs.msg import MarkerArray
 
 from . import qos
 from .declare import declared, follow
-from .display import pose_markers, self_test_of, status_of
+from .display import pose_markers, progress_of, self_test_of, statuses_of
 from .services import Services, Worker
 from .stream import Stream
-from ..session import CalibratorSettings, Event, Job, Log, Session, ShowPoses, Still
+from .transforms import MountingBroadcaster, watch_static
+from ..messages.correction import output_frame
+from ..session import CalibratorSettings, Event, Job, Log, Mounting, Session, ShowPoses, Still
 
-_TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading', 'save',
-             'load', 'reset')
-"""Services that are methods of the session."""
+_TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
+             'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
+"""Services that are commands of the session."""
+
+_PROGRESS_EVERY = 0.25
+"""Shortest time between two messages of ~/progress without a new pose [s]."""
 
 
 class CalibratorNode(Node):
@@ -41,35 +48,82 @@ class CalibratorNode(Node):
 
     def __init__(self) -> None:
         super().__init__('calibrator')
-        self.session = Session(declared(self, CalibratorSettings),
-                               self.resolve_topic_name('imu/data_raw'))
-        follow(self, lambda: self.session.settings, self._set_settings)
-        self._worker = Worker(self, self._handle_events)
+        self._calibrator = Calibrator(self)
+
+    def start(self) -> None:
+        """Start; to be called when the node has an executor."""
+        self._calibrator.start()
+
+    def close(self) -> None:
+        """Finish writing, and release the files."""
+        self._calibrator.close()
+
+
+class Calibrator:
+    """
+    The topics, services and parameters of a calibrator in a node.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+
+    Raises
+    ------
+    InputError
+        If a parameter does not accept its value, or the settings contradict each other.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._name = node.get_fully_qualified_name().lstrip('/')
+        self._topic = node.resolve_topic_name('imu/data_raw')
+        settings = declared(node, CalibratorSettings)
+        self.session = Session(settings, self._topic)
+        self._broadcaster = MountingBroadcaster(node) if settings.publish_tf else None
+        self._transforms = (watch_static(node, self._on_transforms) if settings.base_frame
+                            else None)
+        self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
+        self._worker = Worker(node, self._handle_events)
         self._last_logged: dict[str, float] = {}
-        self._still = self.create_publisher(Bool, '~/still', qos.LATCHED)
-        self._poses = self.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._progress_at = 0.0
+        self._still = node.create_publisher(Bool, '~/still', qos.LATCHED)
+        self._poses = node.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
+        self._progress = node.create_publisher(DiagnosticStatus, '~/progress', qos.LATCHED)
+        self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._overrides = QoSOverridingOptions.with_default_policies()
         self.stream = Stream(
-            self.session, self.create_publisher(Imu, 'imu/data_calibrated', qos.STREAM),
-            self.create_publisher(Vector3Stamped, '~/linear_acceleration', qos.STREAM),
-            self._handle_events)
+            self.session, self._published(Imu, 'imu/data_calibrated'),
+            self._published(Imu, '~/preview'),
+            self._published(Vector3Stamped, '~/linear_acceleration'), self._handle_events)
         self._still.publish(Bool(data=False))
-        services = Services(self, self._worker, self._handle_events)
+        self._serve()
+
+    def _published(self, kind: Any, topic: str) -> Any:
+        return self._node.create_publisher(kind, topic, qos.STREAM,
+                                           qos_overriding_options=self._overrides)
+
+    def _serve(self) -> None:
+        services = Services(self._node, self._worker, self._handle_events)
         for name in _TRIGGERS:
             services.serve(name, self._command(name))
-        self.create_service(SetBool, '~/enable', self._on_enable)
-        self.create_service(SelfTest, '~/self_test', self._on_self_test)
+        self._node.create_service(SetBool, '~/enable', self._on_enable)
+        self._node.create_service(SelfTest, '~/self_test', self._on_self_test)
 
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
         self._handle_events()
-        self.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True)
-        self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
-        self.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node, overrides = self._node, self._overrides
+        node.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True,
+                                 qos_overriding_options=overrides)
+        node.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR,
+                                 qos_overriding_options=overrides)
+        node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _command(self, name: str) -> Any:
         """Return a command of the session that first processes all messages so far."""
-        command = getattr(self.session, name)
+        command = getattr(self.session.commands, name)
 
         def call() -> str | Job:
             self.stream.flush()
@@ -78,45 +132,62 @@ class CalibratorNode(Node):
 
         return call
 
-    def _set_settings(self, settings: CalibratorSettings) -> None:
-        self.session.settings = settings
-
     def _on_imu(self, data: bytes) -> None:
         try:
             self.stream.on_message(data)
         except RuntimeError:
-            if self.context.ok():
+            if self._node.context.ok():
                 raise  # otherwise a signal came during publishing
 
     def _on_temperature(self, message: Temperature) -> None:
         self.stream.set_temperature(message.temperature)
 
+    def _on_transforms(self) -> None:
+        """Take the mounting from the static transforms, as soon as they connect the frames."""
+        session = self.session
+        if self._transforms is None or not session.frame_id:
+            return
+        rotation = self._transforms.rotation(session.settings.base_frame, session.frame_id)
+        if rotation is not None:
+            session.set_mounting(rotation.T)
+
     def _on_tick(self) -> None:
         """Publish the diagnostics."""
+        self.session.publishers = tuple(
+            f'{each.node_namespace.rstrip("/")}/{each.node_name}'
+            for each in self._node.get_publishers_info_by_topic(self._topic))
         self.stream.flush()
         self.session.tick()
+        self._on_transforms()
         self._handle_events()
-        array = DiagnosticArray(status=[status_of(self.session.health())])
-        array.header.stamp = self.get_clock().now().to_msg()
+        array = DiagnosticArray(status=statuses_of(self.session.health(), self._name))
+        array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
-        response.success, response.message = True, self.session.enable(request.data)
+        response.success, response.message = True, self.session.commands.enable(request.data)
         return response
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
         health = self.session.health()
         response.id = health.sensor
-        response.status = self_test_of(health)
+        response.status = self_test_of(health, self._name)
         passed = all(status.level == b'\x00' for status in response.status)
         response.passed = b'\x01' if passed else b'\x00'
         return response
 
     def _handle_events(self) -> None:
         """Publish and log what the session reports."""
+        shown = False
         for event in self.session.events():
             self._handle(event)
+            shown |= isinstance(event, ShowPoses)
+        due = monotonic() - self._progress_at >= _PROGRESS_EVERY
+        if shown or (due and self._progress.get_subscription_count()):
+            self._progress_at = monotonic()
+            self._progress.publish(progress_of(self.session.progress(), self._name,
+                                               self.session.sensor))
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Log):
@@ -125,9 +196,20 @@ class CalibratorNode(Node):
             self._still.publish(Bool(data=event.still))
         elif isinstance(event, ShowPoses):
             self._poses.publish(pose_markers(event.up, event.asked, event.frame_id))
+        elif isinstance(event, Mounting):
+            self._broadcast(event)
         else:
             self._worker.run(event, lambda success, words: self._log(
                 Log('info' if success else 'warning', words)))
+
+    def _broadcast(self, event: Mounting) -> None:
+        """Publish the levelled frame as a child of the frame of the sensor."""
+        calibration = self.session.active.calibration
+        if self._broadcaster is None or calibration is None or not event.frame_id:
+            return
+        child = output_frame(calibration, event.frame_id, self.session.settings.output_frame_id)
+        self._broadcaster.publish(self._node.get_clock().now().to_msg(), event.frame_id, child,
+                                  event.rotation)
 
     def _log(self, line: Log) -> None:
         if not line.words:
@@ -137,7 +219,7 @@ class CalibratorNode(Node):
             if now - self._last_logged.get(kind, -line.once_in) < line.once_in:
                 return
             self._last_logged[kind] = now
-        log = self.get_logger()  # rclpy needs a separate line of code for each severity
+        log = self._node.get_logger()  # rclpy needs a separate line of code for each severity
         if line.severity == 'error':
             log.error(line.words)
         elif line.severity == 'warning':
@@ -147,5 +229,6 @@ class CalibratorNode(Node):
 
     def close(self) -> None:
         """Finish writing, and release the files."""
+        self._node.remove_on_set_parameters_callback(self._followed)
         self._worker.close()
         self.session.close()

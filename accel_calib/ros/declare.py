@@ -37,17 +37,30 @@ def declared(node: Node, kind: type[Settings]) -> Settings:
 
     """
     try:
-        values = {parameter.name: node.declare_parameter(
-            parameter.name, default_of(parameter), _descriptor(parameter)).value
-            for parameter in fields(kind)}
+        values = {parameter.name: _declared(node, parameter).value for parameter in fields(kind)}
     except InvalidParameterValueException as error:
         raise InputError(str(error), 'correct the value') from error
     return changed(kind(), values)
 
 
+def _declared(node: Node, parameter: Field[Any]) -> Parameter:
+    """Return a parameter; a managed node that is configured again has declared it before."""
+    if node.has_parameter(parameter.name):
+        return node.get_parameter(parameter.name)
+    return node.declare_parameter(parameter.name, default_of(parameter), _descriptor(parameter))
+
+
 def follow(node: Node, settings: Callable[[], Settings],
-           adopt: Callable[[Settings], None]) -> None:
-    """Pass new settings to `adopt` when parameters are set; refuse invalid values."""
+           adopt: Callable[[Settings], None]) -> Callable[..., Any]:
+    """
+    Pass new settings to `adopt` when parameters are set; refuse invalid values.
+
+    Returns
+    -------
+    callable
+        The callback, which ``node.remove_on_set_parameters_callback`` removes.
+
+    """
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         values = {parameter.name: parameter.value for parameter in parameters}
         try:
@@ -57,6 +70,7 @@ def follow(node: Node, settings: Callable[[], Settings],
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(on_set)
+    return on_set
 
 
 def _descriptor(parameter: Field[Any]) -> ParameterDescriptor:

@@ -19,28 +19,41 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..session import Finding, findings, Health, worst
-from ..session.health import figures
+from ..session.health import figures, Level
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from ..calibrate import NextPose
+    from ..session.guidance import Progress
     from ..table import Floats
 
 
-def status_of(health: Health) -> DiagnosticStatus:
-    """Return the diagnostics: the most severe finding, and the values."""
-    status = _status(worst(health), 'calibrator', health)
-    status.values = [KeyValue(key=key, value=value) for key, value in figures(health)]
-    return status
+def statuses_of(health: Health, node: str) -> list[DiagnosticStatus]:
+    """Return the diagnostics: the state with all values, and one status for each concern."""
+    state = _status(worst(health), node, health.sensor)
+    state.values = _values(figures(health))
+    return [state, *self_test_of(health, node)]
 
 
-def self_test_of(health: Health) -> list[DiagnosticStatus]:
+def self_test_of(health: Health, node: str) -> list[DiagnosticStatus]:
     """Return one status for each finding; the test passes if all are OK."""
-    return [_status(finding, finding.name, health) for finding in findings(health)]
+    return [_status(finding, node, health.sensor) for finding in findings(health)]
 
 
-def _status(finding: Finding, name: str, health: Health) -> DiagnosticStatus:
-    return DiagnosticStatus(level=bytes([finding.level]), name=f'accel_calib: {name}',
-                            message=finding.words, hardware_id=health.sensor)
+def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
+    """Return the progress of a calibration as a message."""
+    return DiagnosticStatus(level=bytes([Level.OK]), name=f'{node}: progress', hardware_id=sensor,
+                            message=progress.advice, values=_values(progress.figures()))
+
+
+def _status(finding: Finding, node: str, sensor: str) -> DiagnosticStatus:
+    return DiagnosticStatus(level=bytes([finding.level]), name=f'{node}: {finding.name}',
+                            message=finding.words, hardware_id=sensor)
+
+
+def _values(named: Iterable[tuple[str, str]]) -> list[KeyValue]:
+    return [KeyValue(key=key, value=value) for key, value in named]
 
 
 _CAPTURED = (0.2, 0.7, 0.3, 1.0)

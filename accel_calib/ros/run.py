@@ -78,12 +78,18 @@ def _run(node: str, args: Sequence[str] | None) -> int:
 
 def _spin(node: str) -> None:
     """Create the node and spin it."""
+    import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.task import Future
     module, name = node.split(':')
-    instance = getattr(import_module(module, __package__), name)()
-    executor = _executor()
-    executor.add_node(instance)
+    try:
+        instance = getattr(import_module(module, __package__), name)()
+        executor = _executor()
+        executor.add_node(instance)
+    except Exception:  # rclpy has many errors for a context that a signal has shut down
+        if rclpy.ok():
+            raise
+        return
     sys.setswitchinterval(_SWITCH)
     gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
     try:

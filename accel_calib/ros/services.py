@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 
 from ..errors import AccelCalibError
 from ..session import Job
+from ..session.store import writing_advice
 from ..session.worker_process import WorkerProcess
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class Worker:
         except AccelCalibError as error:
             words, success = str(error), False
         except OSError as error:
-            words = f'{error}; correct the permissions, or set calibration_file'
+            words = f'{error}; {writing_advice(error)}'
             success = False
         except Exception as error:
             self._node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import math
+import operator
 from time import monotonic
 from typing import Any
 
@@ -24,7 +25,7 @@ from sensor_msgs.msg import Imu
 
 from ..calibrate import Calibration
 from ..errors import AccelCalibError
-from ..messages.correction import motion_of, Rewriter
+from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.layout import (
     ACCELERATION,
     IMU_DOUBLES,
@@ -37,6 +38,7 @@ from ..messages.layout import (
     THREE,
 )
 from ..session import CalibratorSettings, Session
+from ..session.active_calibration import output_scale
 
 _TOGETHER = 0.3
 """
@@ -48,6 +50,44 @@ and 3 batches per second, these are less than 1 % of the messages.
 """
 
 _NO_LAYOUT = Layout(b'', 0, -1)
+_NO_BIAS = np.zeros(3)
+
+
+class Output:
+    """
+    A publisher of corrected messages, with the prepared correction.
+
+    Attributes
+    ----------
+    listeners : int
+        Number of subscribers; messages without subscribers are not computed.
+
+    """
+
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+        self.publish = publisher.publish
+        self.listeners = 0
+        self.rewriter: Rewriter | None = None
+        self._made_for: tuple[object, ...] = ()
+
+    def count(self) -> None:
+        """Count the subscribers."""
+        self.listeners = self._publisher.get_subscription_count()
+
+    def prepare(self, layout: Layout, calibration: Calibration | None, session: Session) -> None:
+        """Prepare the correction of messages by this calibration, unless it is prepared."""
+        settings, active = session.settings, session.active
+        fills = settings.fill_covariance and active.noise is not None
+        made_for = layout, calibration, settings, fills
+        if self._made_for and all(map(operator.is_, made_for, self._made_for)):
+            return
+        self._made_for, self.rewriter = made_for, None
+        if calibration is not None:
+            frame_id = output_frame(calibration, layout.frame_id, settings.output_frame_id)
+            self.rewriter = Rewriter(
+                layout, calibration, output_scale(calibration, settings.gravity),
+                settings.gravity, frame_id, active.noise if fills else None)
 
 
 class Stream:
@@ -58,27 +98,35 @@ class Stream:
     ----------
     session : Session
         The session; it receives the samples and contains the calibration.
-    calibrated, motion : Publisher
-        Publishers of corrected messages, and of the acceleration without gravity.
+    calibrated, preview, motion : Publisher
+        Publishers of corrected messages, of those by an offered calibration, and of the
+        acceleration without gravity.
     on_events : callable
         Function that is called after the session received samples.
 
     """
 
-    def __init__(self, session: Session, calibrated: Any, motion: Any,
+    def __init__(self, session: Session, calibrated: Any, preview: Any, motion: Any,
                  on_events: Callable[[], None]) -> None:
         self._session = session
-        self._calibrated, self._motion = calibrated, motion
+        self._calibrated, self._preview = Output(calibrated), Output(preview)
+        self._motion = Output(motion)
         self._on_events = on_events
         self._layout = _NO_LAYOUT
         self._waiting: list[bytes] = []
         self._temperatures: list[float] = []
         self._due = self._arrived = 0.0
         self._temperature = math.nan
-        self._listeners = self._motion_listeners = 0
-        self._rewriter: Rewriter | None = None
-        self._calibration: Calibration | None = None
+        self._listened = False
+        self._applied: Calibration | None = None
+        self._offered: Calibration | None = None
         self._settings: CalibratorSettings | None = None
+        self._active = True
+
+    def set_active(self, *, active: bool) -> None:
+        """Start or stop publishing."""
+        self._active = active
+        self._prepare()
 
     def set_temperature(self, temperature: float) -> None:
         """Set the temperature of the following messages [°C]; NaN is ignored."""
@@ -90,8 +138,6 @@ class Stream:
         """Correct and publish a serialized Imu message."""
         now = monotonic()
         due = now >= self._due
-        if due:
-            self._count_listeners()
         layout = self._layout
         if (len(data) != layout.size or data[:4] != LITTLE_ENDIAN
                 or data[NAME_AT:layout.name_end] != layout.name):
@@ -100,7 +146,11 @@ class Stream:
                 self._on_events()
                 return
             data = usual
-        if self._listeners or self._motion_listeners:
+        session = self._session
+        if (due or session.active.applied is not self._applied
+                or session.preview is not self._offered or session.settings is not self._settings):
+            self._prepare()
+        if self._listened:
             self._send(data)
         self._waiting.append(data)
         self._temperatures.append(self._temperature)
@@ -109,10 +159,22 @@ class Stream:
             self._due = now + _TOGETHER
             self.flush()
 
-    def _count_listeners(self) -> None:
-        """Count the subscribers; messages without subscribers are not computed."""
-        self._listeners = self._calibrated.get_subscription_count()
-        self._motion_listeners = self._motion.get_subscription_count()
+    def _prepare(self) -> None:
+        """Count the subscribers, and prepare the corrections."""
+        session = self._session
+        self._applied, self._offered = session.active.applied, session.preview
+        self._settings = session.settings
+        outputs = self._calibrated, self._preview, self._motion
+        for output in outputs:
+            output.count()
+        self._listened = self._active and any(output.listeners for output in outputs)
+        gyro = session.active.gyro if session.settings.gyro_bias else None
+        bias = _NO_BIAS if gyro is None else gyro.at(self._temperature)
+        for output, calibration in ((self._calibrated, self._applied),
+                                    (self._preview, self._offered)):
+            output.prepare(self._layout, calibration, session)
+            if output.rewriter is not None:
+                output.rewriter.bias = tuple(bias.tolist())
 
     def _adopted(self, data: bytes) -> bytes | None:
         """
@@ -132,29 +194,28 @@ class Stream:
             self.flush()
             if not self._session.accepts(layout.frame_id):
                 return None
-            self._layout, self._settings = layout, None
+            self._layout, self._settings = layout, None  # the corrections are prepared again
         return data
 
     def _send(self, data: bytes) -> None:
         """Publish the corrected message, or the raw message if so configured."""
         session = self._session
-        active, settings = session.active, session.settings
+        active = session.active
         if not session.publishes:
             return
-        if not active.enabled or (active.calibration is None and settings.passthrough):
+        if session.preview is not None and self._preview.listeners:
+            self._rewrite(data, self._preview)
+        if not active.enabled or (active.calibration is None and session.settings.passthrough):
             if math.isfinite(sum(THREE.unpack_from(data, self._layout.place(ACCELERATION)))):
                 self._calibrated.publish(data)
-            return
-        if active.calibration is not self._calibration or settings is not self._settings:
-            self._calibration, self._settings = active.calibration, settings
-            self._rewriter = None if active.calibration is None else Rewriter(
-                self._layout, active.calibration, active.scale, settings.gravity,
-                settings.output_frame_id)
-        if self._rewriter is not None:
-            self._rewrite(data, self._rewriter)
+        elif self._calibrated.listeners or self._motion.listeners:
+            self._rewrite(data, self._calibrated)
 
-    def _rewrite(self, data: bytes, rewriter: Rewriter) -> None:
+    def _rewrite(self, data: bytes, output: Output) -> None:
         """Publish the corrected message, and the acceleration without gravity."""
+        rewriter = output.rewriter
+        if rewriter is None:
+            return
         try:
             corrected = rewriter(data, self._temperature)
         except AccelCalibError as error:
@@ -162,10 +223,10 @@ class Stream:
             return
         if corrected is None:
             return
-        if self._listeners:
-            self._calibrated.publish(corrected)
+        if output.listeners:
+            output.publish(corrected)
         gravity = self._session.active.gravity
-        if self._motion_listeners and gravity is not None:
+        if self._motion.listeners and gravity is not None and output is self._calibrated:
             self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
 
     def flush(self) -> None:

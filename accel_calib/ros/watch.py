@@ -1,0 +1,199 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Receive the progress of a calibrator node.
+
+The node publishes ``~/progress`` up to four times per second while somebody listens, and at least
+once per second. A longer silence therefore means that the node or the network is down.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from time import monotonic
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import rclpy
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from . import qos
+from ..errors import InputError
+from ..session.guidance import Progress
+
+Show = Callable[[str, Progress | None, str], None]
+"""
+Function that shows the full name of the node, its progress, and a problem.
+
+The progress is None before the first message. The problem is empty if there is none.
+
+"""
+
+_LOOK_EVERY = 0.1
+"""Longest wait for a message before the end is checked [s]."""
+
+_FIRST = 6.0
+"""Longest wait for the first message [s]; DDS repeats a lost announcement after 3 s."""
+
+_SILENT = 3.0
+"""Longest wait for the next message [s]."""
+
+_NEXT = 1.5
+"""Wait for a second message [s]; the first one may have been published long ago."""
+
+_SUFFIX = '/progress'
+
+
+class _Receiver:
+    """
+    The subscription of the progress of a calibrator.
+
+    Attributes
+    ----------
+    name : str
+        Full name of the node, such as ``/left/calibrator``.
+    messages : int
+        Number of messages so far.
+
+    """
+
+    def __init__(self, node: Node, executor: SingleThreadedExecutor, name: str) -> None:
+        self._node, self._executor = node, executor
+        self._last: DiagnosticStatus | None = None
+        self._arrived = monotonic()
+        self.messages = 0
+        topic = f'{name.rstrip("/")}{_SUFFIX}'
+        try:
+            found = node.create_subscription(DiagnosticStatus, topic, self._on_message,
+                                             qos.LATCHED)
+        except InvalidTopicNameException as err:
+            raise InputError(f'--node is {name!r}, expected the name of a node',
+                             'set it to a name such as calibrator or left/calibrator') from err
+        self._topic = found.topic_name
+        self.name = self._topic.removesuffix(_SUFFIX)
+
+    def _on_message(self, message: DiagnosticStatus) -> None:
+        self._last, self._arrived = message, monotonic()
+        self.messages += 1
+
+    def spin(self) -> None:
+        """Wait a short time for a message."""
+        self._executor.spin_once(timeout_sec=_LOOK_EVERY)
+
+    @property
+    def progress(self) -> Progress | None:
+        """The last progress; None before the first message."""
+        last = self._last
+        return None if last is None else Progress.from_figures(
+            {each.key: each.value for each in last.values})
+
+    @property
+    def silence(self) -> float:
+        """Time since the last message, or since the start [s]."""
+        return monotonic() - self._arrived
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether a message is overdue."""
+        return self.silence > (_SILENT if self.messages else _FIRST)
+
+    def problem(self) -> tuple[str, str]:
+        """Return what was found and expected, and what to do, if no messages arrive."""
+        node, topic = self._node, self._topic
+        others = [name.removesuffix(_SUFFIX) for name, kinds in node.get_topic_names_and_types()
+                  if name.endswith(_SUFFIX) and 'diagnostic_msgs/msg/DiagnosticStatus' in kinds
+                  and name != topic and node.count_publishers(name)]
+        expected = f'expected a message on {topic} every second'
+        if node.count_publishers(topic):
+            return (f'{self.name} sends no message, {expected}',
+                    'check that the node still runs, and the network')
+        if others:
+            return (f'found {" and ".join(sorted(others))}, but not {self.name}, {expected}',
+                    f'set --node {min(others).lstrip("/")}')
+        return (f'found no calibrator {self.name}, {expected}',
+                'start it with accel-calib node, or check --node and ROS_DOMAIN_ID')
+
+
+def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str] = ()) -> None:
+    """
+    Show the progress of a calibrator at each message, and problems, until it is over.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node, with or without namespace.
+    show : callable
+        Function that is called for each message, and each time the problem changes.
+    is_over : callable
+        Function that returns whether to end; it is called about ten times per second.
+    args : sequence of str, optional
+        Arguments for ROS, starting with ``--ros-args``.
+
+    Raises
+    ------
+    InputError
+        If ROS does not start, the name is not valid, or the node has another version.
+
+    """
+    with _receiver(name, args) as receiver:
+        shown, problem = 0, ''
+        show(receiver.name, None, problem)
+        while not is_over():
+            receiver.spin()
+            before, problem = problem, ''
+            if receiver.is_silent:
+                problem = '; '.join(receiver.problem())
+            if receiver.messages != shown or problem != before:
+                shown = receiver.messages
+                show(receiver.name, receiver.progress, problem)
+
+
+def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
+            ) -> tuple[str, Progress | None]:
+    """
+    Return the full name of a calibrator and its progress now; None: it was over before.
+
+    Parameters
+    ----------
+    name, is_over, args
+        As in `watch`.
+
+    Raises
+    ------
+    InputError
+        As in `watch`, and if no node answers.
+
+    """
+    with _receiver(name, args) as receiver:
+        while receiver.messages < 2 and not is_over():
+            receiver.spin()
+            if receiver.messages and receiver.silence > _NEXT:
+                break
+            if receiver.is_silent:
+                raise InputError(*receiver.problem())
+        return receiver.name, receiver.progress
+
+
+@contextmanager
+def _receiver(name: str, args: Sequence[str]) -> Iterator[_Receiver]:
+    """Yield a receiver; the process keeps its own signal handlers."""
+    try:
+        rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as err:
+        raise InputError(f'ROS 2 does not start: {str(err).splitlines()[0]}',
+                         'check the arguments after --ros-args') from err
+    # A leading underscore hides the node from ros2 node list.
+    node = Node('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        yield _Receiver(node, executor, name)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()

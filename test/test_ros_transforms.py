@@ -1,0 +1,235 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Static transforms: the tree of frames, and the topic /tf_static between processes."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from accel_calib.errors import InputError
+from accel_calib.ros.transforms import (
+    MountingBroadcaster,
+    needs_tf2,
+    StaticTransforms,
+    TOPIC,
+    watch_static,
+)
+from accel_calib.sphere import quaternion_of, rotation_from_rpy
+from builtin_interfaces.msg import Time
+import numpy as np
+import pytest
+
+MAST = rotation_from_rpy(0.1, -0.2, 1.3)
+IMU = rotation_from_rpy(math.pi, 0.4, -0.7)
+LIDAR = rotation_from_rpy(0.0, 0.0, 0.5)
+BASE = rotation_from_rpy(0.02, 0.03, 2.0)
+UNIT = (0.0, 0.0, 0.0, 1.0)
+
+Link = tuple[str, str, tuple[float, ...]]
+
+PUBLISH = """
+import json
+import sys
+from accel_calib.ros import qos
+from geometry_msgs.msg import Quaternion, TransformStamped
+import rclpy
+from tf2_msgs.msg import TFMessage
+rclpy.init()
+publishers = []
+for k, links in enumerate(json.loads(sys.argv[1])):
+    node = rclpy.create_node(f'links_{k}')
+    publishers.append(node.create_publisher(TFMessage, '/tf_static', qos.LATCHED))
+    message = TFMessage()
+    for parent, child, quaternion in links:
+        stamped = TransformStamped(child_frame_id=child)
+        stamped.header.frame_id = parent
+        stamped.transform.rotation = Quaternion(**dict(zip('xyzw', quaternion)))
+        message.transforms.append(stamped)
+    publishers[-1].publish(message)
+print('published', flush=True)
+rclpy.spin(node)
+"""
+"""Publishes each list of links as one latched message of a node of its own."""
+
+BROADCAST = """
+import sys
+from accel_calib.ros.transforms import MountingBroadcaster
+from accel_calib.sphere import rotation_from_rpy
+from builtin_interfaces.msg import Time
+import rclpy
+rclpy.init()
+node = rclpy.create_node('broadcaster')
+broadcaster = MountingBroadcaster(node)
+for roll in (0.3, 0.4):
+    broadcaster.publish(Time(sec=7), '/imu_link', 'imu_link_levelled',
+                        rotation_from_rpy(roll, -0.2, 1.0))
+print('published', flush=True)
+rclpy.spin(node)
+"""
+
+
+def robot() -> StaticTransforms:
+    """
+    Return the transforms of a robot with a sensor on a mast.
+
+    footprint → base → mast → imu, and base → lidar.
+
+    """
+    tree = StaticTransforms()
+    for parent, child, rotation in (('mast', 'imu', IMU), ('footprint', 'base', BASE),
+                                    ('base', 'lidar', LIDAR), ('base', 'mast', MAST)):
+        assert tree.add(parent, child, quaternion_of(rotation))
+    return tree
+
+
+def published(bench: Any, source: str, *arguments: str) -> None:
+    """Run a script and wait until it has published."""
+    process = bench.run('-c', source, *arguments)
+    assert process.stdout.readline() == 'published\n'
+
+
+def publish(bench: Any, *messages: list[Link]) -> None:
+    published(bench, PUBLISH, json.dumps(messages))
+
+
+@pytest.mark.parametrize(('base', 'frame', 'expected'), [
+    ('base', 'mast', MAST),
+    ('base', 'imu', MAST @ IMU),
+    ('footprint', 'imu', BASE @ MAST @ IMU),
+    ('imu', 'base', (MAST @ IMU).T),
+    ('lidar', 'imu', LIDAR.T @ MAST @ IMU),
+    ('imu', 'lidar', (MAST @ IMU).T @ LIDAR),
+    ('imu', 'imu', np.eye(3)),
+])
+def test_rotations_are_multiplied_along_the_path(base: str, frame: str, expected: Any) -> None:
+    np.testing.assert_allclose(robot().rotation(base, frame), expected, atol=1e-12)
+
+
+def test_rotation_transforms_vectors_from_frame_to_base() -> None:
+    tree = StaticTransforms()
+    tree.add('base', 'imu', (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # turned left by 90°
+    np.testing.assert_allclose(tree.rotation('base', 'imu') @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(tree.rotation('imu', 'base') @ [1, 0, 0], [0, -1, 0], atol=1e-12)
+
+
+def test_frames_without_a_connection_have_no_rotation() -> None:
+    tree = robot()
+    tree.add('map', 'dock', UNIT)
+    assert tree.rotation('base', 'dock') is None
+    assert tree.rotation('base', 'unknown') is None
+    assert tree.rotation('unknown', 'imu') is None
+
+
+def test_leading_slash_is_ignored() -> None:
+    tree = StaticTransforms()
+    tree.add('/base', '/imu', quaternion_of(IMU))
+    for base, frame in (('base', 'imu'), ('/base', '/imu'), ('/base', 'imu')):
+        np.testing.assert_allclose(tree.rotation(base, frame), IMU, atol=1e-12)
+
+
+def test_new_transform_replaces_the_previous_one_of_its_child() -> None:
+    tree = robot()
+    assert not tree.add('mast', 'imu', quaternion_of(IMU))
+    assert tree.add('mast', 'imu', quaternion_of(LIDAR))
+    np.testing.assert_allclose(tree.rotation('base', 'imu'), MAST @ LIDAR, atol=1e-12)
+    assert tree.add('lidar', 'imu', quaternion_of(LIDAR))
+    np.testing.assert_allclose(tree.rotation('base', 'imu'), LIDAR @ LIDAR, atol=1e-12)
+
+
+def test_rounded_quaternions_give_proper_rotations() -> None:
+    tree = StaticTransforms()
+    tree.add('base', 'imu', [round(part, 3) for part in quaternion_of(IMU)])
+    found = tree.rotation('base', 'imu')
+    assert found is not None
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(found, IMU, atol=2e-3)
+
+
+@pytest.mark.parametrize(('parent', 'child', 'quaternion', 'words'), [
+    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), 'from mast to imu has the quaternion (0, 0, 0, 0) of '
+                                          'length 0, expected length 1; correct the node'),
+    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), '(0, nan, 0, 1) of length nan'),
+    ('mast', 'imu', (0.0, 0.0, math.inf, 1.0), 'of length inf'),
+    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'of length 2, expected length 1'),
+    ('', 'imu', UNIT, 'has an empty frame name'),
+    ('mast', '/', UNIT, 'has an empty frame name'),
+    ('imu', 'base', UNIT, 'from imu to base makes a loop'),
+    ('imu', 'imu', UNIT, 'from imu to imu makes a loop'),
+])
+def test_invalid_transforms_are_refused_and_change_nothing(
+        parent: str, child: str, quaternion: tuple[float, ...], words: str) -> None:
+    tree = robot()
+    with pytest.raises(InputError) as refusal:
+        tree.add(parent, child, quaternion)
+    assert words in str(refusal.value)
+    np.testing.assert_allclose(tree.rotation('footprint', 'imu'), BASE @ MAST @ IMU, atol=1e-12)
+
+
+@pytest.mark.parametrize(('parameter', 'instead'), [
+    ('base_frame', 'set mounting_rpy instead'), ('publish_tf', 'set publish_tf to false')])
+def test_without_tf2_msgs_its_parameters_are_refused(
+        without_tf2: None, bench: Any, parameter: str, instead: str) -> None:
+    words = (f'the parameter {parameter} needs the package tf2_msgs, which is not installed; '
+             f'install ros-jazzy-tf2-msgs, or {instead}')
+    with pytest.raises(InputError) as refusal:
+        needs_tf2(parameter)
+    assert str(refusal.value) == words
+    process = bench.run('-c', 'from accel_calib.ros.transforms import needs_tf2\n'
+                              f'needs_tf2({parameter!r})')
+    assert words in process.communicate(timeout=30)[0]
+
+
+def test_late_subscriber_receives_the_transforms_of_all_nodes(
+        tf_message: Any, bench: Any) -> None:
+    publish(bench,
+            [('base', 'mast', quaternion_of(MAST)), ('base', 'lidar', quaternion_of(LIDAR))],
+            [('/mast', 'imu', quaternion_of(IMU))])
+    changes: list[Any] = []
+    tree = watch_static(bench.node, lambda: changes.append(tree.rotation('base', 'imu')))
+    bench.spin(lambda: len(changes) == 2)
+    np.testing.assert_allclose(changes[-1], MAST @ IMU, atol=1e-12)
+    np.testing.assert_allclose(tree.rotation('lidar', 'imu'), LIDAR.T @ MAST @ IMU, atol=1e-12)
+
+
+def test_invalid_transform_is_logged_and_the_rest_of_its_message_is_used(
+        tf_message: Any, bench: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    changes: list[int] = []
+    tree = watch_static(bench.node, lambda: changes.append(1))
+    publish(bench, [('base', 'mast', (0.0, 0.0, 0.0, 0.0)), ('base', 'imu', quaternion_of(IMU))])
+    bench.spin(lambda: changes)
+    np.testing.assert_allclose(tree.rotation('base', 'imu'), IMU, atol=1e-12)
+    assert tree.rotation('base', 'mast') is None
+    log = capfd.readouterr().err
+    assert '[WARN]' in log
+    assert 'the static transform from base to mast has the quaternion (0, 0, 0, 0)' in log
+
+
+def test_repeated_transform_is_no_change(tf_message: Any, bench: Any) -> None:
+    changes: list[Any] = []
+    tree = watch_static(bench.node, lambda: changes.append(tree.rotation('base', 'imu')))
+    broadcaster = MountingBroadcaster(bench.node)
+    received = bench.listen(tf_message, TOPIC, latched=True)
+    for rotation in (IMU, IMU, MAST):
+        broadcaster.publish(Time(), 'base', 'imu', rotation)
+    bench.spin(lambda: len(received) == 3 and len(changes) >= 2)
+    np.testing.assert_allclose(changes, [IMU, MAST], atol=1e-12)
+
+
+def test_late_subscriber_receives_the_last_published_mounting(
+        tf_message: Any, bench: Any) -> None:
+    published(bench, BROADCAST)
+    received = bench.listen(tf_message, TOPIC, latched=True)
+    bench.spin(lambda: received)
+    assert len(received) == 1
+    stamped, = received[0].transforms
+    assert stamped.header.stamp == Time(sec=7)
+    assert (stamped.header.frame_id, stamped.child_frame_id) == ('imu_link', 'imu_link_levelled')
+    offset = stamped.transform.translation
+    assert (offset.x, offset.y, offset.z) == (0.0, 0.0, 0.0)
+    tree = watch_static(bench.node, lambda: None)
+    bench.spin(lambda: tree.rotation('imu_link', 'imu_link_levelled') is not None)
+    np.testing.assert_allclose(tree.rotation('imu_link', 'imu_link_levelled'),
+                               rotation_from_rpy(0.4, -0.2, 1.0), atol=1e-12)
