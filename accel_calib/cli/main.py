@@ -31,6 +31,7 @@ COMMANDS = {
     'apply': 'correct a recording with a calibration',
     'simulate': 'simulate poses or a recording of a sensor with known effects',
     'report': 'write a report about effects that a calibration lacks, with figures (HTML)',
+    'watch': 'show the progress of a calibrator node, and which pose is next',
     'node': 'run the calibrator node',
     'simulator': 'run the simulated Imu node',
 }
@@ -67,7 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
-    args = parser(own[:1]).parse_args(own)
+    try:
+        args = parser(own[:1]).parse_args(own)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     args.for_ros = for_ros
     try:
         status: int = args.run(args)

@@ -1,0 +1,245 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The view of ``accel-calib watch``: the progress of a calibration as a screen, or as lines.
+
+**Large words.** The sides of the sensor to point up are drawn in letters of 5 rows of pixels, so
+that they can be read from a distance. Two columns of the terminal, or half a row, are one pixel.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from ..calibrate.pose_planning import words_of
+from ..session.guidance import Progress
+from ..units import MG
+
+GOOD, BAD, NEXT = 'green', 'red', 'bold yellow'
+
+_SCALE = 2.0
+"""Stillness at the end of its bar; the limit is at its middle."""
+
+_WORDS = 30
+"""Width of the words beside the bars, so that the bars keep their length."""
+
+_OTHER_ROWS = 14
+"""Rows of the screen besides the large words."""
+
+_LETTERS = {
+    'A': '.#. #.# ### #.# #.#', 'B': '##. #.# ##. #.# ##.', 'C': '### #.. #.. #.. ###',
+    'E': '### #.. ##. #.. ###', 'F': '### #.. ##. #.. #..', 'G': '### #.. #.# #.# ###',
+    'H': '#.# #.# ### #.# #.#', 'I': '# # # # #', 'K': '#.# #.# ##. #.# #.#',
+    'L': '#.. #.. #.. #.. ###', 'M': '#...# ##.## #.#.# #...# #...#',
+    'N': '#..# ##.# #.## #..# #..#', 'O': '### #.# #.# #.# ###', 'P': '### #.# ### #.. #..',
+    'R': '##. #.# ##. #.# #.#', 'T': '### .#. .#. .#. .#.', ' ': '. . . . .',
+}
+"""Rows of pixels of each letter, from the top."""
+
+
+class _Row(NamedTuple):
+    """A row of the screen: what it shows, in words, and as the share of a bar (NaN: no bar)."""
+
+    label: str
+    words: str
+    share: float = math.nan
+    style: str = GOOD
+    limit: float = math.nan
+
+
+def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
+    """
+    Return the screen.
+
+    Parameters
+    ----------
+    node : str
+        Full name of the calibrator.
+    progress : Progress or None
+        Its progress; None before the first message.
+    problem : str, optional
+        Why no messages arrive, and what to do.
+
+    """
+    parts: list[RenderableType] = [Text(problem, style=f'bold {BAD}')] if problem else []
+    if progress is not None:
+        parts += [_table(_rows(progress)), '', *_next(node, progress)]
+    elif not problem:
+        parts.append(Text('waiting for the first message'))
+    return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
+
+
+def state(node: str, progress: Progress) -> Iterator[str]:
+    """Yield the lines of a progress: its rows, the next pose, and the call of ~/fit."""
+    for row in _rows(progress):
+        yield f'{row.label}: {row.words}'
+    yield f'next: {progress.advice or "wait"}'
+    if _sides(progress):
+        yield _direction(progress)
+    if _is_enough(progress):
+        yield fit_call(node)
+
+
+def captured(before: Progress | None, now: Progress) -> bool:
+    """Return whether a pose was captured in between."""
+    return before is not None and now.poses > before.poses
+
+
+def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
+    """Yield a line for each change that the user must know; all is new if `before` is None."""
+    if before is None or (before.poses, before.advice) != (now.poses, now.advice):
+        what = 'captured pose' if captured(before, now) else 'poses:'
+        yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
+               f'next: {now.advice or "wait"}{f": {fit_call(node)}" if _is_enough(now) else ""}')
+    if before is None or before.still != now.still:
+        yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
+
+
+def fit_call(node: str) -> str:
+    """Return the command that calls ~/fit."""
+    return f'ros2 service call {node}/fit std_srvs/srv/Trigger'
+
+
+def _rows(progress: Progress) -> list[_Row]:
+    now, style = progress, GOOD if progress.still else BAD
+    share = now.poses / max(now.poses, now.total, 1)
+    return [
+        _Row('stillness', _stillness(now), now.stillness / _SCALE, style, 1.0 / _SCALE),
+        _Row('dwell', _dwell(now), now.dwell / now.min_dwell, style),
+        _Row('poses', _count(now), share),
+        _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
+        _Row('accuracy', _accuracy(now))]
+
+
+def _stillness(progress: Progress) -> str:
+    if math.isnan(progress.stillness):
+        return 'no Imu messages yet'
+    digits = 2 if progress.stillness < 10.0 else 0
+    times = f'{progress.stillness:.{digits}f} times the limit'
+    return f'{"still" if progress.still else "moving"}, {times}'
+
+
+def _dwell(progress: Progress) -> str:
+    enough = progress.dwell >= progress.min_dwell
+    return f'{progress.dwell:.1f} s of {progress.min_dwell:g} s{", long enough" if enough else ""}'
+
+
+def _count(progress: Progress) -> str:
+    if progress.poses >= progress.total:
+        return str(progress.poses)
+    return f'{progress.poses} of about {progress.total}'
+
+
+def _accuracy(progress: Progress) -> str:
+    if math.isnan(progress.accuracy):
+        return 'not known'
+    if math.isinf(progress.accuracy):
+        return 'not determined by these poses'
+    return f'{progress.accuracy * MG:.2g} mg expected'
+
+
+def _is_enough(progress: Progress) -> bool:
+    """Return whether more poses no longer help, and the fit is not made yet."""
+    return not progress.direction and '~/fit' in progress.advice
+
+
+def _direction(progress: Progress) -> str:
+    return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
+
+
+def _next(node: str, progress: Progress) -> Iterator[RenderableType]:
+    """Yield the next action, in large words if it is a pose or the fit."""
+    sides = _sides(progress)
+    if _is_enough(progress):
+        yield from (_Large('CALL FIT', f'bold {GOOD}'), '')
+    elif sides:
+        yield from (_Large(sides, NEXT), '')
+    yield Text(progress.advice or 'wait', style='bold')
+    if sides:
+        yield Text(_direction(progress), style='dim')
+    if '~/fit' in progress.advice:
+        yield Text(fit_call(node), style='dim')
+
+
+def _sides(progress: Progress) -> str:
+    """Return the sides to point up, such as ``FRONT LEFT``; empty if the advice is another."""
+    if not progress.direction:
+        return ''
+    words = words_of(np.sign(np.round(np.array(progress.direction), 1)))
+    sides = words.removeprefix('the ').rsplit(' ', 1)[0]
+    return sides.upper() if words in progress.advice else ''
+
+
+def _table(rows: Iterable[_Row]) -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0), expand=True)
+    table.add_column(no_wrap=True)
+    table.add_column(ratio=1)
+    table.add_column(no_wrap=True, min_width=_WORDS)
+    for row in rows:
+        bar = '' if math.isnan(row.share) else _Bar(row)
+        table.add_row(Text(row.label), bar, Text(row.words))
+    return table
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """A bar that fills the available width, with a line at the limit."""
+
+    row: _Row
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        full, empty, line = '#-|' if options.ascii_only else '█░┃'
+        width = options.max_width
+        done = round(min(self.row.share, 1.0) * width)
+        text = Text(full * done, style=self.row.style, no_wrap=True)
+        text.append(empty * (width - done), style='dim')
+        if not math.isnan(self.row.limit):
+            at = min(round(self.row.limit * width), width - 1)
+            text = Text.assemble(text[:at], (line, 'bold white'), text[at + 1:], no_wrap=True)
+        yield text
+
+
+@dataclass(frozen=True)
+class _Large:
+    """Words in the largest letters that fit the terminal."""
+
+    words: str
+    style: str
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        rows = _pixels(self.words)
+        wide, half = _two_columns(rows), _half_rows(rows)
+        fitting = [lines for lines in (wide, half) if len(lines[0]) <= options.max_width
+                   and len(lines) <= console.height - _OTHER_ROWS]
+        lines = fitting[0] if fitting and not options.ascii_only else [self.words]
+        yield Text('\n'.join(lines), style=self.style)
+
+
+def _pixels(words: str) -> list[str]:
+    """Return the rows of pixels of words."""
+    letters = [_LETTERS[letter].split() for letter in words]
+    return ['.'.join(parts) for parts in zip(*letters)]
+
+
+def _two_columns(rows: list[str]) -> list[str]:
+    """Return lines with two columns for a pixel."""
+    return [''.join('██' if pixel == '#' else '  ' for pixel in row) for row in rows]
+
+
+def _half_rows(rows: list[str]) -> list[str]:
+    """Return lines with half a row for a pixel."""
+    blocks = {'..': ' ', '#.': '▀', '.#': '▄', '##': '█'}
+    padded = [*rows, '.' * len(rows[0])]
+    return [''.join(blocks[upper + lower] for upper, lower in zip(above, below))
+            for above, below in zip(padded[::2], padded[1::2])]

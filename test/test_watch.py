@@ -1,0 +1,226 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The view of ``accel-calib watch``, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+import io
+from itertools import product
+import math
+import sys
+from typing import Any
+
+from accel_calib.calibrate.pose_planning import next_pose, words_of
+from accel_calib.cli import watch
+from accel_calib.cli.main import main
+from accel_calib.cli.watch_view import changes, screen, state
+from accel_calib.errors import InputError
+from accel_calib.session.guidance import next_action, Progress
+from accel_calib.sphere import unit
+import numpy as np
+import pytest
+from rich.console import Console
+from rich.live import Live
+
+NODE = '/left/calibrator'
+NOISE_G = 0.0004
+
+
+def guided() -> Iterator[Progress]:
+    """Yield the progress of a person who follows the guidance, until more poses do not help."""
+    directions = np.zeros((0, 3))
+    while True:
+        asked = next_pose(directions, noise_g=NOISE_G)
+        up = () if asked.direction is None else tuple(asked.direction.tolist())
+        yield Progress(
+            still=True, stillness=0.5, dwell=0.6, min_dwell=1.0, poses=len(directions),
+            total=asked.total, coverage=len(directions) / 20, accuracy=asked.error * NOISE_G,
+            advice=next_action(asked), direction=up)
+        if asked.direction is None:
+            return
+        directions = np.vstack([directions, asked.direction])
+
+
+STEPS = list(guided())
+START, MIDDLE, ENOUGH = STEPS[0], STEPS[7], STEPS[-1]
+FITTED = replace(MIDDLE, advice='the calibration uses these poses')
+
+
+def drawn(view: Any, width: int = 80, height: int = 24, encoding: str = 'utf-8') -> str:
+    """Return what a terminal of this size shows, without colours."""
+    raw = io.BytesIO()
+    file = io.TextIOWrapper(raw, encoding)
+    Console(file=file, width=width, height=height, highlight=False).print(view)
+    file.flush()
+    return raw.getvalue().decode(encoding)
+
+
+def row(shown: str, label: str) -> str:
+    return next(line for line in shown.splitlines() if label in line)
+
+
+@pytest.mark.parametrize('progress', [*STEPS, FITTED, replace(
+    START, still=False, stillness=math.nan, accuracy=math.nan, advice='')])
+def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
+    figures = dict(progress.figures())
+    found = Progress.from_figures({**figures, 'a figure of a later version': '1'})
+    assert dict(found.figures()) == figures
+    assert found.direction == pytest.approx(progress.direction, abs=1e-4)
+    assert found.accuracy == pytest.approx(progress.accuracy, rel=0.01, nan_ok=True)
+    assert (found.still, found.poses, found.total, found.advice) == (
+        progress.still, progress.poses, progress.total, progress.advice)
+
+
+@pytest.mark.parametrize(('name', 'text', 'words'), [
+    ('poses', None, 'no figure poses'), ('still', 'perhaps', 'still: perhaps'),
+    ('dwell [s]', 'long', 'dwell \\[s\\]: long')])
+def test_figures_of_another_version_are_refused(name: str, text: str | None, words: str) -> None:
+    figures = dict(START.figures())
+    if text is None:
+        del figures[name]
+    else:
+        figures[name] = text
+    with pytest.raises(InputError, match=f'{words}, expected .* install the same version'):
+        Progress.from_figures(figures)
+
+
+def test_screen_shows_all_figures() -> None:
+    shown = drawn(screen(NODE, MIDDLE))
+    for words in (NODE, 'still, 0.50 times the limit', '0.6 s of 1 s', '7 of about 12',
+                  '35% of the sphere', 'not determined by these poses', MIDDLE.advice,
+                  'direction in sensor axes: +0.58 +0.58 -0.58'):
+        assert words in shown
+    assert f'{ENOUGH.accuracy * 1e3:.2g} mg expected' in drawn(screen(NODE, ENOUGH))
+
+
+def test_stillness_bar_reaches_its_line_at_the_limit() -> None:
+    bars = {stillness: row(drawn(screen(NODE, replace(MIDDLE, stillness=stillness))), 'stillness')
+            for stillness in (0.0, 0.5, 1.0, 1.5, 100.0)}
+    lengths = [bar.count('█') for bar in bars.values()]
+    width = lengths[-1] + 1
+    assert lengths == pytest.approx([0, width / 4, width / 2, width * 3 / 4 - 1, width - 1], abs=1)
+    assert len({bar.index('┃') for bar in bars.values()}) == 1
+    assert [next(part for part in ('░┃░', '█┃░', '█┃█') if part in bar)
+            for bar in bars.values()] == ['░┃░', '░┃░', '█┃░', '█┃█', '█┃█']
+    assert '█' not in row(drawn(screen(NODE, replace(MIDDLE, stillness=math.nan))), 'stillness')
+
+
+def test_dwell_bar_is_full_when_the_dwell_is_long_enough() -> None:
+    short, full = (row(drawn(screen(NODE, replace(MIDDLE, dwell=dwell))), 'dwell')
+                   for dwell in (0.9, 1.0))
+    assert '░' in short
+    assert 'long enough' not in short
+    assert '░' not in full
+    assert 'long enough' in full
+
+
+@pytest.mark.parametrize('signs', [
+    np.array(signs, float) for signs in product((-1, 0, 1), repeat=3) if any(signs)], ids=str)
+def test_every_next_pose_is_shown_in_large_words(signs: Any) -> None:
+    words = words_of(signs)
+    progress = replace(START, direction=tuple(unit(signs[np.newaxis])[0].tolist()),
+                       advice=f'turn the sensor so that {words} points up')
+    sides = words.removeprefix('the ').rsplit(' ', 1)[0].upper()
+    large = drawn(screen(NODE, progress))
+    assert sides not in large
+    below = large[large.index('accuracy'):]
+    assert '██' in below or '▀' in below
+    assert all(len(line) == 80 for line in large.splitlines())
+    assert f'│ {sides} ' in drawn(screen(NODE, progress), height=14)
+    narrow = drawn(screen(NODE, progress), width=40)
+    assert all(len(line) == 40 for line in narrow.splitlines())
+
+
+def test_large_words_are_drawn_pixel_by_pixel() -> None:
+    progress = replace(START, direction=(0.0, 1.0, 0.0), advice='now the left side points up')
+    letters = ['██      ██████  ██████  ██████',
+               '██      ██      ██        ██',
+               '██      ████    ████      ██',
+               '██      ██      ██        ██',
+               '██████  ██████  ██        ██']
+    lines = [line.strip('│ ') for line in drawn(screen(NODE, progress)).splitlines()]
+    assert lines[7:12] == letters
+    assert '█   █▀▀ █▀▀ ▀█▀' in drawn(screen(NODE, progress), height=18)
+
+
+def test_terminal_without_unicode_gets_ascii() -> None:
+    shown = drawn(screen(NODE, replace(MIDDLE, stillness=1.5)), encoding='ascii')
+    assert 'FRONT LEFT BOTTOM' in shown
+    assert '#|#' in row(shown, 'stillness')
+
+
+def test_end_of_the_poses_is_clear() -> None:
+    shown = drawn(screen(NODE, ENOUGH))
+    assert 'more poses no longer help' in shown
+    assert f'ros2 service call {NODE}/fit std_srvs/srv/Trigger' in shown
+    assert '██████  ██  ██████' in shown  # FIT
+    line, = changes(NODE, STEPS[-2], ENOUGH)
+    assert 'more poses no longer help' in line
+    assert line.endswith(f'~/fit: ros2 service call {NODE}/fit std_srvs/srv/Trigger')
+    assert list(state(NODE, ENOUGH))[-1] == f'ros2 service call {NODE}/fit std_srvs/srv/Trigger'
+
+
+def test_no_pose_is_asked_for_after_the_fit() -> None:
+    shown = drawn(screen(NODE, FITTED))
+    assert FITTED.advice in shown
+    assert 'direction' not in shown
+    assert 'ros2 service' not in shown
+    assert not any('direction' in line for line in state(NODE, FITTED))
+
+
+def test_problem_is_above_the_last_figures() -> None:
+    problem = f'found no calibrator {NODE}, expected a message; start it'
+    lines = drawn(screen(NODE, MIDDLE, problem)).splitlines()
+    assert problem in lines[1]
+    assert 'stillness' in lines[2]
+    assert drawn(screen(NODE, None, problem)).count('\n') == 3
+    assert 'waiting for the first message' in drawn(screen(NODE, None))
+
+
+def test_changes_are_one_line_each() -> None:
+    assert not list(changes(NODE, MIDDLE, replace(MIDDLE, stillness=0.7, dwell=0.8)))
+    assert list(changes(NODE, MIDDLE, replace(MIDDLE, still=False))) == ['moving']
+    assert list(changes(NODE, replace(MIDDLE, still=False), MIDDLE)) == ['still: hold it for 1 s']
+    line, = changes(NODE, STEPS[6], MIDDLE)
+    assert line == ('captured pose 7 of about 12; coverage 35%; accuracy not determined by these '
+                    f'poses; next: {MIDDLE.advice}')
+    line, = changes(NODE, STEPS[8], MIDDLE)  # ~/undo_pose
+    assert line.startswith('poses: 7 of about 12; ')
+    assert len(list(changes(NODE, None, MIDDLE))) == 2
+
+
+def test_lines_have_no_control_codes_and_report_problems_once(
+        capsys: pytest.CaptureFixture[str]) -> None:
+    lines = watch._Lines()
+    lines.show(NODE, None, '')
+    for problem in ('', 'no message; do this', 'no message; do this', ''):
+        lines.show(NODE, MIDDLE, problem)
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[2:] == ['no message; do this',
+                                        f'messages from {NODE} arrive again']
+    assert all(line.isprintable() for line in printed.splitlines())
+
+
+@pytest.mark.parametrize('bell', [True, False])
+def test_bell_rings_for_each_captured_pose(bell: bool) -> None:
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=80, height=24)
+    shown = watch._Screen(Live(console=console, auto_refresh=False), bell)
+    for progress in (None, MIDDLE, MIDDLE, STEPS[8], STEPS[8], MIDDLE, STEPS[8]):
+        shown.show(NODE, progress, '')
+    assert file.getvalue().count('\a') == (2 if bell else 0)
+
+
+def test_missing_ros_is_one_line(monkeypatch: pytest.MonkeyPatch,
+                                 capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    monkeypatch.setitem(sys.modules, 'diagnostic_msgs.msg', None)
+    monkeypatch.delitem(sys.modules, 'accel_calib.ros.watch', raising=False)
+    monkeypatch.delattr('accel_calib.ros.watch', raising=False)
+    assert main(['watch', '--once']) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert 'ROS 2 is not installed' in line
+    assert 'source /opt/ros/jazzy/setup.bash' in line
