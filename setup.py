@@ -6,6 +6,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 NAME = 'accel_calib'
+URL = 'https://github.com/accel-calib/accel_calib'
 
 setup(
     name=NAME,
@@ -14,7 +15,9 @@ setup(
                 'from still poses, and the named effects behind what is left.',
     author='The accel_calib authors',
     maintainer='The accel_calib authors',
-    maintainer_email='accel_calib@example.com',
+    maintainer_email='maintainers@users.noreply.h-seed-877d15be.example',
+    url=URL,
+    project_urls={'Repository': URL, 'Bug Tracker': f'{URL}/issues'},
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed']},
@@ -25,7 +28,9 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
         # Where ros2 run and launch look. Under colcon the entry points below land there too,
         # see setup.cfg; pip puts those into bin/ alone.
-        (f'lib/{NAME}', ['scripts/calibrator', 'scripts/simulator']),
+        (f'lib/{NAME}', [f'scripts/{name}' for name in (
+            'accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')]),
+        ('bin', ['scripts/bin/accel-calib']),
     ],
     zip_safe=True,
     python_requires='>=3.10',
@@ -59,6 +64,7 @@ setup(
         'console_scripts': [
             'accel-calib = accel_calib.cli.main:main',
             'calibrator = accel_calib.ros.calibrator:main',
+            'calibrator_lifecycle = accel_calib.ros.calibrator_lifecycle:main',
             'simulator = accel_calib.ros.simulator:main',
         ],
     },

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Start an installed executable as `ros2 run` does, and see that it is there over DDS.
+Start an installed executable as `ros2 run` does, and see that it works.
 
     probe.py EXECUTABLE PREFIX
 
-EXECUTABLE is calibrator or simulator; PREFIX is where the ament index must say that the package
-is installed. The exit status is 0 where the executable answers and ends with 0 on SIGINT.
+EXECUTABLE is accel-calib, calibrator, calibrator_lifecycle or simulator; PREFIX is where the ament
+index must say that the package is installed. The exit status is 0 if accel-calib prints its help,
+also when it is found in PATH; or if the node answers over DDS and ends with 0 on SIGINT.
 
 """
 
@@ -16,14 +17,17 @@ from __future__ import annotations
 from collections.abc import Callable
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import GetState
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -31,6 +35,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 PACKAGE = 'accel_calib'
+COMMAND = 'accel-calib'
 COMES_UP_SECONDS = 60.0
 ENDS_SECONDS = 30.0
 
@@ -62,18 +67,30 @@ def wait_for(node: Node, process: subprocess.Popen[bytes], what: str,
         rclpy.spin_once(node, timeout_sec=0.1)
 
 
+def answer_of(node: Node, process: subprocess.Popen[bytes], kind: Any, name: str) -> Any:
+    """Call a service without arguments."""
+    client = node.create_client(kind, name)
+    wait_for(node, process, f'service {name}', client.service_is_ready)
+    future = client.call_async(kind.Request())
+    wait_for(node, process, f'answer of {name}', future.done)
+    return future.result()
+
+
 def probe_calibrator(node: Node, process: subprocess.Popen[bytes]) -> None:
     """See diagnostics, and an answer to ~/fit: there are no poses, and it says so."""
     heard: list[DiagnosticArray] = []
     node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
     wait_for(node, process, 'message on /diagnostics', lambda: bool(heard))
-    fit = node.create_client(Trigger, '/calibrator/fit')
-    wait_for(node, process, 'service /calibrator/fit', fit.service_is_ready)
-    future = fit.call_async(Trigger.Request())
-    wait_for(node, process, 'answer of /calibrator/fit', future.done)
-    answer = future.result()
+    answer = answer_of(node, process, Trigger, '/calibrator/fit')
     if answer.success or not answer.message:
         raise ProbeError(f'/calibrator/fit without poses answers {answer}')
+
+
+def probe_lifecycle(node: Node, process: subprocess.Popen[bytes]) -> None:
+    """See a managed node that waits to be configured."""
+    state = answer_of(node, process, GetState, '/calibrator/get_state').current_state
+    if state.label != 'unconfigured':
+        raise ProbeError(f'the state is {state.label}, expected unconfigured')
 
 
 def probe_simulator(node: Node, process: subprocess.Popen[bytes]) -> None:
@@ -94,10 +111,23 @@ def end(process: subprocess.Popen[bytes]) -> None:
         raise ProbeError(f'ends with {status} on SIGINT')
 
 
-def probe(name: str, prefix: Path, folder: Path) -> None:
-    """Start the executable in an empty folder, look at it, end it."""
-    path = executable_path(name, prefix)
-    look = {'calibrator': probe_calibrator, 'simulator': probe_simulator}[name]
+def probe_command(path: Path, folder: Path) -> None:
+    """See the help of the command, where `ros2 run` looks and where a shell looks."""
+    in_path = shutil.which(COMMAND)
+    if in_path is None or not Path(in_path).is_relative_to(path.parents[2]):
+        raise ProbeError(f'{COMMAND} in PATH is {in_path}, expected it in {path.parents[2]}')
+    for each in (path, Path(in_path)):
+        done = subprocess.run([each, '--help'], cwd=folder, stdin=subprocess.DEVNULL,
+                              stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                              timeout=COMES_UP_SECONDS, check=False)
+        if done.returncode != 0 or 'verify' not in done.stdout:
+            raise ProbeError(f'{each} --help ends with {done.returncode}:\n{done.stdout}')
+
+
+def probe_node(name: str, path: Path, folder: Path) -> None:
+    """Start the node in an empty folder, look at it, end it."""
+    look = {'calibrator': probe_calibrator, 'calibrator_lifecycle': probe_lifecycle,
+            'simulator': probe_simulator}[name]
     output = folder / 'output'
     environment = {**os.environ, 'ROS_HOME': str(folder)}
     with output.open('wb') as stream:
@@ -125,7 +155,11 @@ def main() -> int:
     rclpy.init(args=[])
     try:
         with tempfile.TemporaryDirectory() as folder:
-            probe(name, Path(prefix), Path(folder))
+            path = executable_path(name, Path(prefix))
+            if name == COMMAND:
+                probe_command(path, Path(folder))
+            else:
+                probe_node(name, path, Path(folder))
     except ProbeError as error:
         print(error, file=sys.stderr)
         return 1

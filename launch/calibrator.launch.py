@@ -6,44 +6,143 @@ Start the calibrator for the driver of a robot.
 
     ros2 launch accel_calib calibrator.launch.py imu:=camera/imu output:=camera/imu_calibrated
 
+`ros2 launch accel_calib calibrator.launch.py --show-args` lists all arguments.
+
+**Names of topics.** A name without a leading slash is inside `namespace`, a name with a leading
+slash is not. Only the default of `temperature` has a leading slash: with ``namespace:=left`` the
+node listens to ``/left/imu/data_raw`` and to ``/temperature``, so that several Imus can share one
+thermometer. If the driver in the namespace publishes the temperature, add
+``temperature:=temperature``.
+
+**Parameters.** An argument that is empty does not override `params_file`.
+
+**Lifecycle.** With ``lifecycle:=true`` the node is a managed node. This file configures and
+activates it once; later transitions are up to you, for example by `ros2 lifecycle set`.
+
 """
+
+import re
+from typing import Any
 
 from ament_index_python.packages import get_package_share_path
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    OpaqueFunction,
+    RegisterEventHandler,
+)
+from launch.conditions import IfCondition
+from launch.events import matches_action
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import LifecycleNode, Node
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState
 from launch_ros.parameter_descriptions import ParameterValue
+from lifecycle_msgs.msg import Transition
+
+TOPICS = {
+    'imu': ('imu/data_raw', 'imu/data_raw', 'Topic of the readings (sensor_msgs/Imu).'),
+    'temperature': (
+        'temperature', '/temperature',
+        'Topic of the temperature of the sensor (sensor_msgs/Temperature), optional. The default '
+        'is outside the namespace; temperature:=temperature is inside.'),
+    'output': ('imu/data_calibrated', 'imu/data_calibrated',
+               'Topic of the corrected readings (sensor_msgs/Imu).'),
+    'linear_acceleration': (
+        '~/linear_acceleration', '~/linear_acceleration',
+        'Topic of the acceleration without gravity (geometry_msgs/Vector3Stamped).'),
+}
+"""Topics by argument: name in the node, default and description."""
+
+PARAMETERS = {
+    'units': (str, 'Unit of the incoming linear_acceleration: m/s2, g or native.'),
+    'model': (str, 'Model for ~/fit: auto, 4, 7, 9 or 10.'),
+    'frame': (str, 'Levelled frame: ros, ned, android or win8.'),
+    'output_frame_id': (str, 'frame_id of messages in the levelled frame.'),
+    'rotate': (bool, 'Whether to turn corrected messages into the levelled frame.'),
+    'mounting_rpy': (list, 'Roll, pitch and yaw of the sensor on the robot [rad], such as '
+                           "'0 0 1.57'."),
+    'base_frame': (str, 'Frame of the robot, to take the mounting from /tf_static.'),
+    'publish_tf': (bool, 'Whether to publish the levelled frame on /tf_static.'),
+    'gyro_bias': (bool, 'Whether to subtract the bias of the gyro.'),
+    'fill_covariance': (bool, 'Whether to state the measured noise as covariance.'),
+    'confirm': (bool, 'Whether a new result waits for ~/save or ~/undo.'),
+    'calibration_file': (str, 'File of the calibration.'),
+    'sensor': (str, 'Name of the sensor and of its files.'),
+}
+"""Parameters of the node by argument: type and description. A list has three numbers."""
+
+BOOLS = ['true', 'false', 'True', 'False']
 
 
 def generate_launch_description() -> LaunchDescription:
     params_file = get_package_share_path('accel_calib') / 'config' / 'calibrator.yaml'
-    arguments = {
-        'namespace': ('', 'Namespace of the node; the topics are relative to it.'),
-        'imu': ('imu/data_raw', 'Topic of the readings (sensor_msgs/Imu).'),
-        'output': ('imu/data_calibrated', 'Topic of the corrected readings.'),
-        'params_file': (str(params_file), 'File with the parameters of the node.'),
-        'calibration_file': ('', 'File of the calibration; empty: as in params_file.'),
-        'sensor': ('', 'Name of the sensor; empty: as in params_file.'),
+    return LaunchDescription([
+        DeclareLaunchArgument(
+            'namespace', default_value='',
+            description='Namespace of the node. Topic names without a leading slash are in it.'),
+        *(DeclareLaunchArgument(name, default_value=default, description=words)
+          for name, (_, default, words) in TOPICS.items()),
+        DeclareLaunchArgument('params_file', default_value=str(params_file),
+                              description='File with the parameters of the node.'),
+        *(DeclareLaunchArgument(name, default_value='',
+                                description=f'{words} Empty: as in params_file.',
+                                choices=['', *BOOLS] if kind is bool else None)
+          for name, (kind, words) in PARAMETERS.items()),
+        DeclareLaunchArgument(
+            'lifecycle', default_value='false', choices=BOOLS,
+            description='Whether to start the managed node, and configure and activate it.'),
+        OpaqueFunction(function=_calibrator),
+    ])
+
+
+def _calibrator(context: LaunchContext) -> list[Any]:
+    """Return the node, and the transitions of a managed node."""
+    about = {
+        'package': 'accel_calib',
+        'name': 'calibrator',
+        'namespace': LaunchConfiguration('namespace'),
+        'parameters': [LaunchConfiguration('params_file'), *_overrides(context)],
+        'remappings': [(inside, LaunchConfiguration(name))
+                       for name, (inside, _, _) in TOPICS.items()],
+        'output': 'screen',
     }
-    declared = [DeclareLaunchArgument(name, default_value=default, description=description)
-                for name, (default, description) in arguments.items()]
-    return LaunchDescription([*declared, OpaqueFunction(function=_calibrator)])
+    if IfCondition(LaunchConfiguration('lifecycle')).evaluate(context):
+        return _activated(LifecycleNode(executable='calibrator_lifecycle', **about))
+    return [Node(executable='calibrator', **about)]
 
 
-def _calibrator(context: LaunchContext) -> list[Node]:
-    """Return the node; an empty argument does not override the parameter file."""
-    given = {name: LaunchConfiguration(name).perform(context)
-             for name in ('calibration_file', 'sensor')}
-    overrides = {name: ParameterValue(value, value_type=str)
-                 for name, value in given.items() if value}
-    return [Node(
-        package='accel_calib',
-        executable='calibrator',
-        name='calibrator',
-        namespace=LaunchConfiguration('namespace'),
-        parameters=[LaunchConfiguration('params_file'), *([overrides] if overrides else [])],
-        remappings=[('imu/data_raw', LaunchConfiguration('imu')),
-                    ('imu/data_calibrated', LaunchConfiguration('output'))],
-        output='screen',
-    )]
+def _overrides(context: LaunchContext) -> list[dict[str, Any]]:
+    """Return one dictionary of the parameters that are given, or nothing if none is given."""
+    values: dict[str, Any] = {}
+    for name, (kind, _) in PARAMETERS.items():
+        given = LaunchConfiguration(name)
+        text = given.perform(context)
+        if text:
+            values[name] = (_numbers(name, text) if kind is list
+                            else ParameterValue(given, value_type=kind))
+    return [values] if values else []
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    """Return three numbers, written as in YAML or as in a URDF; launch refuses '[0, 0, 1.57]'."""
+    try:
+        roll, pitch, yaw = (float(part) for part in re.split(r'[\s,]+', text.strip('[] ')))
+    except ValueError:
+        raise ValueError(f"argument {name} is '{text}', expected 3 numbers; write for example "
+                         f"{name}:='0 0 1.57'") from None
+    return [roll, pitch, yaw]
+
+
+def _activated(node: LifecycleNode) -> list[Any]:
+    """Return the actions that start a managed node, configure it and then activate it."""
+    configure, activate = (
+        EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(node),
+                                    transition_id=transition))
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE))
+    # Without start_state and handle_once, a later deactivation would be undone at once.
+    configured = OnStateTransition(
+        target_lifecycle_node=node, start_state='configuring', goal_state='inactive',
+        entities=[activate], handle_once=True)
+    return [RegisterEventHandler(configured), node, configure]

@@ -10,6 +10,9 @@ import os
 from pathlib import Path
 import re
 import runpy
+import shutil
+import subprocess
+import sys
 from typing import Any
 from xml.etree import ElementTree
 
@@ -18,6 +21,8 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parent.parent
+
+EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
 ROSDEP_KEYS = {
     'PyYAML': 'python3-yaml',
@@ -79,6 +84,14 @@ def test_email_of_the_maintainer_agrees(
     assert package_xml.find('maintainer').get('email') == setup_py['maintainer_email']
 
 
+def test_addresses_of_the_project_agree(
+        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
+    urls = {element.get('type'): element.text for element in package_xml.findall('url')}
+    assert urls == {'website': setup_py['url'],
+                    'repository': setup_py['project_urls']['Repository'],
+                    'bugtracker': setup_py['project_urls']['Bug Tracker']}
+
+
 def test_each_requirement_has_its_rosdep_key(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     required = setup_py['install_requires'] + setup_py['extras_require']['report']
@@ -98,7 +111,8 @@ def test_package_xml_lists_all_imports_of_the_nodes(package_xml: ElementTree.Ele
 def test_all_shipped_files_exist(setup_py: dict[str, Any]) -> None:
     shipped = {path for _, paths in setup_py['data_files'] for path in paths}
     assert {'resource/accel_calib', 'package.xml', 'config/calibrator.yaml',
-            'launch/calibrator.launch.py', 'scripts/calibrator', 'scripts/simulator'} <= shipped
+            *(str(path.relative_to(ROOT)) for path in (ROOT / 'launch').glob('*.launch.py')),
+            *(f'scripts/{name}' for name in EXECUTABLES)} <= shipped
     assert not [path for path in shipped if not (ROOT / path).is_file()]
 
 
@@ -108,19 +122,47 @@ def test_every_folder_with_code_is_a_package(setup_py: dict[str, Any]) -> None:
         setup_py['packages'])
 
 
-@pytest.mark.parametrize('name', ['calibrator', 'simulator'])
-def test_scripts_can_be_executed(name: str) -> None:
-    assert os.access(ROOT / 'scripts' / name, os.X_OK)
-
-
-@pytest.mark.parametrize('name', ['accel-calib', 'calibrator', 'simulator'])
-def test_entry_points_are_importable(name: str, setup_py: dict[str, Any]) -> None:
+@pytest.fixture
+def entry_points(setup_py: dict[str, Any]) -> dict[str, str]:
+    """Return module:function by name of the executable."""
     scripts = setup_py['entry_points']['console_scripts']
-    entry_points = dict(re.split(r'\s*=\s*', script) for script in scripts)
+    return dict(re.split(r'\s*=\s*', script) for script in scripts)
+
+
+def test_every_entry_point_is_an_executable_of_the_package(entry_points: dict[str, str]) -> None:
+    assert set(entry_points) == set(EXECUTABLES)
+
+
+@pytest.mark.parametrize('name', EXECUTABLES)
+def test_entry_points_are_importable(name: str, entry_points: dict[str, str]) -> None:
     module, function = entry_points[name].split(':')
     if '.ros.' in module:
         pytest.importorskip('rclpy')
     assert callable(getattr(importlib.import_module(module), function))
+
+
+@pytest.mark.parametrize('name', EXECUTABLES)
+def test_scripts_run_the_function_of_the_entry_point(
+        name: str, entry_points: dict[str, str]) -> None:
+    path = ROOT / 'scripts' / name
+    assert os.access(path, os.X_OK)
+    module, function = re.search(r'^from (\S+) import (\S+)$', path.read_text(), re.M).groups()
+    assert f'{module}:{function}' == entry_points[name]
+
+
+def test_command_in_the_path_is_that_of_ros2_run(
+        tmp_path: Path, setup_py: dict[str, Any]) -> None:
+    for folder, paths in setup_py['data_files']:
+        if folder in ('bin', 'lib/accel_calib'):
+            (tmp_path / folder).mkdir(parents=True)
+            for path in paths:
+                shutil.copy(ROOT / path, tmp_path / folder)
+    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
+    done = subprocess.run(
+        [tmp_path / 'bin' / 'accel-calib', '--version'], cwd=tmp_path, capture_output=True,
+        text=True, timeout=60, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert done.returncode == 0, done.stderr
+    assert accel_calib.__version__ in done.stdout
 
 
 def test_parameter_file_addresses_the_node_in_any_namespace() -> None:
@@ -128,12 +170,3 @@ def test_parameter_file_addresses_the_node_in_any_namespace() -> None:
     nodes = yaml.safe_load(text)
     assert set(nodes) <= {'/**', '/**/calibrator', '/**/simulator'}
     assert all('ros__parameters' in node for node in nodes.values())
-
-
-def test_launch_file_declares_its_arguments() -> None:
-    path = ROOT / 'launch' / 'calibrator.launch.py'
-    compile(path.read_text(encoding='utf-8'), path, 'exec')
-    pytest.importorskip('launch_ros', reason='not on PyPI')
-    description = runpy.run_path(str(path))['generate_launch_description']()
-    names = {argument.name for argument in description.get_launch_arguments()}
-    assert names == {'namespace', 'imu', 'output', 'params_file', 'calibration_file', 'sensor'}
