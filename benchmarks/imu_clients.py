@@ -146,8 +146,9 @@ def main() -> int:
     parser.add_argument('what', choices=['drive', 'listen', 'serialized', 'typed', 'sink'])
     parser.add_argument('--rate', type=float, default=1000.0)
     parser.add_argument('--file', type=Path)
+    parser.add_argument('--namespace', default='/')
     given = parser.parse_args()
-    rclpy.init(args=[])
+    rclpy.init(args=['--ros-args', '-r', f'__ns:={given.namespace}'])
     if given.what == 'drive':
         drive(given.rate, given.file)
     elif given.what == 'listen':

@@ -47,6 +47,8 @@ class Trial:
         Stamps of the messages that the driver sent [ns].
     heard : (m, 2) array
         Stamp and arrival of the messages that the user received [ns].
+    memory : (float, float)
+        Resident memory of that process at the begin and the end [MB].
 
     """
 
@@ -56,6 +58,7 @@ class Trial:
     last: int
     sent: Stamps
     heard: Stamps
+    memory: tuple[float, float] = (np.nan, np.nan)
 
     def between(self, first: int, last: int) -> Trial:
         """Return the messages of a shorter interval."""
@@ -90,6 +93,12 @@ def cpu_seconds(pid: int) -> float:
     return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
 
 
+def resident_mb(pid: int) -> float:
+    """Return the resident memory of a process [MB]."""
+    pages = int(Path(f'/proc/{pid}/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') * 1e-6
+
+
 def first_of(client: subprocess.Popen[str]) -> int:
     """Wait for the first message of a client, and return its time [ns]."""
     assert client.stdout is not None
@@ -116,7 +125,8 @@ def process(command: list[str], environment: dict[str, str]) -> Iterator[subproc
 
 
 def trial(command: list[str], rate: float, during: Callable[[], object], *,
-          listened: bool = True, lead: float = 0.0) -> Trial:
+          listened: bool = True, lead: float = 0.0, domain: int | None = None,
+          namespace: str = '/') -> Trial:
     """
     Run a relay, or the node, between a driver and a user.
 
@@ -132,16 +142,22 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
         Whether there is a user.
     lead : float
         Time from the first message of the driver to the start of the program [s].
+    domain : int, optional
+        DDS domain; by default one of its own.
+    namespace : str
+        Namespace of all topics.
 
     """
-    os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT))
+    domain = next(_DOMAINS) if domain is None else domain
+    os.environ.update(ROS_DOMAIN_ID=str(domain), PYTHONPATH=str(ROOT))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, 'ROS_LOG_DIR': folder, 'ROS_HOME': folder}
         sent_file, heard_file = Path(folder) / 'sent.npy', Path(folder) / 'heard.npy'
-        listen = ([str(CLIENTS), 'listen', '--file', str(heard_file)] if listened
+        own = ['--namespace', namespace, '--file']
+        listen = ([str(CLIENTS), 'listen', *own, str(heard_file)] if listened
                   else ['-c', 'import sys; sys.stdin.read()'])
-        drive = [str(CLIENTS), 'drive', f'--rate={rate}', '--file', str(sent_file)]
+        drive = [str(CLIENTS), 'drive', f'--rate={rate}', *own, str(sent_file)]
         with process(listen, environment) as user, process(drive, environment) as driver:
             first_of(driver)
             time.sleep(lead)
@@ -150,13 +166,15 @@ def trial(command: list[str], rate: float, during: Callable[[], object], *,
                 start = first_of(user) * 1e-9 - began if listened else np.nan
                 time.sleep(SETTLE if listened else 2.0 * SETTLE)
                 cpu, first = cpu_seconds(measured.pid), time.monotonic_ns()
+                memory = resident_mb(measured.pid)
                 during()
                 cpu, last = cpu_seconds(measured.pid) - cpu, time.monotonic_ns()
+                grown = memory, resident_mb(measured.pid)
                 time.sleep(0.3)
                 end(driver)  # first: a flooded process may not notice that it must end
         sent = np.load(sent_file)
         heard = np.load(heard_file) if listened else np.empty((0, 2), np.int64)
-    return Trial(cpu, start, first, last, sent, heard).between(first, last)
+    return Trial(cpu, start, first, last, sent, heard, grown).between(first, last)
 
 
 def relay(kind: str) -> list[str]:
