@@ -67,6 +67,10 @@ class Calibration(calibrate.Calibration):
         Residuals and other figures over the poses used.
     warnings : tuple of str
         Warnings for the user.
+    gyro : GyroBias or None
+        Bias of the gyro at rest; None if the poses have no angular rates.
+    noise : SampleNoise or None
+        Noise of one sample at rest; None if it is not known.
 
     """
 

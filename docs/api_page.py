@@ -14,7 +14,7 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib import errors
-from accel_calib.calibrate import Quality, Rejected, Verification
+from accel_calib.calibrate import GyroBias, Quality, Rejected, SampleNoise, Verification
 from accel_calib.capture import CaptureSettings
 from accel_calib.compare import Comparison
 from accel_calib.compare.comparison import Parameter, Run
@@ -26,8 +26,8 @@ FUNCTIONS = ('capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify
 RECORDS = ('Poses', 'Recording', 'Calibration', 'Refinement')
 """The names of ``accel_calib.__all__``, in the order of the page."""
 
-OTHER_RECORDS = (Quality, Rejected, Units, Verification, Step, Stage, Comparison, Run, Parameter,
-                 CaptureSettings)
+OTHER_RECORDS = (Quality, Rejected, Units, GyroBias, SampleNoise, Verification, Step, Stage,
+                 Comparison, Run, Parameter, CaptureSettings)
 ERRORS = (errors.AccelCalibError, errors.InputError, errors.RefusedFitError,
           errors.StoredCalibrationError, errors.DamagedCalibrationError)
 

@@ -3,6 +3,7 @@
 
 """The documentation agrees with the code, and its commands and snippets run."""
 
+from dataclasses import fields
 import importlib
 import inspect
 import os
@@ -15,11 +16,12 @@ import sys
 import accel_calib as ac
 from accel_calib.cli.main import COMMANDS, main, parser
 from accel_calib.files import write_table
+from accel_calib.session import CalibratorSettings
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ['README.md', 'CONTRIBUTING.md', *(
+PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', *(
     str(path.relative_to(ROOT)) for path in sorted((ROOT / 'docs').rglob('*.md')))]
 OWN_PAGES = [page for page in PAGES if 'figures' not in page]
 EFFECTS = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
@@ -161,3 +163,15 @@ def test_services_and_topics_of_the_readme_are_those_of_the_node():
     triggers = re.search(r'_TRIGGERS = \((.*?)\)', source, re.DOTALL).group(1)
     made |= {f'~/{name}' for name in re.findall(r"'(\w+)'", triggers)}
     assert listed == made
+
+
+def test_parameters_of_the_readme_are_those_of_the_node():
+    table = text_of('README.md').partition('| parameters | |\n')[2].partition('\n\n')[0]
+    listed = re.findall(r'`(\w+)`', table)
+    assert sorted(listed) == sorted(field.name for field in fields(CalibratorSettings))
+
+
+def test_the_rule_of_frames_is_in_one_place():
+    assert [page for page in OWN_PAGES if '<frame_id>_levelled' in text_of(page)] == ['README.md']
+    for page in ('docs/files.md', 'docs/method.md'):
+        assert '../README.md#which-frame-a-corrected-message-is-in' in text_of(page)
