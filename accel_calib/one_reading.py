@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -305,7 +306,7 @@ class AtReading:
         else:
             xx, xy, xz, yy, yz, zz = [form(*force) for form in self._forms]
             added = [xx, xy, xz, xy, yy, yz, xz, yz, zz]
-        return [*map(float.__add__, own, added)]
+        return [*map(add, own, added)]
 
     @cached_property
     def _forms(self) -> list[Callable[[float, float, float], float]]:

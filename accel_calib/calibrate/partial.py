@@ -416,8 +416,8 @@ def _known_words(about: Carried) -> str:
         return (f'1 pose: along gravity the sum of offset and gain, and so |a|, is known to '
                 f'{_mg(about.along_g)}')
     return (f'the {about.count} poses lie within {about.cone.degrees:.0f}° of one direction: '
-            f'along gravity the sum of offset and gain, and so |a|, is known to {_mg(about.along_g)}, '
-            f'and at each pose |a| to {_mg(about.among_g)}')
+            'along gravity the sum of offset and gain, and so |a|, is known to '
+            f'{_mg(about.along_g)}, and at each pose |a| to {_mg(about.among_g)}')
 
 
 def _open_words(about: Carried) -> str:
