@@ -21,6 +21,7 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
@@ -38,6 +39,9 @@ from ..session import CalibratorSettings, Event, Job, Log, Mounting, Session, Sh
 _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
              'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
 """Services that are commands of the session."""
+
+_UNKNOWN = '_NODE_NAME_UNKNOWN_'
+"""Name of a node of which DDS knows only the publisher so far."""
 
 _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
@@ -154,8 +158,7 @@ class Calibrator:
     def _on_tick(self) -> None:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
-            f'{each.node_namespace.rstrip("/")}/{each.node_name}'
-            for each in self._node.get_publishers_info_by_topic(self._topic))
+            map(_name_of, self._node.get_publishers_info_by_topic(self._topic)))
         self.stream.flush()
         self.session.tick()
         self._on_transforms()
@@ -232,3 +235,10 @@ class Calibrator:
         self._node.remove_on_set_parameters_callback(self._followed)
         self._worker.close()
         self.session.close()
+
+
+def _name_of(endpoint: TopicEndpointInfo) -> str:
+    """Return the name of the node of a publisher, with its namespace."""
+    if endpoint.node_name == _UNKNOWN:
+        return 'a node whose name is not known yet'
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'

@@ -144,7 +144,7 @@ class Guide:
 
     @property
     def advice(self) -> str:
-        """What to do next; empty before the first choice."""
+        """Return what to do next; empty before the first choice."""
         return '' if self.asked is None else next_action(self.asked)
 
     def added(self, count: int) -> int:

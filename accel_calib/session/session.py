@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 import math
+import re
 from time import monotonic
 
 import numpy as np
@@ -44,8 +45,7 @@ _AGAIN = 10.0
 _FAULT_AGAIN = 60.0
 """Shortest time between two equal log lines about another fault of the stream [s]."""
 
-_KIND = 20
-"""Number of letters that distinguish the kinds of faults."""
+_NUMBER = re.compile(r'[\d.]+')
 
 _AUTO_FIT_EVERY = 60.0
 """Shortest time between two automatic fits [s]."""
@@ -340,10 +340,11 @@ class Session:
         fault = stream_fault(self.statistics, self.length_g(), self.topic, self.publishers)
         silent = self.statistics.age > SILENT
         again = self.clock() - self._reported_at >= (_AGAIN if silent else _FAULT_AGAIN)
-        if fault and (again or fault[:_KIND] != self._reported):
+        kind = _NUMBER.sub('', fault)
+        if fault and (again or kind != self._reported):
             waiting = not self.statistics.messages
             self._log('info' if waiting else 'warning', f'waiting: {fault}' if waiting else fault)
-            self._reported, self._reported_at = fault[:_KIND], self.clock()
+            self._reported, self._reported_at = kind, self.clock()
         elif not fault and self._reported:
             self._log('info', f'messages arrive as expected, {self.statistics.rate:.1f} Hz')
             self._reported = ''
@@ -413,7 +414,7 @@ class Session:
 
     @property
     def advice(self) -> str:
-        """What to do next with the poses."""
+        """Return what to do next with the poses."""
         if self._all_used:
             return 'the calibration uses these poses'
         return self.guide.advice
