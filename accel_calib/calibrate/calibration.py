@@ -215,7 +215,7 @@ class Calibration:
 
     @property
     def in_sensor_frame(self) -> Calibration:
-        """The same calibration without the mounting: offset, gain and the other effects."""
+        """Return the calibration without the mounting: offset, gain and the other effects."""
         return replace(self, model=Model(self.model.values)) if self.is_levelled else self
 
     @property

@@ -74,6 +74,9 @@ def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
                          f'{other}, expected the same unit, because the conversion is not known',
                          'fit all runs from readings in one unit')
     for k, run in enumerate(calibrations, 1):
+        if not run.model.effects:
+            raise InputError(f'run {k} is a mounting alone, expected a fit of offset and gain',
+                             'leave it out, or fit it with more poses')
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')

@@ -154,7 +154,14 @@ def monitor(calibration: Calibration) -> Drift:
 
 
 def _repeats(calibration: Calibration) -> float:
-    """Return the variance of pose means beyond the noise of their samples [g²]."""
+    """
+    Return the variance of pose means beyond the noise of their samples [g²].
+
+    It is infinite for a mounting alone, whose offset and gain are not calibrated.
+
+    """
+    if not calibration.model.effects:
+        return np.inf
     quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
     spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
     excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2

@@ -353,7 +353,7 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
         base, model=Model(model.values, base.model.rotation),
         covariance=matrix @ final.fit.covariance @ matrix.T,
         quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
-        rejected=rejected, warnings=tuple(warnings),
+        rejected=rejected, warnings=tuple(warnings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
     try:
         return _determined(gated(with_rest_noise(refined, given.poses)), final)

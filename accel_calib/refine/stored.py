@@ -52,12 +52,12 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     -------
     Poses
         All poses, with the column ``new``. Only the new poses, without this column, if the
-        calibration has no poses, or was fitted to some of the new poses and still agrees with
-        them.
+        calibration has no effects or no poses, or was fitted to some of the new poses and still
+        agrees with them.
 
     """
     stored = in_g(calibration.used_poses, calibration.units)
-    if not len(stored):
+    if not len(stored) or not calibration.model.effects:
         return poses_g
     shared = _shares(poses_g, stored)
     if shared and EDITED not in calibration.warnings and _agrees(calibration, poses_g):

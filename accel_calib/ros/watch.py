@@ -87,7 +87,7 @@ class _Receiver:
 
     @property
     def progress(self) -> Progress | None:
-        """The last progress; None before the first message."""
+        """Return the last progress; None before the first message."""
         last = self._last
         return None if last is None else Progress.from_figures(
             {each.key: each.value for each in last.values})

@@ -73,15 +73,14 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
         If the readings are clearly in another unit.
 
     """
-    try:
+    full = before is not None and not is_partial(before)
+    up = poses_up(poses, units)
+    few = units.name != 'native' and len(up) >= _FEWEST_IN_CONE and lies_in_cone(up)
+    if few and not full:
+        calibration = fit_partial(poses, units, sensor=sensor, date=now())
+    else:
         calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
                                 sensor=sensor, date=now())
-    except RefusedFitError:
-        up = poses_up(poses, units)
-        kept = before is not None and not is_partial(before)
-        if kept or len(up) < _FEWEST_IN_CONE or not lies_in_cone(up):
-            raise
-        calibration = fit_partial(poses, units, sensor=sensor, date=now())
     if before is None or not before.is_levelled:
         return calibration
     flat = flat_direction(before.frame) * before.force_per_g
