@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,16 @@ from accel_calib.files import read_calibration, read_poses, write_calibration, w
 from accel_calib.model import Model
 from accel_calib.session import CalibratorSettings, findings, Job, Log, Session
 from accel_calib.session.health import Level
-from accel_calib.session.store import Identity, load, Lock, Store, store_of, StoreInUseError
+from accel_calib.session.store import (
+    Identity,
+    load,
+    Lock,
+    MOST_STEPS,
+    Store,
+    store_of,
+    StoreInUseError,
+    writing_advice,
+)
 from accel_calib.session.stream_statistics import StreamStatistics
 from accel_calib.sphere import rotation_from_rpy, spread_directions
 import numpy as np
@@ -465,3 +475,32 @@ def test_settings_of_the_mounting_must_not_contradict_each_other() -> None:
         Driver(mounting_rpy=[0.0, 0.0, 1.0], base_frame='base_link')
     with pytest.raises(InputError, match='publish_tf would make'):
         Driver(publish_tf=True, base_frame='base_link', output_frame_id='base_link')
+
+
+# Steps back
+
+
+def test_steps_back_are_kept_for_changes_only_and_have_a_limit(stored: Stored) -> None:
+    path = stored(sensor='imu_link')
+    store = Store(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    first = store.load_calibration()
+    assert first is not None
+    store.save_calibration(first)
+    before = len(store.steps())
+    store.save_calibration(first)
+    assert len(store.steps()) == before
+    for k in range(MOST_STEPS + 5):
+        store.save_calibration(replace(first, date=f'{k}'))
+    assert len(store.steps()) == MOST_STEPS
+    for k in reversed(range(5, MOST_STEPS + 4)):
+        back = store.step_back()
+        assert back is not None
+        assert back.date == f'{k}'
+
+
+@pytest.mark.parametrize(('number', 'words'), [
+    (errno.ENOSPC, 'free space on the disk'), (errno.EROFS, 'mount the file system'),
+    (errno.EACCES, 'correct the permissions')])
+def test_advice_about_a_file_that_cannot_be_written_fits_the_reason(number: int, words: str
+                                                                    ) -> None:
+    assert words in writing_advice(OSError(number, 'reason'))

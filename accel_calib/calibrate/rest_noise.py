@@ -250,11 +250,11 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     slope = np.where(sloping, chosen.values[-1], 0.0)
-    if rests.warmth is None:
+    if rests.temperature is None:
         return GyroBias(bias, sd, len(rests.rate), math.nan, slope, ())
-    limits = (float(rests.warmth.min()), float(rests.warmth.max()))
-    return GyroBias(bias, sd, len(rests.rate), float(np.clip(rests.warmth.mean(), *limits)), slope,
-                    limits)
+    limits = (float(rests.temperature.min()), float(rests.temperature.max()))
+    mean = float(np.clip(rests.temperature.mean(), *limits))
+    return GyroBias(bias, sd, len(rests.rate), mean, slope, limits)
 
 
 @dataclass(frozen=True)
@@ -263,11 +263,11 @@ class _Rests:
 
     rate: Floats
     variance: Floats
-    warmth: Floats | None
+    temperature: Floats | None
 
     def take(self, which: NDArray[np.bool_]) -> _Rests:
         return _Rests(self.rate[which], self.variance[which],
-                      None if self.warmth is None else self.warmth[which])
+                      None if self.temperature is None else self.temperature[which])
 
 
 def _rests_of(poses: Poses) -> _Rests:
@@ -284,9 +284,10 @@ def _agreeing(rests: _Rests) -> NDArray[np.bool_]:
     from scipy.special import stdtrit
 
     count, left = len(rests.rate), rests.rate
-    with_slope = rests.warmth is not None and count >= _ENOUGH
-    if rests.warmth is not None and with_slope:
-        left = left - rests.warmth[:, np.newaxis] * _slope_of_pairs(rests.rate, rests.warmth)
+    with_slope = rests.temperature is not None and count >= _ENOUGH
+    if rests.temperature is not None and with_slope:
+        slope = _slope_of_pairs(rests.rate, rests.temperature)
+        left = left - rests.temperature[:, np.newaxis] * slope
     left = np.abs(left - np.median(left, axis=0))
     factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
     spread = _MAD * factor * np.median(left, axis=0)
@@ -295,11 +296,12 @@ def _agreeing(rests: _Rests) -> NDArray[np.bool_]:
     return np.asarray(np.all(left ** 2 <= limit ** 2 * (rests.variance + scatter), axis=1))
 
 
-def _slope_of_pairs(values: Floats, warmth: Floats) -> Floats:
+def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
     """Return the (3,) weighted medians of the slopes of all pairs; see the module."""
-    rows = np.unique(np.linspace(0, len(warmth) - 1, min(len(warmth), _PAIRED)).astype(np.intp))
+    count = len(temperature)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _PAIRED)).astype(np.intp))
     one, other = (rows[each] for each in np.triu_indices(len(rows), 1))
-    apart = warmth[other] - warmth[one]
+    apart = temperature[other] - temperature[one]
     one, other, apart = (each[apart != 0.0] for each in (one, other, apart))
     if not len(apart):
         return np.zeros(3)
@@ -353,10 +355,11 @@ def _means(rests: _Rests) -> _Fit:
 
 def _lines(rests: _Rests) -> _Fit | None:
     """Return lines over temperature minus its mean; None if they are not determined."""
-    warmth = rests.warmth
-    if warmth is None or len(warmth) < _ENOUGH or not np.ptp(warmth) > 0.0:
+    temperature = rests.temperature
+    if temperature is None or len(temperature) < _ENOUGH or not np.ptp(temperature) > 0.0:
         return None
-    return _fit(np.column_stack([np.ones(len(warmth)), warmth - warmth.mean()]), rests)
+    design = np.column_stack([np.ones(len(temperature)), temperature - temperature.mean()])
+    return _fit(design, rests)
 
 
 def _fit(design: Floats, rests: _Rests) -> _Fit:

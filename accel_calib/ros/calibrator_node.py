@@ -84,10 +84,10 @@ class Calibrator:
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._topic = node.resolve_topic_name('imu/data_raw')
         settings = declared(node, CalibratorSettings)
-        self.session = Session(settings, self._topic)
         self._broadcaster = MountingBroadcaster(node) if settings.publish_tf else None
         self._transforms = (watch_static(node, self._on_transforms) if settings.base_frame
                             else None)
+        self.session = Session(settings, self._topic)  # last, because it locks the files
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
         self._worker = Worker(node, self._handle_events)
         self._last_logged: dict[str, float] = {}

@@ -28,6 +28,7 @@ from .work import (
     change_words,
     fitted,
     has_changed,
+    is_partial,
     refined,
     story,
     summary,
@@ -189,8 +190,8 @@ class Commands:
         session, rest = self._session, self._rest()
         before = self._present()
         calibration = session.with_given(at_rest(rest, session.units, session.sensor, before))
-        words = [carried_words(calibration) if before is None or calibration.model is not
-                 before.model else 'offset and gain of the fit are kept']
+        words = [carried_words(calibration) if before is None or is_partial(before)
+                 else 'offset and gain of the fit are kept']
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words.append(f'gyro bias ({bias}) °/s')

@@ -168,13 +168,23 @@ class Store:
     def save_calibration(self, calibration: Calibration) -> None:
         """Write the calibration, and keep the file before as a step; raise OSError if it fails."""
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
-        self._keep_step()
+        step = self._keep_step()
         write_calibration(self.calibration, replace(
             calibration, sensor=self.identity.sensor, stream=self.identity.topic),
             keep_before=False)
+        if step.read_bytes() == self.calibration.read_bytes():
+            step.unlink()
 
-    def _keep_step(self) -> None:
-        """Copy the file for `step_back`, or store an empty step if there is no file."""
+    def _keep_step(self) -> Path:
+        """
+        Copy the file for `step_back`, or store an empty step if there is no file.
+
+        Returns
+        -------
+        Path
+            The step.
+
+        """
         if self.calibration.exists():
             try:
                 self.load_calibration()
@@ -186,8 +196,9 @@ class Store:
             copy_atomically(self.calibration, step)
         else:
             step.touch()
-        for old in steps[:len(steps) + 1 - MOST_STEPS]:
+        for old in steps[:max(len(steps) + 1 - MOST_STEPS, 0)]:
             self._step(old).unlink(missing_ok=True)
+        return step
 
     def steps(self) -> list[int]:
         """Return the numbers of the kept steps, oldest first."""
