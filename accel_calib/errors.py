@@ -49,6 +49,13 @@ class DamagedCalibrationError(StoredCalibrationError):
     """A stored calibration is damaged, or has values that are not plausible."""
 
 
+TAKE_ALL_SIDES = 'take poses with each side of the sensor up and down, and some edges'
+"""Advice for poses that do not determine a calibration."""
+
+NEEDS_ROS = "source /opt/ros/jazzy/setup.bash, or run pip install 'accel_calib[ros]'"
+"""Advice if ROS 2 is not installed."""
+
+
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun, such as ``1 pose`` or ``2 poses``."""
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'

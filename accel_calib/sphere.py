@@ -30,6 +30,10 @@ def spread_directions(count: int) -> Floats:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
+OVER_THE_SPHERE = spread_directions(300)
+"""Directions over which figures are averaged, (300, 3); not to be changed in place."""
+
+
 def unit(vectors: Floats) -> Floats:
     """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

@@ -24,9 +24,9 @@ import numpy as np
 from .calibration import Calibration, Rejected
 from .unknown_orientation import PRIOR
 from ..effects import LADDER
-from ..errors import RefusedFitError
+from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..model import Model, times
-from ..sphere import spread_directions, unit
+from ..sphere import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
@@ -164,7 +164,7 @@ def _contribution(model: Model, used: Poses, units: Units) -> float:
 
 def uncertainty_g(calibration: Calibration) -> float:
     """Return the largest standard deviation of |force| over the sphere [g]."""
-    return float(np.max(deviations_g(calibration, spread_directions(300))))
+    return float(np.max(deviations_g(calibration, OVER_THE_SPHERE)))
 
 
 def deviations_g(calibration: Calibration, up: Floats) -> Floats:
@@ -204,7 +204,7 @@ def _with_warning(calibration: Calibration) -> Calibration:
         raise RefusedFitError(
             f'the poses do not determine the calibration: the uncertainty of |a| is up to '
             f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
-            'take poses with each side of the sensor up and down')
+            TAKE_ALL_SIDES)
     others = tuple(line for line in calibration.warnings if not line.startswith(_UNCERTAIN))
     if uncertain < _WARN_UNCERTAINTY_G:
         return replace(calibration, warnings=others)

@@ -51,7 +51,7 @@ from ..estimate.geometry import (
     rows_of,
     WEAK_DILUTION,
 )
-from ..sphere import spread_directions, unit
+from ..sphere import OVER_THE_SPHERE, unit
 from ..table import Floats
 from ..units import MG
 
@@ -307,7 +307,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
 
 def _uncertainty(calibration: Calibration) -> float:
     """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
-    up: Floats = spread_directions(300)
+    up = OVER_THE_SPHERE
     per_g = calibration.force_per_g
     covariance = calibration.force_covariance(up * per_g) / per_g ** 2
     errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.name == '12'

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from .calibration import Calibration, Rejected
 from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_warnings, in_g, quality_of
-from ..errors import listed, RefusedFitError
+from ..errors import listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
 from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Point, solve
 from ..estimate.geometry import (
@@ -235,8 +235,7 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
     except NotConvergedError:
         raise RefusedFitError(
             f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
-            'take poses with each side of the sensor up and down, and some edges, and hold it '
-            'still in each') from None
+            f'{TAKE_ALL_SIDES}, and hold it still in each') from None
     return (_in_sensing_axes(fit.model.linear_part, poses_g.take(kept)) if name == '9' else fit,
             kept)
 
@@ -256,8 +255,7 @@ def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     mat_w, vec_v = closed_form(name, poses_g.reading)
     if not np.all(np.isfinite(mat_w)):
         raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
-                              'take poses with each side of the sensor up and down, and some '
-                              'edges')
+                              TAKE_ALL_SIDES)
     if name == '9':
         return _in_sensing_axes(_of_the_report(mat_w, vec_v, poses_g), poses_g)
     return judge(start_of(name, poses_g.reading), poses_g)

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import Any, TYPE_CHECKING
 
 from . import options
-from ..errors import InputError
+from ..errors import InputError, NEEDS_ROS
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,8 +31,7 @@ def run(args: argparse.Namespace) -> int:
         from ..ros.demo import demonstrate
     except ImportError as err:
         raise InputError(f'ROS 2 is not installed ({err}), but the demonstration needs it',
-                         'source /opt/ros/jazzy/setup.bash, or run pip install '
-                         "'accel_calib[ros]'") from err
+                         NEEDS_ROS) from err
     console = options.console(args)
     outcome = asdict(demonstrate(lambda line: console.print(line, markup=False)))
     options.write_json(args.json, outcome)

@@ -20,7 +20,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from . import options
-from ..errors import InputError
+from ..errors import InputError, NEEDS_ROS
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
             from ..ros import watch
         except ImportError as err:
             raise InputError(f'ROS 2 is not installed ({err}), but the command needs it',
-                             'source /opt/ros/jazzy/setup.bash, or run pip install '
-                             "'accel_calib[ros]'") from err
+                             NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
         try:
             if args.once:

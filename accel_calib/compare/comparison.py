@@ -35,7 +35,7 @@ from ..calibrate.unknown_orientation import fit_unknown
 from ..effects import Context
 from ..errors import counted, InputError, listed, RefusedFitError
 from ..model import length_rows, MODELS, sensor_force
-from ..sphere import spread_directions
+from ..sphere import OVER_THE_SPHERE
 from ..table import Floats
 from ..units import MG
 
@@ -197,9 +197,6 @@ def _temperatures(calibrations: Sequence[Calibration]) -> list[str]:
         return []
     return [f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all runs '
             'correct for temperature: this can cause differences']
-
-
-_DIRECTIONS = spread_directions(300)
 
 
 @dataclass(frozen=True)
@@ -383,7 +380,7 @@ def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
 def _each(prepared: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
     """Compare the corrected |a| of each run with that of the others, over all directions."""
     reading = (np.mean([run.free.vec_v for run in prepared], axis=0)
-               + _DIRECTIONS @ np.mean([run.free.mat_s for run in prepared], axis=0))
+               + OVER_THE_SPHERE @ np.mean([run.free.mat_s for run in prepared], axis=0))
     found = [run.length(reading) for run in prepared]
     length, variance = (np.array(part) for part in zip(*found, strict=True))
     weight = 1.0 / (np.mean(variance, axis=1) + SAME_G ** 2)
@@ -394,7 +391,8 @@ def _each(prepared: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
         expected = variance[k] + others ** 2 @ np.delete(variance, k, 0)
         largest = int(np.argmax(np.abs(away)))
         runs.append(Run(_rms(away) * MG, _rms(np.sqrt(expected)) * MG,
-                        float(np.abs(away[largest])) * MG, _DIRECTIONS[largest], float(chance)))
+                        float(np.abs(away[largest])) * MG, OVER_THE_SPHERE[largest],
+                        float(chance)))
     return tuple(runs)
 
 

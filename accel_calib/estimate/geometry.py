@@ -39,7 +39,7 @@ import numpy as np
 from .equations import believable, LEAST_NOISE
 from ..effects import EFFECTS
 from ..model import Model, MODELS, parameter_names, with_vector
-from ..sphere import spread_directions
+from ..sphere import OVER_THE_SPHERE, spread_directions
 from ..table import Floats
 
 LARGEST_DILUTION = 25.0
@@ -107,7 +107,7 @@ def relative_weights(noise: Floats | None, count: int) -> Floats:
 @lru_cache(maxsize=8)
 def over_the_sphere(name: str) -> Floats:
     """Return the (m, 1 or 3, p) rows Φ at directions spread evenly over the sphere."""
-    return rows_of(name, spread_directions(300))
+    return rows_of(name, OVER_THE_SPHERE)
 
 
 def information_of(name: str, directions: Floats, weights: Floats) -> Floats:

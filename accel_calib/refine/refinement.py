@@ -39,7 +39,7 @@ from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.pose_planning import refuse_if_unfit
 from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_previous
 from ..effects import CHANGES, effect_named, LADDER, WANDER
-from ..errors import counted, listed, RefusedFitError
+from ..errors import counted, listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import fit_4
 from ..estimate.equations import variance_factor
 from ..estimate.fit import judge, NotConvergedError
@@ -369,12 +369,12 @@ def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[
     if fit.undetermined:
         return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
                          f'{", …" if len(fit.undetermined) > _NAMED else ""}',
-                         'take poses with each side of the sensor up and down, and some edges')
+                         TAKE_ALL_SIDES)
     factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
     dilution = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
     if dilution > LARGEST_DILUTION:
         return refined, ('the poses do not determine the refined calibration: the error of |a| '
                          f'is up to {dilution:.3g} times that of a pose, expected less than '
                          f'{LARGEST_DILUTION:.0f} times',
-                         'take poses with each side of the sensor up and down, and some edges')
+                         TAKE_ALL_SIDES)
     return replace(refined, warnings=(*refined.warnings, *fit_warnings(fit, dilution))), ()

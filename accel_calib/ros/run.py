@@ -11,7 +11,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from ..errors import AccelCalibError
+from ..errors import AccelCalibError, NEEDS_ROS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,8 +55,8 @@ def _run(node: str, args: Sequence[str] | None) -> int:
     try:
         import rclpy
     except ImportError as error:
-        return _refuse(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy; source '
-                       "/opt/ros/jazzy/setup.bash, or pip install 'accel_calib[ros]'")
+        return _refuse(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy; '
+                       f'{NEEDS_ROS}')
     from rclpy.executors import ExternalShutdownException
     try:
         rclpy.init(args=args)
