@@ -173,10 +173,11 @@ def test_parameters_that_need_tf_are_refused_in_words_without_it(
 @pytest.mark.parametrize(('kind', 'words'), [
     ('zero', 'the stamps are zero'), ('constant', 'the stamps are constant'),
     ('shuffled', 'the stamps are out of order')])
-def test_wrong_stamps_are_diagnosed_within_two_seconds(bench: Any, kind: str, words: str) -> None:
+def test_wrong_stamps_are_in_the_second_diagnostics_at_latest(
+        bench: Any, kind: str, words: str) -> None:
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(passthrough=True)
-    started, sent = [math.nan], 0
+    sent = 0
 
     def make() -> Imu:
         nonlocal sent
@@ -191,15 +192,14 @@ def test_wrong_stamps_are_diagnosed_within_two_seconds(bench: Any, kind: str, wo
         return message
 
     bench.exchange(bench.came_out, make)
-    started[0] = time.monotonic()
+    diagnostics.clear()
 
     def said() -> bool:
         bench.send(make())
-        return any(words in each.message for array in diagnostics for each in array.status
-                   if each.name == f'{NODE}: stream')
+        return bool(diagnostics) and words in status(diagnostics, 'stream').message
 
     bench.spin(said)
-    assert time.monotonic() - started[0] < 2.0 + 0.5  # half a second for a busy machine
+    assert len(diagnostics) <= 2  # one each second
 
 
 def test_two_publishers_on_the_topic_are_named(bench: Any) -> None:
