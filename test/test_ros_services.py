@@ -80,9 +80,11 @@ def test_set_level_warns_of_a_flat_pose_on_another_face(bench: Any, readings: Re
                                                         stored: Stored) -> None:
     still = bench.listen(Bool, 'calibrator/still', latched=True)
     bench.calibrator(calibration_file=str(stored()), sensor='arm', passthrough=True)
-    bench.feed(readings([[0, 0, 1], [0, 0, -1]], dwell=3.0)[:-5])
+    turned = readings([[0, 0, 1], [0, 0, -1]], dwell=6.0)
+    bench.feed(turned[:-200])
+    rest = iter(turned[-200:])
     bench.spin(lambda: still and still[-1].data)
-    answer = bench.call_while('set_level', lambda: bench.imu([0, 0, -9.6]))
+    answer = bench.call_while('set_level', lambda: bench.imu(next(rest)))
     assert answer.success, answer.message
     assert 'the mounting is levelled by this pose' in answer.message
     assert 'the flat pose reads -1.00 g on z' in answer.message
