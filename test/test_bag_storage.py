@@ -203,7 +203,8 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, calibration, tmp_
             assert new.header.frame_id == old.header.frame_id + '_levelled' * turned
             before_turn, after_turn = (Rotation.from_quat(
                 [getattr(each.orientation, axis) for axis in 'xyzw']) for each in (old, new))
-            assert (before_turn * Rotation.from_matrix(rotation)).approx_equal(after_turn, 1e-9)
+            np.testing.assert_allclose(after_turn.as_matrix(),
+                                       before_turn.as_matrix() @ rotation, atol=1e-9)
             for name, expected in (
                     ('linear_acceleration', lambda x: calibration.correct(x[np.newaxis])[0]),
                     ('angular_velocity', lambda x, rotation=rotation: x @ rotation)):

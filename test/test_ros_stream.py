@@ -74,8 +74,8 @@ def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored) 
     got = bench.exchange(heard, make)
     assert got.header.frame_id == 'base_link'
     assert got.header.stamp in [message.header.stamp for message in sent]
-    assert quaternion_of(got).inv().approx_equal(
-        (quaternion_of(sent[0]) * Rotation.from_matrix(rotation)).inv(), 1e-9)
+    np.testing.assert_allclose(quaternion_of(got).as_matrix(),
+                               quaternion_of(sent[0]).as_matrix() @ rotation, atol=1e-9)
     np.testing.assert_allclose(force_of(got), calibration.correct(READING[None])[0], atol=1e-12)
     np.testing.assert_allclose(rate_of(got), rotation.T @ RATE, atol=1e-12)
     known = KNOWN.reshape(3, 3)
