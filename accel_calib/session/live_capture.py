@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
+from operator import is_
 
 import numpy as np
 
@@ -60,11 +61,16 @@ class PoseBook:
         self._earlier: list[Dwell] = []
         self._dwells: list[Dwell] = []
         self._held: list[Dwell] = []
+        self._made: tuple[list[Dwell], Poses] | None = None
 
     def poses(self) -> Poses:
         """Return the pose table, with repeated poses merged or left out."""
         dwells = [*self._earlier, *self._dwells, *self._held]
-        return poses_from(self._selected(dwells), self._settings)
+        made = self._made
+        if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
+            # Merging compares all pairs; the diagnostics ask every second.
+            made = self._made = dwells, poses_from(self._selected(dwells), self._settings)
+        return made[1]
 
     def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
         """Keep, merge or refuse repeated poses, separately at each temperature."""

@@ -365,10 +365,9 @@ class Session:
 
     def _auto_fit(self) -> None:
         """Start an automatic fit if one is due."""
-        enough = len(self.live.book.poses()) >= self.settings.auto_fit_poses
         due = self.clock() - self._auto_fit_at >= _AUTO_FIT_EVERY
-        if (self.settings.auto_fit and self._auto_fit_waits and enough and due
-                and self.files.locked):
+        if (self.settings.auto_fit and self._auto_fit_waits and due and self.files.locked
+                and len(self.live.book.poses()) >= self.settings.auto_fit_poses):
             self._auto_fit_waits, self._auto_fit_at = False, self.clock()
             self._events.append(self.commands.auto_fit())
 
