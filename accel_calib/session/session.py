@@ -393,15 +393,15 @@ class Session:
             return not_stored, compute(asked_for, poses, units, model)
 
         def finish(found: tuple[OSError | None, NextPose | None]) -> str:
-            not_stored, asked = found[0], found[1] or guide.asked
+            not_stored = found[0]
             if not_stored is not None:
                 self._log('error', f'the poses could not be stored: {not_stored}; '
                           f'{writing_advice(not_stored)}', once_in=_AGAIN)
-            if asked is None:
-                return ''  # the sensor has changed in the meantime
-            up = poses_up(poses, units)
-            guide.adopt(asked, count, noise_of(poses, units), coverage(up) if count else 0.0)
-            self._events.append(ShowPoses(up, asked, self.frame_id or ''))
+            if found[1] is not None:  # otherwise only an average has changed
+                up = poses_up(poses, units)
+                guide.adopt(found[1], count, noise_of(poses, units),
+                            coverage(up) if count else 0.0)
+                self._events.append(ShowPoses(up, found[1], self.frame_id or ''))
             return guide.line(poses, units, added=added > 0) if new_rest else ''
 
         self._events.append(Job(run, finish))
