@@ -16,7 +16,7 @@ from accel_calib.files import read_calibration
 from accel_calib.session import CalibratorSettings
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
-from accel_calib.session.work import asked_for, fitted
+from accel_calib.session.work import fitted, plan_for
 from accel_calib.simulate import model_with, simulate_recording
 from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
@@ -164,7 +164,7 @@ def test_a_next_pose_is_asked_for_with_any_number_of_poses(unit: Any, count: int
     for k in range(count):
         book.end(dwell(10.0 * k, [0, 0, 1]))
     poses = book.poses()
-    assert 'turn the sensor' in asked_for(poses, units_of(unit), 'auto').words
+    assert 'turn the sensor' in plan_for(poses, units_of(unit), 'auto').asked.words
 
 
 def test_drift_is_that_of_the_rests_since_the_calibration(stored: Callable[..., Path]) -> None:

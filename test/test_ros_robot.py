@@ -287,7 +287,7 @@ def test_set_level_works_without_a_fit(bench: Any) -> None:
     answer = bench.call_while('set_level', rest(bench, still, reading))
     assert answer.success, answer.message
     assert 'roll' in answer.message
-    got = bench.exchange(bench.came_out, lambda: bench.imu(reading))
+    bench.exchange(bench.came_out, lambda: bench.imu(reading))
     bench.spin(lambda: bench.came_out[-1].header.frame_id == 'imu_link_levelled' or bench.send(
         bench.imu(reading)))
     got = bench.came_out[-1]
@@ -305,9 +305,7 @@ def test_a_cone_of_poses_gives_what_it_carries_with_numbers(
     assert re.search(r'\d+(\.\d+)? mg', answer.message)
     assert 'turn the sensor so that' in answer.message
     found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
-    up = cone(5) * GRAVITY
     lengths = np.linalg.norm(found.correct(readings(cone(5), dwell=1.0)[:20]), axis=1)
-    assert np.all(np.isfinite(up))
     assert abs(float(np.mean(lengths)) / GRAVITY - 1.0) < 1e-3
 
 
@@ -362,10 +360,9 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
         assert bench.exchange(bench.came_out, lambda raw=raw: raw) == raw
         assert bench.call(end).success
         assert path.exists() is (end == 'save')
-    got = bench.exchange(bench.came_out, lambda: bench.imu([0.3, 0.4, 9.7]))
+    bench.exchange(bench.came_out, lambda: bench.imu([0.3, 0.4, 9.7]))
     bench.spin(lambda: np.linalg.norm(force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05
                or bench.send(bench.imu([0.3, 0.4, 9.7])))
-    assert got is not None
 
 
 def test_undo_goes_back_step_by_step_also_after_a_restart(

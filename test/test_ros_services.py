@@ -14,7 +14,7 @@ from accel_calib.files import read_calibration, read_poses
 from accel_calib.model import Model
 from accel_calib.ros.display import pose_markers
 from accel_calib.session.guidance import next_action
-from accel_calib.session.work import asked_for
+from accel_calib.session.work import plan_for
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
@@ -64,12 +64,12 @@ def test_refused_fit_advises_how_to_turn_the_sensor(bench: Any, readings: Readin
 
 def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
-    asked = asked_for(poses, units_of('g'), 'auto')
+    asked = plan_for(poses, units_of('g'), 'auto').asked
     assert re.fullmatch(r'more poses no longer help: 24 poses determine \|a\| to within 0\.18 mg; '
                         'call ~/fit', next_action(asked))
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
     assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
-    few = asked_for(poses.take(slice(0, 8)), units_of('g'), 'auto')
+    few = plan_for(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
     arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers
                    if m.ns == 'next']
     np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 import errno
 from pathlib import Path
+import shutil
 from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
@@ -492,10 +493,23 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(stored: Stored) -
     for k in range(MOST_STEPS + 5):
         store.save_calibration(replace(first, date=f'{k}'))
     assert len(store.steps()) == MOST_STEPS
+    shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
     for k in reversed(range(5, MOST_STEPS + 4)):
         back = store.step_back()
         assert back is not None
         assert back.date == f'{k}'
+
+
+def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> None:
+    path = stored(sensor='imu_link')
+    before = path.read_text()
+    step = path.with_name(f'{path.name}.before1')
+    step.write_text(before.replace('readings: m/s2', 'readings: g'))
+    store = Store(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    with pytest.raises(StoredCalibrationError, match='is for readings in g'):
+        store.step_back()
+    assert path.read_text() == before
+    assert step.exists()
 
 
 @pytest.mark.parametrize(('number', 'words'), [

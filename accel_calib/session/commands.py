@@ -20,15 +20,15 @@ import numpy as np
 
 from .active_calibration import context_of_rest
 from .events import Compute, Job
-from .guidance import next_action
+from .guidance import next_action, Plan
 from .store import Store, writing_advice
 from .work import (
-    asked_for,
     at_rest,
     change_words,
     fitted,
     has_changed,
     is_partial,
+    plan_for,
     refined,
     story,
     summary,
@@ -67,7 +67,7 @@ class Commands:
 
     # Poses
 
-    def capture_pose(self) -> str:
+    def capture_pose(self) -> Job:
         """Capture the ongoing rest as a pose."""
         session = self._session
         self._check_fresh()
@@ -76,10 +76,14 @@ class Commands:
             raise self._not_still()
         session.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         session.poses_changed(ended=False)
-        poses = session.live.book.poses()
-        asked = asked_for(poses, session.units, session.settings.model)
-        return (f'{counted(len(poses), "pose")}: the sensor has been still for '
-                f'{dwell.end - dwell.start:.1f} s; {next_action(asked)}')
+        given = session.live.book.poses(), session.units, session.settings.model
+        words = (f'{counted(len(given[0]), "pose")}: the sensor has been still for '
+                 f'{dwell.end - dwell.start:.1f} s')
+
+        def finish(plan: Plan) -> str:
+            return f'{words}; {next_action(plan.asked)}'
+
+        return Job(lambda compute: compute(plan_for, *given), finish)
 
     def undo_pose(self) -> str:
         """Remove the last pose."""
@@ -123,7 +127,7 @@ class Commands:
         def run(compute: Compute) -> tuple[Calibration, bool, OSError | None] | RefusedFitError:
             try:
                 calibration = compute(fitted, *given)
-            except RefusedFitError as error:
+            except RefusedFitError as error:  # `finish` decides whether to report it
                 return error
             used = is_used(before, calibration)
             stored = used and not offered

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..calibrate import NextPose
 from ..errors import InputError
-from ..table import Poses
+from ..table import Floats, Poses
 from ..units import MG, Units
 
 
@@ -118,34 +118,59 @@ class Progress:
         return cls(**fields)
 
 
+@dataclass(frozen=True)
+class Plan:
+    """
+    The next pose, and the poses for which it was chosen.
+
+    Parameters
+    ----------
+    asked : NextPose
+        The next pose, or that more poses no longer help.
+    poses : int
+        Number of poses.
+    up : (n, 3) array
+        Approximate direction of up in each pose, unit vectors in the sensor axes; n = 0 if they
+        are not known.
+    noise_g : float
+        Median noise of the poses [g]; NaN if not known.
+    coverage : float
+        Share of the sphere within 45° of a pose.
+
+    """
+
+    asked: NextPose
+    poses: int
+    up: Floats
+    noise_g: float
+    coverage: float
+
+
 class Guide:
     """
     The next pose, and the lines about captured poses.
 
     Attributes
     ----------
-    asked : NextPose or None
-        The next pose, or that more poses no longer help; None before the first choice.
-    poses : int
-        Number of poses for which it was chosen.
-    noise_g : float
-        Median noise of these poses [g]; NaN if not known.
-    coverage : float
-        Share of the sphere within 45° of one of them.
+    plan : Plan or None
+        The next pose; None before the first choice.
 
     """
 
     def __init__(self) -> None:
-        self.asked: NextPose | None = None
-        self.poses, self.coverage = 0, 0.0
-        self.noise_g = math.nan
+        self.plan: Plan | None = None
         self._count = 0
         self._rest = -math.inf
 
     @property
     def advice(self) -> str:
         """Return what to do next; empty before the first choice."""
-        return '' if self.asked is None else next_action(self.asked)
+        return '' if self.plan is None else next_action(self.plan.asked)
+
+    @property
+    def poses(self) -> int:
+        """Number of poses for which the next pose was chosen."""
+        return 0 if self.plan is None else self.plan.poses
 
     def added(self, count: int) -> int:
         """Note this number of poses, and return by how many it has changed."""
@@ -158,10 +183,6 @@ class Guide:
         self._rest = max(start, self._rest)
         return new
 
-    def adopt(self, asked: NextPose, count: int, noise_g: float, coverage: float) -> None:
-        """Use the next pose, with the attributes of the poses for which it was chosen."""
-        self.asked, self.poses, self.noise_g, self.coverage = asked, count, noise_g, coverage
-
     def line(self, poses: Poses, units: Units, *, added: bool) -> str:
         """
         Return the line about a captured pose; empty if there is nothing new to report.
@@ -169,23 +190,26 @@ class Guide:
         Parameters
         ----------
         poses : Poses
-            The poses; the captured one is the last.
+            The poses; the captured one is the latest.
         units : Units
             Unit of the readings.
         added : bool
             Whether the number of poses has increased; otherwise the rest repeats a pose.
 
         """
-        if self.asked is None:
+        if self.plan is None:
             return ''
-        done = self.asked.direction is None
+        asked = self.plan.asked
+        done = asked.direction is None
         if not added:
             return '' if done else f'this rest repeats an earlier pose; next: {self.advice}'
-        noise = '' if poses.noise is None or units.name == 'native' else (
-            f', {float(np.mean(units.to_g(poses.noise[-1]))) * MG:.2f} mg')
-        if done and len(poses) > self.asked.total:
+        noise = ''
+        if poses.noise is not None and units.name != 'native':
+            latest = poses.noise[int(np.argmax(poses['time']))]
+            noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
+        if done and len(poses) > asked.total:
             return f'pose {len(poses)}{noise}'
-        return f'pose {len(poses)} of about {self.asked.total}{noise}, next: {self.advice}'
+        return f'pose {len(poses)} of about {asked.total}{noise}, next: {self.advice}'
 
 
 def next_action(asked: NextPose) -> str:

@@ -23,18 +23,17 @@ import numpy as np
 from .active_calibration import ActiveCalibration
 from .commands import Commands
 from .events import Compute, Event, Job, Log, Mounting, Severity, ShowPoses, Still
-from .guidance import Guide, Progress
+from .guidance import Guide, Plan, Progress
 from .health import Health, stream_fault
 from .live_capture import Change, LiveCapture
 from .settings import CalibratorSettings, capture_settings
 from .store import load, Loaded, SensorFiles, writing_advice
 from .stream_statistics import SILENT, StreamStatistics
-from .work import asked_for, is_partial, noise_of, poses_up, title
-from ..calibrate import Calibration, NextPose, with_given_mounting
+from .work import is_partial, plan_for, title
+from ..calibrate import Calibration, with_given_mounting
 from ..calibrate.mounting import mounting_of, mounting_words
 from ..effects import Context
 from ..errors import AccelCalibError, counted, InputError
-from ..estimate.geometry import coverage
 from ..monitor import status
 from ..table import Floats, Poses
 from ..units import units_of
@@ -126,7 +125,7 @@ class Session:
         if settings.rotate != before.rotate:
             self.active.set_rotates(settings.rotate)
         if settings.model != before.model:
-            self.guide.asked = None
+            self.guide.plan = None
             self._show_poses(store=False)
 
     def events(self) -> list[Event]:
@@ -375,33 +374,31 @@ class Session:
         """Add a job that draws the poses with the next pose, and stores them."""
         poses, units, model = self.live.book.poses(), self.units, self.settings.model
         where = self.files.store if store else None
-        guide, count = self.guide, len(poses)
-        added = guide.added(count)
-        due = added != 0 or guide.asked is None
+        guide = self.guide
+        added = guide.added(len(poses))
+        due = added != 0 or guide.plan is None
 
-        def run(compute: Compute) -> tuple[OSError | None, NextPose | None]:
+        def run(compute: Compute) -> tuple[OSError | None, Plan | None]:
             not_stored = None
             try:
                 if where is not None:
                     where.save_poses(poses)
             except OSError as error:
                 not_stored = error
-            if not due:
+            if not due:  # only an average has changed
                 return not_stored, None
-            if not count:
-                return not_stored, asked_for(poses, units, model)
-            return not_stored, compute(asked_for, poses, units, model)
+            if not len(poses):  # without waiting for the start of the worker process
+                return not_stored, plan_for(poses, units, model)
+            return not_stored, compute(plan_for, poses, units, model)
 
-        def finish(found: tuple[OSError | None, NextPose | None]) -> str:
-            not_stored = found[0]
+        def finish(found: tuple[OSError | None, Plan | None]) -> str:
+            not_stored, plan = found
             if not_stored is not None:
                 self._log('error', f'the poses could not be stored: {not_stored}; '
                           f'{writing_advice(not_stored)}', once_in=_AGAIN)
-            if found[1] is not None:  # otherwise only an average has changed
-                up = poses_up(poses, units)
-                guide.adopt(found[1], count, noise_of(poses, units),
-                            coverage(up) if count else 0.0)
-                self._events.append(ShowPoses(up, found[1], self.frame_id or ''))
+            if plan is not None:
+                guide.plan = plan
+                self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
             return guide.line(poses, units, added=added > 0) if new_rest else ''
 
         self._events.append(Job(run, finish))
@@ -420,17 +417,18 @@ class Session:
 
     def progress(self) -> Progress:
         """Return the progress of the calibration."""
-        guide, asked = self.guide, self.guide.asked
+        plan = self.guide.plan
         silent = self.statistics.age > SILENT
         threshold = self.live.detector.threshold
-        direction = None if asked is None or self._all_used else asked.direction
+        direction = None if plan is None or self._all_used else plan.asked.direction
         return Progress(
             still=self._still and not silent,
             stillness=math.nan if silent else self.statistics.spread / threshold,
             dwell=self.statistics.stamp - self._still_since if self._still else 0.0,
-            min_dwell=self.settings.min_dwell, poses=guide.poses,
-            total=0 if asked is None else asked.total, coverage=guide.coverage,
-            accuracy=math.nan if asked is None else asked.error * guide.noise_g,
+            min_dwell=self.settings.min_dwell, poses=self.guide.poses,
+            total=0 if plan is None else plan.asked.total,
+            coverage=0.0 if plan is None else plan.coverage,
+            accuracy=math.nan if plan is None else plan.asked.error * plan.noise_g,
             advice=self.advice, direction=() if direction is None else tuple(direction.tolist()))
 
     def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:

@@ -131,14 +131,16 @@ class Store:
             If the file cannot be read.
 
         """
-        if not self.calibration.exists():
-            return None
-        calibration = read_calibration(self.calibration)
+        return self._read(self.calibration) if self.calibration.exists() else None
+
+    def _read(self, path: Path) -> Calibration:
+        """Read a calibration, and check that it is for this sensor and unit."""
+        calibration = read_calibration(path)
         check_sensor(calibration, self.identity.sensor)
         if calibration.units.name != self.units:
-            raise StoredCalibrationError(f'{self.calibration} is for readings in '
-                                         f'{calibration.units.name}, but the parameter units is '
-                                         f'{self.units}', 'set units to that of the calibration')
+            raise StoredCalibrationError(f'{path} is for readings in {calibration.units.name}, '
+                                         f'but the parameter units is {self.units}',
+                                         'restart the node with units of the calibration')
         return calibration
 
     def load_poses(self) -> Poses | None:
@@ -225,18 +227,25 @@ class Store:
             If a file cannot be read or written.
 
         """
-        steps = self.steps()
-        if not steps:
-            raise InputError('there is no earlier calibration', 'nothing can be undone')
-        step = self._step(steps[-1])
+        step = self._last_step()
+        before = self._read(step) if step.stat().st_size else None
         if self.calibration.exists():
             copy_atomically(self.calibration, free_name(self.calibration, 'undone'))
-        if step.stat().st_size:
+        if before is not None:
             step.replace(self.calibration)
-            return self.load_calibration()
+            return before
         self.calibration.unlink(missing_ok=True)
         step.unlink()
         return None
+
+    def _last_step(self) -> Path:
+        """Return the last step that differs from the file; equal ones come from failed writes."""
+        now = self.calibration.read_bytes() if self.calibration.exists() else b''
+        for step in map(self._step, reversed(self.steps())):
+            if step.read_bytes() != now:
+                return step
+            step.unlink()
+        raise InputError('there is no earlier calibration', 'nothing can be undone')
 
     def save_poses(self, poses: Poses) -> None:
         """Write the poses, or remove the file if there are none; raise OSError if it fails."""

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from .active_calibration import gyro_bias_of_rest
+from .guidance import Plan
 from .settings import CalibratorSettings
 from ..calibrate import (
     Calibration,
@@ -20,14 +21,13 @@ from ..calibrate import (
     level,
     lies_in_cone,
     next_pose,
-    NextPose,
     PRIOR,
 )
 from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
 from ..effects import Context
 from ..errors import counted, listed, RefusedFitError
-from ..estimate.geometry import pose_noise
+from ..estimate.geometry import coverage, pose_noise
 from ..model import Model
 from ..refine import refine, Refinement
 from ..sphere import spread_directions
@@ -145,14 +145,6 @@ def has_changed(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def noise_of(poses: Poses, units: Units) -> float:
-    """Return the median noise of the poses [g]; NaN if it is not known."""
-    noise = pose_noise(poses.noise, poses_up(poses, units)) if len(poses) else None
-    if noise is None or units.name == 'native' or len(noise) != len(poses):
-        return math.nan
-    return float(np.median(units.to_g(noise)))
-
-
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
     """
     Return the refinement of a calibration.
@@ -198,12 +190,15 @@ def poses_up(poses: Poses, units: Units) -> Floats:
         return np.zeros((0, 3))
 
 
-def asked_for(poses: Poses, units: Units, model: str) -> NextPose:
-    """Return the next pose, or that more poses no longer help."""
+def plan_for(poses: Poses, units: Units, model: str) -> Plan:
+    """Return the next pose for a fit of this model, or that more poses no longer help."""
     up = poses_up(poses, units)
-    noise_g = noise_of(poses, units)
-    return next_pose(up, '10' if model == 'auto' else model, pose_noise(poses.noise, up),
-                     noise_g=None if math.isnan(noise_g) else noise_g)
+    noise, noise_g = pose_noise(poses.noise, up), None
+    if noise is not None and len(noise) and units.name != 'native':
+        noise_g = float(np.median(units.to_g(noise)))
+    asked = next_pose(up, '10' if model == 'auto' else model, noise, noise_g=noise_g)
+    return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
+                coverage(up) if len(up) else 0.0)
 
 
 def summary(calibration: Calibration) -> str:
