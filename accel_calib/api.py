@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import calibrate
 from .calibrate import FrameName, level_by_rows, Method, Verification
+from .calibrate.mounting import mounting_of
 from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
@@ -32,7 +33,7 @@ from .files import read_recording as read_whole_recording
 from .refine import refine as find_effects
 from .refine import Refinement
 from .simulate import model_with, simulate_poses, simulate_recording
-from .sphere import rotation_from_rpy, spread_directions
+from .sphere import spread_directions
 from .table import columns_from, Floats, numbered, Poses, Recording, Table
 from .units import STANDARD_GRAVITY, UnitName, Units, units_of
 from .words import now
@@ -463,7 +464,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     """
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
-    rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
+    rotation = mounting_of(np.radians(np.asarray(mounting, float)))
     model = model_with(effects, rotation)
     up = _directions(poses) if directions is None else np.asarray(directions, float)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)

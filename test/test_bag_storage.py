@@ -11,8 +11,9 @@ from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.files import bag, correct_bag, open_recording, read_recording
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import simulate_poses, simulate_recording
-from accel_calib.sphere import rotation_from_rpy, spread_directions
+from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
 from mcap_file import McapFile, STORE
 import numpy as np

@@ -10,8 +10,8 @@ import sys
 from accel_calib.cli.main import main, parser
 from accel_calib.cli.options import plain, progress
 from accel_calib.files import read_calibration, read_poses, write_table
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import parse_effect
-from accel_calib.sphere import rotation_from_rpy
 import numpy as np
 import pytest
 

@@ -14,8 +14,9 @@ from accel_calib.errors import InputError
 from accel_calib.estimate.fit import estimate
 from accel_calib.files import write_calibration
 from accel_calib.model import Model
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import Units, units_of
 import numpy as np
 import pytest

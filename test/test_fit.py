@@ -7,8 +7,9 @@ from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate.closed_form import lower_triangular, sensing_axes
 from accel_calib.model import predict
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
 import numpy as np

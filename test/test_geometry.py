@@ -15,8 +15,9 @@ from accel_calib.estimate.geometry import (
     rows_of,
 )
 from accel_calib.model import predict
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.table import Poses
 from accel_calib.units import Units, units_of
 import numpy as np

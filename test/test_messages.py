@@ -22,8 +22,9 @@ from accel_calib.messages.layout import (
     stamps_of,
 )
 from accel_calib.model import Model, predict
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, rotation_from_rpy, spread_directions
+from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import STANDARD_GRAVITY, units_of
 import numpy as np
 import pytest

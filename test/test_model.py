@@ -17,8 +17,9 @@ from accel_calib.model import (
     with_linear_part,
     with_vector,
 )
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import parse_effect
-from accel_calib.sphere import random_directions, rotation_from_rpy
+from accel_calib.sphere import random_directions
 import numpy as np
 import pytest
 

@@ -11,7 +11,8 @@ from accel_calib.calibrate.mounting import (
     with_heading_of,
 )
 from accel_calib.errors import InputError
-from accel_calib.sphere import random_directions, rotation_from_rpy
+from accel_calib.rotations import rotation_from_rpy
+from accel_calib.sphere import random_directions
 import numpy as np
 import pytest
 

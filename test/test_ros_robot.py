@@ -14,7 +14,8 @@ import time
 from typing import Any
 
 from accel_calib.files import read_calibration
-from accel_calib.sphere import rotation_from_rpy, spread_directions
+from accel_calib.rotations import rotation_from_rpy
+from accel_calib.sphere import spread_directions
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3
 import numpy as np

@@ -17,7 +17,7 @@ from accel_calib.ros.transforms import (
     TOPIC,
     watch_static,
 )
-from accel_calib.sphere import quaternion_of, rotation_from_rpy
+from accel_calib.rotations import quaternion_of, rotation_from_rpy
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ rclpy.spin(node)
 BROADCAST = """
 import sys
 from accel_calib.ros.transforms import MountingBroadcaster
-from accel_calib.sphere import rotation_from_rpy
+from accel_calib.rotations import rotation_from_rpy
 from builtin_interfaces.msg import Time
 import rclpy
 rclpy.init()

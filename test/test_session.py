@@ -15,20 +15,20 @@ from typing import Any
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.files import read_calibration, read_poses, write_calibration, write_table
 from accel_calib.model import Model
+from accel_calib.rotations import rotation_from_rpy
 from accel_calib.session import CalibratorSettings, findings, Job, Log, Session
 from accel_calib.session.health import Level
+from accel_calib.session.sensor_files import Lock, StoreInUseError
 from accel_calib.session.store import (
     Identity,
     load,
-    Lock,
     MOST_STEPS,
     Store,
     store_of,
-    StoreInUseError,
     writing_advice,
 )
 from accel_calib.session.stream_statistics import StreamStatistics
-from accel_calib.sphere import rotation_from_rpy, spread_directions
+from accel_calib.sphere import spread_directions
 import numpy as np
 import pytest
 

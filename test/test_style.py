@@ -16,7 +16,7 @@ PACKAGE = ROOT / 'accel_calib'
 LAYERS = (
     ('errors', 'html_table', 'units'),
     ('table',),
-    ('sphere',),
+    ('sphere', 'rotations'),
     ('effects',),
     ('model',),
     ('capture', 'estimate', 'simulate'),

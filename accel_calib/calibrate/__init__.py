@@ -12,21 +12,11 @@ figures, and `rest_noise` those of the gyro and of the samples.
 
 """
 
-from .calibration import (
-    ARBITRARY_HEADING,
-    Calibration,
-    check_sensor,
-    EDITED,
-    level,
-    of_samples,
-    Quality,
-    Rejected,
-    set_heading,
-    with_given_mounting,
-)
+from .calibration import Calibration, check_sensor, EDITED, of_samples, Quality, Rejected
 from .checks import check_units, FLAT
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .gate import gated
+from .levelling import ARBITRARY_HEADING, level, set_heading, with_given_mounting
 from .mounting import FrameName, FRAMES
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook

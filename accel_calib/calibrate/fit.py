@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from .calibration import Calibration, level, Rejected, set_heading
+from .calibration import Calibration, Rejected
 from .checks import check_units, wiring_warnings
 from .gate import gated, sound_rows, sure_rows
 from .known_orientation import fit_known
+from .levelling import level, set_heading
 from .mounting import FrameName
 from .rest_noise import with_rest_noise
 from .unknown_orientation import fit_unknown, Method, METHODS

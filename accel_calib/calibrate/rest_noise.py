@@ -69,7 +69,7 @@ _TAIL = 5e-4               # probability, on each side, of a rest left out or a 
 _CONFIDENCE = 0.975        # quantile at which the uncertainty of τ is included
 _NORMAL = 1.959964         # the same quantile of the normal distribution
 _CORRELATION_MAX = 0.9
-_BISECTIONS = 40
+_ROUNDING = 1e-9
 _PAIRED = 200              # rests used for the slopes of pairs
 _TINY = 1e-30              # variance added to rests without noise [(rad/s)²]
 _MAD = 1.4826
@@ -388,9 +388,11 @@ def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, F
 
 def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
     """Return τ², at which the weighted squares have their expected sum; see the module."""
+    from scipy.optimize import brentq
+
     dof = design.shape[0] - design.shape[1]
     flat = _weighted(design, rate, np.ones(len(rate)))[2]
-    low, high = 0.0, float(flat @ flat) / dof
+    high = float(flat @ flat) / dof * (1.0 + _ROUNDING)
 
     def excess(scatter: float) -> float:
         left = _weighted(design, rate, noise + scatter)[2]
@@ -398,7 +400,4 @@ def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
 
     if excess(0.0) <= 0.0:
         return 0.0
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    return float(brentq(excess, 0.0, high, xtol=_ROUNDING * high))

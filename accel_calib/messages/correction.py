@@ -34,7 +34,6 @@ message, so each covariance is transformed only once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 import struct
 from typing import Any, TYPE_CHECKING
@@ -62,7 +61,7 @@ from ..calibrate import Calibration, of_samples
 from ..effects import Context
 from ..errors import InputError
 from ..one_reading import AtReading, OneReading, Triple
-from ..sphere import quaternion_of
+from ..rotations import quaternion_of
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -98,8 +97,9 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
         _transform(result, ANGULAR_VELOCITY_COVARIANCE, rotation.T)
         present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
-        result[present, ORIENTATION] = _turned(doubles[present, ORIENTATION].T,
-                                               quaternion_of(rotation)).T
+        x, y, z, w = doubles[present, ORIENTATION].T
+        result[present, ORIENTATION] = np.array(
+            _product(x, y, z, w, *quaternion_of(rotation))).T
         _transform(result, ORIENTATION_COVARIANCE, rotation.T)
     stated = _transform(result, ACCELERATION_COVARIANCE,
                         rotation.T @ np.linalg.inv(calibration.gain))
@@ -147,13 +147,9 @@ def transformed(matrix: Floats, covariance: Floats) -> Floats:
     return (matrix @ covariance.reshape(-1, 3, 3) @ matrix.T).reshape(-1, 9)
 
 
-def _turned(orientation: Any, turn: Sequence[float]) -> Floats:
-    """Return the product of quaternions (x, y, z, w), each component a float or an array."""
-    return np.array(_product(*orientation, *turn))
-
-
 def _product(x: Any, y: Any, z: Any, w: Any, p: float, q: float, r: float, s: float
              ) -> tuple[Any, Any, Any, Any]:
+    """Return the product of two quaternions (x, y, z, w); the first can have arrays."""
     return (w * p + x * s + y * r - z * q, w * q - x * r + y * s + z * p,
             w * r + x * q - y * p + z * s, w * s - x * p - y * q - z * r)
 

@@ -13,6 +13,7 @@ samples that are due, with stamps at intervals of exactly 1/rate. The accelerati
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 import time
 
 from geometry_msgs.msg import Vector3, Vector3Stamped
@@ -25,9 +26,10 @@ from std_msgs.msg import Header
 
 from . import qos
 from .declare import declared
+from ..calibrate.mounting import mounting_of
 from ..session.settings import parameter
 from ..simulate import model_with, parse_effect, simulate_recording
-from ..sphere import rotation_from_rpy, spread_directions
+from ..sphere import spread_directions
 from ..table import Floats, Recording
 from ..units import STANDARD_GRAVITY
 
@@ -152,7 +154,7 @@ def recording_of(settings: SimulatorSettings) -> Recording:
 
     """
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
-    rotation = rotation_from_rpy(*np.radians(settings.mounting)).T
+    rotation = mounting_of([math.radians(angle) for angle in settings.mounting])
     effects = dict(parse_effect(text) for text in settings.effects if text)
     flat = [_FLAT] * settings.flat_first, [_FLAT] * settings.flat_last
     directions = np.concatenate([*flat[0], spread_directions(settings.poses), *flat[1]])

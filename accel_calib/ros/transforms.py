@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from . import qos
 from ..errors import InputError
-from ..sphere import quaternion_of
+from ..rotations import quaternion_of, rotation_from_quaternion
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -227,7 +227,4 @@ def _rotation_of(quaternion: Sequence[float], what: str) -> Floats:
         raise InputError(
             f'{what} has the quaternion ({x:g}, {y:g}, {z:g}, {w:g}) of length '
             f'{math.sqrt(squared):.3g}, expected length 1', 'correct the node that publishes it')
-    return np.eye(3) + (2.0 / squared) * np.array(
-        [[-y * y - z * z, x * y - w * z, x * z + w * y],
-         [x * y + w * z, -x * x - z * z, y * z - w * x],
-         [x * z - w * y, y * z + w * x, -x * x - y * y]])
+    return rotation_from_quaternion(quaternion)

@@ -6,9 +6,9 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `commands` contains what the user can ask for. `live_capture`
 captures poses, `guidance` says which pose is next, and `active_calibration` contains the
-calibration in use. `store` manages files. `work` contains the computations, which run in
-`worker_process`. `stream_statistics` and `health` describe the stream and the state. `settings`
-defines the parameters.
+calibration in use. `store` manages files, and `sensor_files` locks them. `work` contains the
+computations, which run in `worker_process`. `stream_statistics` and `health` describe the stream
+and the state. `settings` defines the parameters.
 
 """
 

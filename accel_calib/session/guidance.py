@@ -169,7 +169,7 @@ class Guide:
 
     @property
     def poses(self) -> int:
-        """Number of poses for which the next pose was chosen."""
+        """Return the number of poses for which the next pose was chosen."""
         return 0 if self.plan is None else self.plan.poses
 
     def added(self, count: int) -> int:

@@ -26,8 +26,9 @@ from .events import Compute, Event, Job, Log, Mounting, Severity, ShowPoses, Sti
 from .guidance import Guide, Plan, Progress
 from .health import Health, stream_fault
 from .live_capture import Change, LiveCapture
+from .sensor_files import SensorFiles
 from .settings import CalibratorSettings, capture_settings
-from .store import load, Loaded, SensorFiles, writing_advice
+from .store import load, Loaded, writing_advice
 from .stream_statistics import SILENT, StreamStatistics
 from .work import is_partial, plan_for, title
 from ..calibrate import Calibration, with_given_mounting

@@ -42,7 +42,7 @@ _IDLE = 'idle'
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 """Limits of the number of threads: arrays are small, so more threads would only wait."""
 
-_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.special')
+_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
 
 

@@ -1,0 +1,140 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The files of the sensor of a session, which only one node can use at a time.
+
+A lock on the files is held until it is released or the process ends.
+
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+
+from .settings import CalibratorSettings
+from .store import Identity, Store, store_of
+from ..errors import AccelCalibError, InputError
+
+
+class StoreInUseError(AccelCalibError):
+    """Another node uses the files."""
+
+
+class Lock:
+    """
+    A lock on the files of a store, until it is released or the process ends.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+
+    Raises
+    ------
+    StoreInUseError
+        If another process has locked the files.
+
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._handle = -1
+        path = store.calibration.with_name(f'{store.calibration.stem}.lock')
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError:
+            return  # the folder cannot be written, so there is nothing to protect
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(self._handle, 32).decode(errors='replace').strip()
+            self.release()
+            raise StoreInUseError(
+                f'{store.calibration} is used by the node with process id {holder or "unknown"}',
+                'stop that node, or restart this node with another calibration_file or sensor'
+            ) from None
+        os.ftruncate(self._handle, 0)
+        os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
+
+    def release(self) -> None:
+        """Release the lock."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+
+class SensorFiles:
+    """
+    The store of a sensor, with its lock.
+
+    Parameters
+    ----------
+    settings : CalibratorSettings
+        Parameters for sensor and files.
+    topic : str
+        Topic of the messages, with namespace.
+
+    Attributes
+    ----------
+    store : Store or None
+        The store; None until the sensor is known.
+    problem : str
+        Reason why the files cannot be used, or empty.
+
+    """
+
+    def __init__(self, settings: CalibratorSettings, topic: str) -> None:
+        self._settings, self._topic = settings, topic
+        self._lock: Lock | None = None
+        self.store: Store | None = None
+        self.problem = ''
+
+    @property
+    def locked(self) -> bool:
+        """Whether this node has locked the files."""
+        return self._lock is not None
+
+    def take(self, sensor: str) -> Store | None:
+        """Lock the files of a sensor and return the store; None if another node uses them."""
+        identity = Identity(sensor, self._topic, bool(self._settings.sensor))
+        before, self.store = self.store, store_of(self._settings.calibration_file, identity,
+                                                  self._settings.units)
+        if before is None or before.calibration != self.store.calibration:
+            self.release()
+        return self.store if self.locked else self.try_again()
+
+    def try_again(self) -> Store | None:
+        """Lock the files if they have become free; return the store, or otherwise None."""
+        if self.store is None or self.locked:
+            return None
+        try:
+            self._lock, self.problem = Lock(self.store), ''
+        except StoreInUseError as error:
+            self.problem = str(error)
+            return None
+        return self.store
+
+    def usable(self) -> Store:
+        """
+        Return the locked store.
+
+        Raises
+        ------
+        InputError
+            If the sensor is not known yet, or another node uses the files.
+
+        """
+        if self.store is None:
+            raise InputError('the name of the sensor is not known, because there is no Imu '
+                             'message yet', 'start the driver, or set the parameter sensor')
+        if not self.locked:
+            raise InputError(self.problem, 'this node stores nothing')
+        return self.store
+
+    def release(self) -> None:
+        """Unlock the files."""
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
