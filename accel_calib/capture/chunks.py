@@ -15,6 +15,10 @@ interruption of the stamps. After an interruption the period is estimated again.
 
 **Sums.** Sums over the samples of chunks, one record per chunk. Records of several chunks add up.
 
+**Limits.** A sensor that reaches the end of its range repeats its largest or smallest reading. The
+samples that repeat the extreme of their axis so far are therefore counted. A new extreme is not
+counted, because noise also reaches new extremes.
+
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ SUMS = np.dtype([
     ('time', float),              # of the stamps, relative to the epoch [s]
     ('first', float, 6),          # of reading and rate, relative to the origin
     ('second', float, 6),         # of their squares
+    ('at_limit', float, 3),       # samples that repeat the extreme of the axis so far
     ('context_count', float, 2),  # samples that have the context
     ('context_sum', float, 2)])
 
@@ -89,11 +94,11 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> R
     Returns
     -------
     (m,) array of SUMS
-        The sums; those of a missing rate are NaN.
+        The sums; those of a missing rate are NaN, and ``at_limit`` is 0.
 
     """
     sums = blank(SUMS, len(starts))
-    sums['context_count'] = sums['context_sum'] = 0.0
+    sums['context_count'] = sums['context_sum'] = sums['at_limit'] = 0.0
     if not len(starts):
         return sums
     sums['count'] = np.diff(starts, append=samples.shape[1])
@@ -126,6 +131,54 @@ def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
     lowest[starts] = np.inf
     found = np.minimum.reduceat(lowest, starts)
     return np.asarray(np.where(found < least, found, np.inf))
+
+
+class Extremes:
+    """The largest and the smallest reading of each axis so far."""
+
+    def __init__(self) -> None:
+        self._highest = np.full(3, -np.inf)
+        self._lowest = np.full(3, np.inf)
+
+    def repeated(self, reading: Floats, starts: Indices) -> Floats:
+        """
+        Return how many samples of each chunk repeat an extreme, and update the extremes.
+
+        Parameters
+        ----------
+        reading : (3, n) array
+            The next readings.
+        starts : (m,) array of int
+            Index of the first sample of each chunk.
+
+        Returns
+        -------
+        (m, 3) array
+            Number of samples, by axis.
+
+        """
+        found = np.zeros((len(starts), 3))
+        if not len(starts):
+            return found
+        highest, lowest = reading.max(axis=1), reading.min(axis=1)
+        for axis, values in enumerate(reading):
+            # Most blocks reach no extreme; they need no more than the maximum and the minimum.
+            if highest[axis] >= self._highest[axis]:
+                found[:, axis] += _repeats(values, starts, self._highest[axis])
+            if lowest[axis] <= self._lowest[axis]:
+                found[:, axis] += _repeats(-values, starts, -self._lowest[axis])
+        np.maximum(self._highest, highest, out=self._highest)
+        np.minimum(self._lowest, lowest, out=self._lowest)
+        return found
+
+
+def _repeats(values: Floats, starts: Indices, before: float) -> Floats:
+    """Return the (m,) numbers of values in chunks that repeat the maximum so far."""
+    highest = np.maximum.reduceat(values, starts)
+    so_far = np.maximum.accumulate(np.concatenate([[before], highest]))
+    sizes = np.diff(starts, append=len(values))
+    equal = np.add.reduceat((values == np.repeat(so_far[1:], sizes)).astype(float), starts)
+    return np.asarray(equal - (highest > so_far[:-1]))
 
 
 _LEARN = 16          # intervals from which the period is estimated
@@ -226,6 +279,7 @@ class Chunker:
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
         self._pending: Floats = _NONE
         self._least = [np.inf, np.inf]
+        self._extremes = Extremes()
         self._origin: Floats | None = None
         self._period = -1.0
         self._length = 0.0
@@ -319,9 +373,10 @@ class Chunker:
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         assert self._origin is not None
         ends = np.append(starts[1:], samples.shape[1]) - 1 if len(starts) else starts
-        return Chunks(sums_of(samples, starts, self._epoch, self._origin), samples[0, starts],
-                      samples[0, ends], self._steps(samples, starts), self._epoch,
-                      self._origin, self._length, self._period, self._fresh)
+        sums = sums_of(samples, starts, self._epoch, self._origin)
+        sums['at_limit'] = self._extremes.repeated(samples[1:4], starts)
+        return Chunks(sums, samples[0, starts], samples[0, ends], self._steps(samples, starts),
+                      self._epoch, self._origin, self._length, self._period, self._fresh)
 
     def _steps(self, samples: Floats, starts: Indices) -> Floats:
         step = np.full((2, len(starts)), np.inf)

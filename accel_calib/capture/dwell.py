@@ -8,10 +8,10 @@ Mean and standard deviation are those of all samples. The number of samples is d
 excess of the noise of the mean (see `window`), so that std/√count is the noise of the mean along
 the force (see below). A short dwell is not enough to estimate the excess, which is a property
 of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
-excess. Samples that are rounded to steps of height q cause an error of the mean. Averaging does
-not remove this error if the noise σ of the samples is less than a step: its variance is
-(q²/12) exp(-4π² σ²/q²) [1]_. σ is estimated from the quietest stretch so far; samples that
-alternate between two steps are not suitable.
+excess. Samples that are rounded to steps cause an error of the mean. Averaging does not remove
+this error if the noise of the samples is less than a step. Its variance follows from the mean
+variance of the samples of each axis over all dwells (see `window`). One dwell without any variance
+is added to this mean, because a few dwells that alternate between two steps look like more noise.
 
 The white noise of the angular rate is the mean variance of the windows. The standard deviation
 over the whole dwell would include the slow drift of a gyro, which is not white.
@@ -36,11 +36,6 @@ correct for its mean attitude, and the fit uses only the noise along the force.
 
 The chunks of a dwell are combined into at most `2 · CELLS` cells. The number of chunks per cell is
 a power of two, so a dwell of days needs no more memory than a dwell of a minute.
-
-References
-----------
-.. [1] B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, chapter 4: the first term of
-   the bias of a mean, q/π sin(2πx/q) exp(-2π² σ²/q²), scaled to q²/12 at σ = 0.
 
 """
 
@@ -255,7 +250,8 @@ def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
     excess = np.minimum(across, along)
     turned, sure = _by_gyro(table, quiet, rule)
     good = quiet & ~turned & (sure | rule.rests(slopes, across))
-    std, count = _counts(table[first:], excess[first:], rule)
+    level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
+    std, count = _counts(table[first:], excess[first:], level, rule)
     rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
     return [_dwell(*each) if fine else None for fine, *each in zip(
         good[first:], table[first:], std.T.copy(), count.tolist(), rate_std)]
@@ -302,9 +298,9 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
-def _counts(table: Records, excess: Floats, rule: Rule) -> tuple[Floats, Floats]:
+def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[Floats, Floats]:
     """Return (3, k) standard deviations and (k,) independent samples, including rounding."""
-    resolution, left = rule.rounding(table['mean'].T[:3], table['std'].T)
+    resolution, left = rule.rounding(table['mean'].T[:3], level)
     std = np.maximum(table['std'].T, resolution)
     variance = std**2 * excess / table['samples'] + left
     return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))

@@ -22,7 +22,8 @@ is exact for white noise and close for AR(1) noise). The upper end of this range
 sensor moves. Its minimum so far is therefore used. It is at least the variance that the resolution
 causes: a quantised reading that alternates between two steps of height q has a variance of up to
 q²/4, and q is the smallest step so far. For data without noise, the noise is at least a millionth
-of the reading.
+of the reading. The samples of an axis at the limit of the sensor scatter less than its noise, so
+nothing is learned from such an axis (see `window.clipped`).
 
 Before the noise is known, the unit of the readings sets a limit: a sensor with a standard
 deviation above `STD_CAP_G` is not still.
@@ -154,9 +155,16 @@ class Rule:
         noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
         return at_least_any(noise, np.asarray(self.scale))
 
-    def rounding(self, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
+    def rounding(self, mean: Floats, level: Floats) -> tuple[Floats, Floats]:
         """
         Return the effect of rounding on samples and on their mean.
+
+        Parameters
+        ----------
+        mean : (3, n) array
+            Mean readings of dwells.
+        level : (3,) array
+            Mean variance of the samples of each axis, over many dwells.
 
         Returns
         -------
@@ -166,7 +174,7 @@ class Rule:
             Variance of the rounding error of the mean; averaging does not remove it.
 
         """
-        return rounding(float(self._step[0]), self._floor[:3, np.newaxis], mean, std)
+        return rounding(float(self._step[0]), mean, level)
 
     @property
     def rate_resolution(self) -> float:
@@ -268,7 +276,7 @@ class Rule:
         dof = np.maximum(2.0 * seen.samples / (1.0 + seen.excess), 1.0)
         average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=0)
         steps = np.minimum.accumulate(np.column_stack([self._step, step]), axis=1)[:, 1:]
-        average[:3][clipped(average, steps, mean)] = np.nan
+        average[:3][clipped(average, seen.at_limit, steps, mean)] = np.nan
         average[:, 0] = np.fmin(average[:, 0], self._floor[:axes])
         floor = np.fmin.accumulate(average, axis=1)
         self._floor[:axes], self._step = floor[:, -1], steps[:, -1]

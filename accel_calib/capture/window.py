@@ -30,6 +30,15 @@ from the residuals r: their power over w, times (1 + ρ)/(1 - ρ) for a correlat
 neighbours (the sum of the correlations of an AR(1) process [1]_). Power and ρ are pooled over the
 axes, because K cells of one axis are too few. They are at least those of white noise.
 
+**Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
+of q. The error of the mean of many samples depends on μ. Over all μ its variance is
+
+    e² = q² Σ_k exp(-4π² k² σ²/q²) / (2π² k²)                                 (1)
+
+and the mean variance v of the rounded samples is σ² + q²/12 - e² [3]_. So v determines σ and e².
+For σ < 0.2 q the samples take two values at most, and v = q σ/√π. For a larger σ the first term of
+(1) is enough, and e² is found by iteration.
+
 **Mean.** The variance of the mean of a correlated series is the sum of its autocovariances divided
 by its length. Sample autocovariances at long lags are noise. The sum therefore ends where a pair
 Γ_j = γ_2j + γ_2j+1 is not positive (initial positive sequence, Geyer [2]_). Subtracting the mean
@@ -39,6 +48,7 @@ References
 ----------
 .. [1] G. E. P. Box, G. M. Jenkins, G. C. Reinsel, Time Series Analysis, 3rd ed., section 2.1.
 .. [2] C. J. Geyer, Practical Markov Chain Monte Carlo, Statistical Science 7 (1992) 473-483.
+.. [3] B. Widrow, I. Kollár, Quantization Noise, Cambridge 2008, chapter 4.
 
 """
 
@@ -46,6 +56,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -281,6 +292,10 @@ RELATIVE = 1e-6
 STD_FLOOR_G = 3.3e-4
 """Smallest noise of a sensor [g]; smaller shaking is harmless."""
 
+AT_LIMIT = 0.1
+"""Share of samples at a limit above which a variance is not that of the noise; it is then smaller
+by a sixth or more."""
+
 _DIGITS = 1e-14
 """Rounding error of differences of sums, relative to the squared reading."""
 
@@ -296,18 +311,21 @@ class Columns:
         Number of samples.
     first, second : (axes, n) array
         Sums of reading and rate, and of their squares.
+    at_limit : (3, n) array
+        Number of samples that repeat the extreme of their axis so far.
 
     """
 
     count: Floats
     first: Floats
     second: Floats
+    at_limit: Floats
 
 
 def columns_of(sums: Records, axes: int) -> Columns:
     """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-    return Columns(sums['count'].copy(), first, second)
+    return Columns(sums['count'].copy(), first, second, np.ascontiguousarray(sums['at_limit'].T))
 
 
 def windows(sums: Columns) -> tuple[Floats, Floats]:
@@ -339,6 +357,8 @@ class Stretch:
         Largest variance of the windows, for the reading.
     samples : (m,) array
         Number of samples.
+    at_limit : (3, m) array
+        Share of samples that repeat the extreme of their axis so far.
 
     """
 
@@ -347,6 +367,7 @@ class Stretch:
     variance: Floats
     highest: Floats
     samples: Floats
+    at_limit: Floats
 
 
 def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
@@ -366,7 +387,8 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
                          neighbours=_grouped(line.neighbours))
     found = strength_of(line, spacing, _grouped(white))
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
-    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count)
+    at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
+    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit)
 
 
 def _grouped(values: Floats) -> Floats:
@@ -400,13 +422,25 @@ def _tiny(mean: Floats) -> Floats:
     return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
 
 
-def clipped(average: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
-    """Return which axes are constant while another axis varies by more than rounding."""
+def clipped(average: Floats, at_limit: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
+    """
+    Return which axes end at a limit while another axis varies by more than rounding.
+
+    Parameters
+    ----------
+    average : (axes, n) array
+        Variances.
+    at_limit : (3, n) array
+        Share of samples that repeat the extreme of their axis so far.
+    step, mean : (2, n) array, (axes, n) array
+        Smallest steps so far; mean readings and rates.
+
+    """
     reading = mean[:3]
     tiny = _tiny(reading)
     least = at_least(np.zeros_like(reading), step, reading)
-    constant = average[:3] <= tiny
-    return np.asarray(constant & np.any(average[:3] > 2.0 * least, axis=0))
+    ends = (average[:3] <= tiny) | (at_limit > AT_LIMIT)
+    return np.asarray(ends & np.any(average[:3] > 2.0 * least, axis=0))
 
 
 def at_least_any(noise: Floats, scale: Floats) -> Floats:
@@ -416,11 +450,40 @@ def at_least_any(noise: Floats, scale: Floats) -> Floats:
     return found
 
 
-def rounding(step: float, floor: Floats, mean: Floats, std: Floats) -> tuple[Floats, Floats]:
+_TWO_VALUES = 0.1128
+"""Variance of rounded samples [steps²] below which they alternate between two values."""
+
+_SOLVED = 30
+"""Steps of the iteration for larger variances; each divides the error by 2.4 or more."""
+
+
+def rounding_left(variance: Floats) -> Floats:
+    """
+    Return the variance that rounding leaves in a mean, from the variance of the rounded samples.
+
+    Parameters
+    ----------
+    variance : (...) array
+        Variance of the rounded samples, as an average over many true values [steps²].
+
+    Returns
+    -------
+    (...) array
+        Variance of the error of the mean of many samples [steps²]: 1/12 without noise, 0 if the
+        noise of the samples is a step or more.
+
+    """
+    small = np.pi * variance**2 + 1.0 / 12.0 - variance
+    left = np.zeros_like(variance)
+    for _ in range(_SOLVED):
+        left = np.exp(-4.0 * np.pi**2 * (variance - 1.0 / 12.0 + left)) / (2.0 * np.pi**2)
+    return np.where(variance < _TWO_VALUES, small, left)
+
+
+def rounding(step: float, mean: Floats, level: Floats) -> tuple[Floats, Floats]:
     """Return the effect of rounding on samples and on their mean; see `Rule.rounding`."""
     step = step if np.isfinite(step) else 0.0
     tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
-    square = step**2 / 12.0
-    own = np.minimum(np.sqrt(floor), std)
-    left = square * np.exp(-np.square(2.0 * np.pi * own / np.maximum(step, tiny)))
-    return np.maximum(np.sqrt(square), tiny), np.maximum(left, 1e-2 * tiny**2)
+    resolution = np.maximum(step / math.sqrt(12.0), tiny)
+    left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
+    return resolution, np.maximum(left[:, np.newaxis], 1e-2 * tiny**2)
