@@ -5,8 +5,9 @@
 One case of the refinement benchmark: poses with hidden effects, refined and judged.
 
 A name is right if it is that of the hidden effect. It is right as a rival if it is another one
-that states the hidden effect among its rivals. The effects of the base (offset, gains) do not
-count as names.
+that states the hidden effect among its rivals. The effects of the base (offset, gains) and the
+empirical term do not count as names. The empirical term is located if its words contain the
+carrier and the variable of the hidden effect.
 
 The reference is the true form, fitted to the same poses: offset, symmetric gain, the values of the
 hidden effects and the time constant of a warm-up, together, by least squares on |a| = 1 g with the
@@ -18,24 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+import re
 import time
 import traceback
 from typing import Any
 
-from accel_calib.calibrate import verify
+from accel_calib.calibrate import fit_poses, verify
 from accel_calib.refine import refine
 from accel_calib.table import COLUMNS, Floats, Poses
 from accel_calib.units import units_of
-from generator import (
-    again,
-    basis_of,
-    ON_OUTPUT,
-    OUTSIDE,
-    Setup,
-    simulate,
-    Simulated,
-    STANDARD_GRAVITY,
-)
+from generator import again, Setup, simulate, Simulated
+from generator_effects import basis_of, CARRIER, ON_OUTPUT, OUTSIDE, STANDARD_GRAVITY
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -46,6 +40,21 @@ SHOWS = 5.0
 
 WITHOUT_FORM = (*ON_OUTPUT, *OUTSIDE, 'offset_wander')
 """Effects that are not functions with a few values."""
+
+EMPIRICAL = 'empirical'
+
+CARRIERS = (('cross_axis', r'\bcross-axis'), ('gain', r'\bgain\b'), ('offset', r'\boffset\b'),
+            ('force', r'\bsize of the force\b|\|force\||\|a\|'))
+VARIABLES = (('temperature_rate', r'\brate\b'), ('temperature', r'\btemperature\b'),
+             ('supply', r'\bsupply\b'), ('vibration', r'\bvibration\b'), ('time', r'\btime\b'),
+             ('force', r'\bforce along\b'))
+"""Words of carriers and variables, more specific ones first."""
+
+LAG_WITHIN = 0.1
+"""Largest relative error of the lag of a thermometer."""
+
+NOT_COMPARED = ('instant', 'limit', 'step')
+"""Values that are not estimated with a standard deviation."""
 
 _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _SWEEPS = 7
@@ -68,6 +77,12 @@ class Case:
         Seed of the random numbers.
     against_truth : bool
         Whether to fit the true form too.
+    group : str
+        Group of the row.
+    drawn : bool
+        Whether the hidden effects are random.
+    base : str
+        Base of the refinement.
 
     """
 
@@ -76,6 +91,28 @@ class Case:
     setup: Setup
     seed: tuple[int, ...]
     against_truth: bool = False
+    group: str = ''
+    drawn: bool = False
+    base: str = '10'
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """
+    Residuals of fresh poses.
+
+    Parameters
+    ----------
+    base_mg, refined_mg : float
+        RMS with the base and with the refined calibration [mg].
+    noise_mg : float
+        RMS of the noise of the poses [mg].
+
+    """
+
+    base_mg: float
+    refined_mg: float
+    noise_mg: float
 
 
 @dataclass(frozen=True)
@@ -99,6 +136,12 @@ class Outcome:
         Errors of the values of the hidden effects over their standard deviations.
     held_out : tuple of float or None
         Residual of fresh poses: of the refined calibration, and of the true form [mg].
+    fresh : Fresh or None
+        Residuals of fresh poses; None after an exception.
+    where : tuple of str
+        Words of each empirical term.
+    lag : float or None
+        The lag of `offset_temperature` [s]; None if it has none.
     seconds : float
         Duration of the refinement [s].
     error : str
@@ -113,6 +156,9 @@ class Outcome:
     knocked: Mapping[int, float]
     deviations: tuple[float, ...]
     held_out: tuple[float, float] | None
+    fresh: Fresh | None
+    where: tuple[str, ...]
+    lag: float | None
     seconds: float
     error: str = ''
 
@@ -138,6 +184,26 @@ class Outcome:
             return 'missed'
         return 'exact' if set(self.names) == found else 'rival'
 
+    @property
+    def located(self) -> bool:
+        """Return whether an empirical term has the carrier and the variable of a hidden effect."""
+        truths = {pair for name in self.case.hidden for pair in CARRIER[name]}
+        return any(carrier_of(words) in truths for words in self.where)
+
+    @property
+    def lag_found(self) -> bool:
+        """Return whether the lag is right; its sign is a convention."""
+        truth = abs(self.case.setup.lag)
+        return self.lag is not None and abs(abs(self.lag) - truth) <= LAG_WITHIN * truth
+
+
+def carrier_of(where: str) -> tuple[str, str]:
+    """Return carrier and variable in the words of an empirical term; '' if there is none."""
+    first = where.split(';')[0]
+    found = [next((name for name, words in table if re.search(words, first)), '')
+             for table in (CARRIERS, VARIABLES)]
+    return found[0], found[1]
+
 
 def run(case: Case) -> Outcome:
     """Simulate the poses of a case, refine them and judge the result."""
@@ -145,16 +211,36 @@ def run(case: Case) -> Outcome:
     knocked = {row: abs(shown) / made.noise[row - 1] for row, shown in made.knocked.items()}
     poses, started = poses_of(made), time.perf_counter()
     try:
-        refined = refine(poses, units_of('m/s2'), base='10')
+        refined = refine(poses, units_of('m/s2'), base=case.base)
         seconds = time.perf_counter() - started
         named = tuple((step.effect, tuple(step.rivals)) for step in refined.steps
-                      if step.effect not in BASE)
+                      if step.effect not in (*BASE, EMPIRICAL))
+        other = again(np.random.default_rng((*case.seed, 1)), made)
+        fresh = _fresh(case, poses, refined, other)
         return Outcome(case, refined.verdict, named, frozenset(refined.disturbed_poses), knocked,
-                       _deviations(refined.calibration, made), _held_out(case, refined, made),
-                       seconds)
+                       _deviations(refined.calibration, made),
+                       _held_out(case, fresh, made, other), fresh,
+                       tuple(step.where for step in refined.steps if step.effect == EMPIRICAL),
+                       _lag(refined), seconds)
     except Exception:
-        return Outcome(case, 'error', (), frozenset(), knocked, (), None,
+        return Outcome(case, 'error', (), frozenset(), knocked, (), None, None, (), None,
                        time.perf_counter() - started, traceback.format_exc())
+
+
+def _lag(refined: Any) -> float | None:
+    """Return the lag of `offset_temperature`, or None."""
+    for step in refined.steps:
+        if step.effect == 'offset_temperature' and 'lag' in step.parameters:
+            return float(step.parameters['lag'])
+    return None
+
+
+def _fresh(case: Case, poses: Poses, refined: Any, other: Simulated) -> Fresh:
+    """Return the residuals that the base and the refined calibration leave in fresh poses."""
+    base = fit_poses(poses, units_of('m/s2'), model=case.base)
+    fresh = poses_of(other)
+    return Fresh(verify(base, fresh).rms_after_mg, verify(refined.calibration, fresh).rms_after_mg,
+                 float(np.sqrt(np.mean(other.noise ** 2)) * 1e3))
 
 
 def poses_of(made: Simulated) -> Poses:
@@ -176,24 +262,16 @@ def _deviations(calibration: Any, made: Simulated) -> tuple[float, ...]:
     for effect, values in made.truth.items():
         for part, value in values.items():
             estimate, deviation = fitted.get(f'{effect}.{part}', (0.0, 0.0))
-            if deviation > 0.0 and part not in ('instant', 'limit', 'step'):
+            if deviation > 0.0 and part not in NOT_COMPARED:
                 found.append(float((estimate - value) / deviation))
     return tuple(found)
 
 
-def _held_out(case: Case, refined: Any, made: Simulated) -> tuple[float, float] | None:
+def _held_out(case: Case, fresh: Fresh, made: Simulated, other: Simulated
+              ) -> tuple[float, float] | None:
     """Return the residuals of fresh poses: refined calibration and true form [mg]."""
-    if not case.against_truth or any(name in WITHOUT_FORM for name in case.hidden):
-        return None
-    fresh = again(np.random.default_rng((*case.seed, 1)), made)
-    poses = poses_of(fresh)
-    if 'previous' in refined.calibration.model.needs:
-        basis = basis_of('hysteresis', fresh.around, fresh.traits)
-        poses = poses.with_columns(previous=np.einsum('nii->ni', basis))
-    reference = true_form_residual_mg(made, fresh)
-    if reference is None:
-        return None
-    return verify(refined.calibration, poses).rms_after_mg, reference
+    reference = true_form_residual_mg(made, other) if case.against_truth and case.hidden else None
+    return None if reference is None else (fresh.refined_mg, reference)
 
 
 @dataclass(frozen=True)

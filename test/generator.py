@@ -5,11 +5,11 @@
 A simulator of a still accelerometer that shares no code with the package.
 
 The results of the package are tested with this simulator. It is therefore independent: it is based
-only on the table of effects, and uses only numpy. A set of poses is simulated sample by sample:
-the true specific force u in the sensor axes, the common errors V + W u, the contributions of the
-hidden effects, the vibration of each sample, and the limits and the grid of the output. Then mean
-and standard deviation of the samples of each pose are computed. Temperature, supply, time, rate
-and variance are always recorded, also if they have no effect.
+only on the table of effects (`generator_effects`), and uses only numpy. A set of poses is
+simulated sample by sample: the true specific force u in the sensor axes, the common errors
+V + W u, the contributions of the hidden effects, the vibration of each sample, and the limits and
+the grid of the output. Then mean and standard deviation of the samples of each pose are computed.
+Temperature, supply, time, rate and variance are always recorded, also if they have no effect.
 
 Forces are in g, and up is positive. The columns are those of a pose table in m/s², with rad/s, °C,
 V and s.
@@ -21,7 +21,8 @@ to |a| after a least squares fit of the 9 free parameters of V and symmetric W, 
 noise of each pose mean in |a|, RMS over the poses. The values of the effects are scaled to the
 requested size. There are two exceptions. For quantisation, the error in g is that of another
 effect of the requested size, but the sample noise is small compared with the step, so the size is
-larger. Saturation clips at least `LEAST_CLIPPED` poses, even if the size is then larger.
+larger. Saturation clips at least `LEAST_CLIPPED` poses, even if the size is then larger. The noise
+is that of the samples, also if the poses repeat worse (`Setup.understated`).
 """
 
 from __future__ import annotations
@@ -30,17 +31,27 @@ from collections.abc import Callable, Mapping
 import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
+from generator_effects import (
+    Around,
+    basis_of,
+    EFFECTS,
+    Floats,
+    HOUR,
+    NOMINAL_SUPPLY,
+    ON_OUTPUT,
+    OUTSIDE,
+    PAIRS,
+    plain_reading,
+    STANDARD_GRAVITY,
+    Traits,
+    unit,
+)
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-
-STANDARD_GRAVITY = 9.80665
-REFERENCE_TEMPERATURE = 25.0
-NOMINAL_SUPPLY = 3.3
-HOUR = 3600.0
+__all__ = ['again', 'Around', 'basis_of', 'EFFECTS', 'Floats', 'LEAST_CLIPPED', 'noise_in_norm',
+           'ON_OUTPUT', 'OUTSIDE', 'plain_reading', 'Setup', 'simulate', 'Simulated', 'size_of',
+           'STANDARD_GRAVITY', 'Traits', 'write_csv']
 
 LEAST_CLIPPED = 3
 """Smallest number of clipped poses; a single clipped pose looks like an outlier."""
@@ -48,11 +59,14 @@ LEAST_CLIPPED = 3
 QUIET_STEP = 20.0
 """Ratio of the step of a coarse grid to the sample noise."""
 
-PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-"""Axes i, j of cross coupling: k u_i u_j is added to axis i."""
+DEGREES = 3.0
+"""Degrees of freedom of the heavy-tailed errors of the poses."""
 
-OUTSIDE = ('ripple', 'temperature_rate', 'periodic_offset', 'repeatability')
-"""Effects that can be hidden but are not in the catalogue."""
+_STEPS = 40
+"""Largest number of steps in which the values are scaled; very large effects need damped steps."""
+
+_TONES = 64
+"""Number of frequencies of the 1/f noise; they are evenly spread over the octaves."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,16 @@ class Setup:
         Number of poses with an error of 10 to 50 mg.
     dropped : tuple of str
         Columns that the table does not have.
+    lag : float
+        Time constant between the temperatures of the sensing element and of the thermometer [s].
+        Positive: the thermometer lags behind. Negative: the sensing element lags behind.
+    understated : float
+        Ratio of the scatter of repeated poses to that of the means of their samples, 1 or more.
+    heavy : bool
+        Whether the errors of the pose means follow Student's t instead of the normal
+        distribution, with the same variance.
+    repeats : int
+        Number of successive poses with the same orientation.
 
     """
 
@@ -95,69 +119,15 @@ class Setup:
     start: float = 0.0
     knocked: int = 0
     dropped: tuple[str, ...] = ()
+    lag: float = 0.0
+    understated: float = 1.0
+    heavy: bool = False
+    repeats: int = 1
 
-
-@dataclass(frozen=True)
-class Around:
-    """
-    The truth about each pose; arrays of n rows.
-
-    Parameters
-    ----------
-    force : (n, 3) array
-        u [g].
-    elapsed : (n,) array
-        Time since the first pose [s].
-    temperature, supply : (n,) array
-        Temperature [°C] and supply [V].
-    rate : (n, 3) array
-        Angular rate [rad/s].
-    shaking : (n, 3, samples) array
-        Contribution of vibration and noise to each sample [g].
-    sigma : (n, 3) array
-        Standard deviation of this contribution [g].
-
-    """
-
-    force: Floats
-    elapsed: Floats
-    temperature: Floats
-    supply: Floats
-    rate: Floats
-    shaking: Floats
-    sigma: Floats
-
-
-@dataclass(frozen=True)
-class Traits:
-    """
-    Random properties of a sensor and a set, except for the values of the effects.
-
-    Parameters
-    ----------
-    offset, gain : (3,) and (3, 3) array
-        V [g] and W.
-    tau, instant, beat : float
-        Time constant of the warm-up, instant of the step, period of the periodic offset [s].
-    period, phase : (3,) array
-        Period [g] and phase [rad] of the ripple, by axis.
-    walk, scatter : (n, 3) array
-        Random walk in time, and random numbers for each pose.
-    hysteresis : str
-        As in `Setup.hysteresis`.
-
-    """
-
-    offset: Floats
-    gain: Floats
-    tau: float
-    instant: float
-    beat: float
-    period: Floats
-    phase: Floats
-    walk: Floats
-    scatter: Floats
-    hysteresis: str
+    def __post_init__(self) -> None:
+        if self.understated < 1.0 or self.repeats < 1:
+            raise ValueError(f'understated is {self.understated:g} and repeats is {self.repeats}, '
+                             'expected 1 or more')
 
 
 @dataclass(frozen=True)
@@ -170,7 +140,8 @@ class Simulated:
     columns : mapping of str to (n,) array
         Columns of the pose table.
     truth : mapping of str to mapping of str to float
-        Values of each hidden effect: g, g/g, g/g², g/g³, g/°C, 1/°C, g/h, m, s.
+        Values of each hidden effect: g, g/g, g/g², g/g³, g/°C, g/°C², 1/°C, g s/°C, g/h, 1/h, m,
+        s.
     sizes : mapping of str to float
         Size of each hidden effect.
     knocked : mapping of int to float
@@ -223,7 +194,7 @@ def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None
     hidden = hidden or {}
     turning = 'lever_arm' in hidden or setup.rates == 'sizeable'
     around = _around(rng, setup, turning)
-    traits = _traits(rng, setup, around.elapsed)
+    traits = _traits(rng, setup, around)
     values: dict[str, Floats] = {}
     if 'quantisation' in hidden:
         typical = float(np.median(noise_in_norm(around, traits)))
@@ -245,6 +216,9 @@ def again(rng: np.random.Generator, before: Simulated) -> Simulated:
     """
     Return other poses of the same sensor, at the same times and temperatures.
 
+    The random walk and the 1/f noise of the offset are also the same. The scatter of each pose is
+    not.
+
     Parameters
     ----------
     rng : numpy.random.Generator
@@ -260,9 +234,11 @@ def again(rng: np.random.Generator, before: Simulated) -> Simulated:
     quiet = ratio if 'quantisation' in before.values else 1.0
     spread = float(np.std(before.around.supply) / np.std(fresh.supply))
     around = replace(fresh, elapsed=before.around.elapsed, temperature=before.around.temperature,
+                     recorded=before.around.recorded,
                      supply=NOMINAL_SUPPLY + spread * (fresh.supply - NOMINAL_SUPPLY),
                      shaking=quiet * fresh.shaking, sigma=quiet * fresh.sigma)
-    return _measured(rng, setup, around, before.traits, before.values)
+    traits = replace(before.traits, scatter=rng.normal(size=(setup.poses, 3)))
+    return _measured(rng, setup, around, traits, before.values)
 
 
 def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
@@ -273,135 +249,129 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
 
 
-def _unit(vectors: Floats) -> Floats:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
-
-
 def _around(rng: np.random.Generator, setup: Setup, turning: bool) -> Around:
     """Return random orientation, time and context of each pose."""
     n = setup.poses
-    force = _unit(rng.normal(size=(n, 3)))
+    force = unit(rng.normal(size=(n, 3)))
+    if setup.repeats > 1:
+        force = force[np.arange(n) // setup.repeats]
     elapsed = np.cumsum(rng.uniform(10.0, 60.0, n))
     elapsed = elapsed - elapsed[0]
-    temperature = _temperature(rng, elapsed / elapsed[-1], setup.temperature == 'rising')
+    course = _temperature(rng, elapsed / elapsed[-1], setup.temperature == 'rising')
+    temperature, recorded = _lagging(course, elapsed, setup.lag)
     supply = rng.uniform(3.0, 3.6, n)
     turning = turning or (bool(rng.integers(2)) and setup.rates == 'any')
-    real = _unit(rng.normal(size=(n, 3))) * rng.uniform(1.0, 5.0, (n, 1))
+    real = unit(rng.normal(size=(n, 3))) * rng.uniform(1.0, 5.0, (n, 1))
     rate = rng.normal(size=(n, 3)) * 0.002 + real * turning
     sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(n, 3))
-    shaking = rng.normal(size=(n, 3, setup.samples)) * sigma[:, :, np.newaxis]
-    return Around(force, elapsed, temperature, supply, rate, shaking, sigma)
+    return Around(force, elapsed, temperature, recorded, supply, rate, _shaking(rng, setup, sigma),
+                  sigma)
 
 
-def _temperature(rng: np.random.Generator, share: Floats, rising: bool) -> Floats:
-    """Return random temperatures between 10 and 40 °C at these shares of the time span."""
+def _shaking(rng: np.random.Generator, setup: Setup, sigma: Floats) -> Floats:
+    """Return the (n, 3, samples) errors of the samples, and of the pose as a whole [g]."""
+    shaking = rng.normal(size=(*sigma.shape, setup.samples)) * sigma[:, :, np.newaxis]
+    of_mean = sigma / np.sqrt(setup.samples)
+    if setup.heavy:
+        error = rng.standard_t(DEGREES, size=sigma.shape) * np.sqrt(1.0 - 2.0 / DEGREES)
+        shaking -= np.mean(shaking, axis=2, keepdims=True)
+        return shaking + (error * setup.understated * of_mean)[:, :, np.newaxis]
+    if setup.understated > 1.0:
+        error = rng.normal(size=sigma.shape) * np.sqrt(setup.understated ** 2 - 1.0)
+        shaking += (error * of_mean)[:, :, np.newaxis]
+    return shaking
+
+
+def _temperature(rng: np.random.Generator, share: Floats, rising: bool
+                 ) -> Callable[[Floats], Floats]:
+    """
+    Return a random course of the temperature, between 10 and 40 °C at the poses.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of all random numbers.
+    share : (n,) array
+        Times of the poses as shares of the time span.
+    rising : bool
+        Whether the temperature only rises.
+
+    Returns
+    -------
+    callable
+        Sorted shares of the time span -> temperatures [°C].
+
+    """
     waves = rng.uniform(1.5, 5.0, 3)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-    wave = np.sum(np.sin(2.0 * np.pi * np.outer(share, waves) + phases), axis=1)
     bend, low, span = rng.uniform(0.5, 3.0), rng.uniform(10.0, 20.0), rng.uniform(10.0, 19.0)
-    if rising:
-        rise = low + span * (1.0 - np.exp(-bend * share)) / (1.0 - np.exp(-bend))
-        return np.sort(rise + 0.1 * wave)
-    return 10.0 + 30.0 * (wave - np.min(wave)) / np.ptp(wave)
+
+    def wave(at: Floats) -> Floats:
+        summed: Floats = np.sum(np.sin(2.0 * np.pi * np.outer(at, waves) + phases), axis=1)
+        return summed
+
+    def rise(at: Floats) -> Floats:
+        settled = (1.0 - np.exp(-bend * at)) / (1.0 - np.exp(-bend))
+        return np.sort(low + span * settled + 0.1 * wave(at))
+
+    least, most = np.min(wave(share)), np.max(wave(share))
+    return rise if rising else lambda at: 10.0 + 30.0 * (wave(at) - least) / (most - least)
 
 
-def _traits(rng: np.random.Generator, setup: Setup, elapsed: Floats) -> Traits:
+def _lagging(course: Callable[[Floats], Floats], elapsed: Floats, lag: float
+             ) -> tuple[Floats, Floats]:
+    """Return the temperatures of the sensing element and of the thermometer at the poses [°C]."""
+    span = elapsed[-1]
+    if lag == 0.0:
+        temperature = course(elapsed / span)
+        return temperature, temperature
+    times = np.arange(0.0, span + 1.0)  # one second apart
+    ahead = course(times / span)
+    behind = low_passed(ahead, abs(lag))
+    leading, following = (np.interp(elapsed, times, each) for each in (ahead, behind))
+    return (leading, following) if lag > 0.0 else (following, leading)
+
+
+def low_passed(series: Floats, constant: float) -> Floats:
+    """Return the first-order low pass of a series with one value per second, from a rest."""
+    passed, share = [float(series[0])], 1.0 - np.exp(-1.0 / constant)
+    for target in (series[1:] + series[:-1]) / 2.0:
+        passed.append(passed[-1] + share * (float(target) - passed[-1]))
+    return np.array(passed)
+
+
+def _traits(rng: np.random.Generator, setup: Setup, around: Around) -> Traits:
     """Return the random properties of a sensor."""
+    elapsed = around.elapsed
     n, span = len(elapsed), elapsed[-1]
+    more = rng.spawn(1)[0]  # leaves the sets as they were before these properties
     gain = np.eye(3) + np.diag(rng.normal(size=3) * 0.02)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         gain[i, j] = gain[j, i] = rng.normal() * 0.01
-    late = rng.integers(int(np.ceil(0.2 * n)), int(0.8 * n) + 1)
+    instant = _instant(rng, elapsed)
     walk = np.cumsum(rng.normal(size=(n, 3)) * np.sqrt(np.diff(elapsed, prepend=0.0))[:, None],
                      axis=0)
-    return Traits(rng.normal(size=3) * 0.05, gain, rng.uniform(0.05, 0.4) * span,
-                  float(elapsed[late - 1:late + 1].mean()), rng.uniform(0.1, 0.3) * span,
-                  rng.uniform(0.2, 0.6, 3), rng.uniform(0.0, 2.0 * np.pi, 3), walk,
-                  rng.normal(size=(n, 3)), setup.hysteresis)
+    knee = np.min(around.temperature) + more.uniform(0.4, 0.7) * np.ptp(around.temperature)
+    return Traits(rng.normal(size=3) * 0.05, gain, rng.uniform(0.05, 0.4) * span, instant,
+                  rng.uniform(0.1, 0.3) * span, rng.uniform(0.2, 0.6, 3),
+                  rng.uniform(0.0, 2.0 * np.pi, 3), walk, rng.normal(size=(n, 3)),
+                  setup.hysteresis, more.uniform(0.1, 0.3, 3), float(knee),
+                  _instant(more, elapsed), more.uniform(0.1, 0.3) * span, _flicker(more, elapsed))
 
 
-def _by_axis(shape: Callable[[Around, Traits], Floats]) -> Callable[[Around, Traits], Floats]:
-    """Return the (n, 3, 3) basis of an (n, 3) shape, with one value per axis."""
-    def basis(around: Around, traits: Traits) -> Floats:
-        return shape(around, traits)[:, :, np.newaxis] * np.eye(3)
-
-    return basis
-
-
-def _same(series: Callable[[Around, Traits], Floats]) -> Callable[[Around, Traits], Floats]:
-    """Make (n, 3, 3) of an (n,) series that adds to each axis whatever the force."""
-    return _by_axis(lambda a, t: np.repeat(series(a, t)[:, np.newaxis], 3, axis=1))
+def _instant(rng: np.random.Generator, elapsed: Floats) -> float:
+    """Return a random instant between two poses, in the middle 60 % of the poses [s]."""
+    n = len(elapsed)
+    late = rng.integers(int(np.ceil(0.2 * n)), int(0.8 * n) + 1)
+    return float(elapsed[late - 1:late + 1].mean())
 
 
-def _coupling(around: Around, traits: Traits) -> Floats:
-    u = around.force
-    basis = np.zeros((len(u), 3, len(PAIRS)))
-    for k, (i, j) in enumerate(PAIRS):
-        basis[:, i, k] = u[:, i] * u[:, j]
-    return basis
-
-
-def _ratiometric(around: Around, traits: Traits) -> Floats:
-    plain = plain_reading(around, traits)
-    return (plain * (around.supply / NOMINAL_SUPPLY - 1.0)[:, np.newaxis])[:, :, np.newaxis]
-
-
-def _hysteresis(around: Around, traits: Traits) -> Floats:
-    u = around.force
-    before = np.vstack([u[:1], u[:-1]])
-    shapes = {'unit': _unit(before - u), 'sign': np.sign(before - u),
-              'previous': np.where(np.arange(len(u))[:, np.newaxis] > 0, before, 0.0)}
-    return shapes[traits.hysteresis]
-
-
-def _centripetal(around: Around, traits: Traits) -> Floats:
-    omega = around.rate[:, np.newaxis, :]
-    added: Floats = np.cross(omega, np.cross(omega, np.eye(3)))
-    return np.swapaxes(added, 1, 2) / STANDARD_GRAVITY
-
-
-EFFECTS: dict[str, Callable[[Around, Traits], Floats] | None] = {
-    'quadratic': _by_axis(lambda a, t: a.force ** 2),
-    'cubic': _by_axis(lambda a, t: a.force ** 3),
-    'odd_quadratic': _by_axis(lambda a, t: a.force * np.abs(a.force)),
-    'gain_asymmetry': _by_axis(lambda a, t: np.abs(a.force)),
-    'cross_coupling': _coupling,
-    'offset_temperature': _same(lambda a, t: a.temperature - REFERENCE_TEMPERATURE),
-    'gain_temperature': _by_axis(
-        lambda a, t: a.force * (a.temperature - REFERENCE_TEMPERATURE)[:, np.newaxis]),
-    'supply_ratio': _ratiometric,
-    'offset_drift': _same(lambda a, t: a.elapsed),
-    'warm_up': _same(lambda a, t: np.exp(-a.elapsed / t.tau)),
-    'offset_wander': _by_axis(lambda a, t: t.walk),
-    'offset_step': _same(lambda a, t: np.where(a.elapsed > t.instant, 1.0, 0.0)),
-    'vibration_rectification': _by_axis(lambda a, t: np.var(a.shaking, axis=2, ddof=1)),
-    'hysteresis': _by_axis(_hysteresis),
-    'lever_arm': _centripetal,
-    'saturation': None,
-    'quantisation': None,
-    'ripple': _by_axis(lambda a, t: np.sin(2.0 * np.pi * a.force / t.period + t.phase)),
-    'temperature_rate': _same(lambda a, t: np.gradient(a.temperature, a.elapsed)),
-    'periodic_offset': _same(
-        lambda a, t: np.sin(2.0 * np.pi * a.elapsed / t.beat + t.phase[0])),
-    'repeatability': _by_axis(lambda a, t: t.scatter),
-}
-"""The (n, 3, p) basis of each effect with p values; None for effects on the output."""
-
-ON_OUTPUT = ('saturation', 'quantisation')
-
-
-def plain_reading(around: Around, traits: Traits) -> Floats:
-    """Return the (n, 3) readings V + W u [g]."""
-    return traits.offset + around.force @ traits.gain.T
-
-
-def basis_of(name: str, around: Around, traits: Traits) -> Floats:
-    """Return the (n, 3, p) derivative of the reading by the values of an effect [g]."""
-    shape = EFFECTS[name]
-    if shape is None:
-        raise ValueError(f'{name} acts on the output')
-    return shape(around, traits)
+def _flicker(rng: np.random.Generator, elapsed: Floats) -> Floats:
+    """Return (n, 3) noise of the same power in each octave, from two spans to a pose interval."""
+    frequencies = np.geomspace(0.5 / elapsed[-1], 0.5 / np.mean(np.diff(elapsed)), _TONES)
+    angle = 2.0 * np.pi * np.outer(elapsed, frequencies)
+    sines, cosines = rng.normal(size=(2, _TONES, 3))
+    return np.asarray(np.sin(angle) @ sines + np.cos(angle) @ cosines)
 
 
 def noise_in_norm(around: Around, traits: Traits) -> Floats:
@@ -437,8 +407,11 @@ def _scaled(rng: np.random.Generator, name: str, wanted: float, around: Around,
     """Return random values of an effect, scaled to a size."""
     basis = basis_of(name, around, traits)
     values = rng.normal(size=basis.shape[2]) * 1e-3 / np.sqrt(np.mean(basis ** 2))
-    for _ in range(6):
-        values = values * wanted / size_of(basis @ values, around, traits)
+    for step in range(_STEPS):
+        ratio = wanted / size_of(basis @ values, around, traits)
+        if step > 5 and abs(ratio - 1.0) < 0.01:
+            break
+        values = values * (ratio if step < 6 else np.sqrt(ratio))
     return values
 
 
@@ -469,7 +442,7 @@ def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Tr
     """Return the set of the averaged samples."""
     samples = _samples(values, around, traits)
     rows = np.sort(rng.choice(setup.poses, setup.knocked, replace=False))
-    knocks = _unit(rng.normal(size=(len(rows), 3))) * rng.uniform(0.01, 0.05, (len(rows), 1))
+    knocks = unit(rng.normal(size=(len(rows), 3))) * rng.uniform(0.01, 0.05, (len(rows), 1))
     samples[rows] += knocks[:, :, np.newaxis]
     added = np.linalg.norm(around.force[rows] + knocks @ np.linalg.inv(traits.gain).T, axis=1)
     rail = float(values['saturation'][0]) if 'saturation' in values else np.inf
@@ -499,10 +472,12 @@ def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
         parts = np.array([np.trace(traits.gain) / 3.0, *traits.offset]) * values[0]
         return dict(zip(('gain', 'x', 'y', 'z'), parts.tolist(), strict=True))
     names = {'cross_coupling': tuple(f'{"xyz"[i]}_{"xyz"[i]}{"xyz"[j]}' for i, j in PAIRS),
-             'saturation': ('limit',), 'quantisation': ('step',)}
-    factor = HOUR if name == 'offset_drift' else 1.0
+             'saturation': ('limit',), 'quantisation': ('step',),
+             'cross_axis_temperature': ('xy', 'xz', 'yz')}
+    factor = HOUR if name in ('offset_drift', 'gain_drift') else 1.0
     named = dict(zip(names.get(name, ('x', 'y', 'z')), (values * factor).tolist(), strict=True))
-    more = {'warm_up': {'tau': traits.tau}, 'offset_step': {'instant': traits.instant}}
+    more = {'warm_up': {'tau': traits.tau}, 'offset_step': {'instant': traits.instant},
+            'gain_step': {'instant': traits.gain_instant}}
     return {**named, **more.get(name, {})}
 
 
@@ -514,7 +489,7 @@ def _columns(output: Floats, around: Around, setup: Setup) -> dict[str, Floats]:
     columns.update(zip(('ax', 'ay', 'az'), mean.T))
     columns.update(zip(('std_x', 'std_y', 'std_z'), std.T))
     columns['count'] = np.full(setup.poses, float(setup.samples))
-    columns['temperature'] = np.round(around.temperature, 2)
+    columns['temperature'] = np.round(around.recorded, 2)
     columns['supply_voltage'] = np.round(around.supply, 4)
     columns.update(zip(('gx', 'gy', 'gz'), np.round(around.rate, 5).T))
     return {name: column for name, column in columns.items() if name not in setup.dropped}
