@@ -16,6 +16,10 @@ belongs to the offset V and a term with monomial u_j to the gain W. The other te
 in the force; they are called bending terms. The constants in which an effect is not linear, such
 as a time constant, are its shape.
 
+A temperature effect can have a lag [s]. With ``of_sensor`` 0 the die lags: the temperature that
+acts is a low pass of the recorded one. With ``of_sensor`` 1 the temperature sensor lags: the
+recorded temperature is a low pass of the one that acts (`accel_calib.thermal`).
+
 Force, readings and standard deviations are in g, temperatures in °C, times in s. Names and terms
 are those of IEEE 1293 (model equation of a linear accelerometer) and of data sheets.
 
@@ -25,13 +29,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .table import Floats
+from .thermal import acting_temperature, rate_at
 from .units import STANDARD_GRAVITY
 
 Context = Mapping[str, NDArray[Any]]
@@ -88,6 +93,17 @@ def _each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list
     return [_of_axis(axis, value, slope) for axis in range(3)]
 
 
+MODES = 24
+"""Number of cosines that an empirical curve can have."""
+
+
+def _wave(mode: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Return the cosine of a mode over -1 to 1 g, and its slope."""
+    turn = mode * np.pi / 2.0
+    return (lambda u: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
+            lambda u: -turn * np.sin(turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))
+
+
 MONOMIALS: tuple[Monomial, ...] = (
     Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
     *_each_axis(lambda u: u, lambda u: 1.0),
@@ -98,10 +114,12 @@ MONOMIALS: tuple[Monomial, ...] = (
     Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
     Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
+    *(monomial for mode in range(1, MODES + 1) for monomial in _each_axis(*_wave(mode))),
 )
-"""1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z. The first four are affine."""
+"""1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
+k, constant beyond ±1 g. The first four are affine."""
 
-ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT = 0, 1, 4, 7, 10, 13, 16
+ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT, WAVE = 0, 1, 4, 7, 10, 13, 16, 19
 """First index of each kind in `MONOMIALS`; a kind by axis has three entries."""
 
 AFFINE = 4
@@ -174,6 +192,14 @@ class Effect:
         Names of the s constants in which the effect is not linear.
     shapes : callable or None
         Shapes that the search tries; None for an effect without shape.
+    usual : tuple of float
+        Shape where a file or a command does not state it; empty: the shape must be stated. The
+        effect is then the plain one, and the search tries this shape first.
+    over : tuple of str
+        Columns that the factor is a function of; empty: those in `needs`.
+    lagged : str
+        Column of the temperature that acts, for an effect with the shape ``lag``, ``of_sensor``;
+        empty for other effects.
     family : {'', 'force', 'time'}
         Group of effects that can be confused with this one.
     repeatable_g : float
@@ -196,6 +222,9 @@ class Effect:
     needs: tuple[str, ...] = ()
     shape: tuple[str, ...] = ()
     shapes: Shapes | None = None
+    usual: tuple[float, ...] = ()
+    over: tuple[str, ...] = ()
+    lagged: str = ''
     family: Family = ''
     repeatable_g: float = np.inf
     output: Callable[[Floats, Floats], Floats] | None = None
@@ -218,6 +247,30 @@ class Effect:
     def split(self, values: Floats) -> tuple[Floats, Floats]:
         """Split (p + s,) values into parameters and shape."""
         return values[:len(self.parameters)], values[len(self.parameters):]
+
+    def filled(self, values: Floats) -> Floats:
+        """Return (p,) or (p + s,) values as (p + s,), with the usual shape where none is given."""
+        if self.usual and np.shape(values) == (len(self.parameters),):
+            return np.concatenate([values, self.usual])
+        return values
+
+    def shown(self, values: Floats) -> dict[str, float]:
+        """Return (p + s,) values by name, without the shape constants at their usual value."""
+        usual = dict(zip(self.shape, self.usual))
+        return {name: value for name, value in zip(self.values, values.tolist(), strict=True)
+                if usual.get(name) != value}
+
+    def is_lagged(self, shape: Floats) -> bool:
+        """Return whether the temperature of this effect lags behind, or runs ahead."""
+        return bool(self.lagged) and bool(shape[0] != 0.0)
+
+    def needs_of(self, shape: Floats) -> tuple[str, ...]:
+        """Return the columns that the effect needs with this shape; a lag needs the time."""
+        return (*self.needs, 'time') if self.is_lagged(shape) else self.needs
+
+    def over_of(self, shape: Floats) -> tuple[str, ...]:
+        """Return the columns that the factor is a function of with this shape."""
+        return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
 
 
 def _by_axis(first: int) -> tuple[Term, ...]:
@@ -278,8 +331,61 @@ def _instants(context: Context) -> Iterator[Floats]:
         yield np.array([instant])
 
 
+_LAGS = 20
+"""Number of lags to try for each kind of lag."""
+
+_LEAST_LAG = 10.0
+"""Smallest lag to try [s]; over a shorter time the temperature of a sensor hardly changes."""
+
+
+def _lags(context: Context) -> Iterator[Floats]:
+    """Yield no lag, then lags of the die and of the sensor, up to a third of the time span."""
+    yield np.zeros(2)
+    if 'time' not in context or 'temperature' not in context:
+        return
+    time = np.unique(_times(context))
+    if len(time) < _LEAST_SIDE or np.ptp(context['temperature']) == 0.0:
+        return
+    least = max(float(np.median(np.diff(time))) / 3.0, _LEAST_LAG)
+    most = (time[-1] - time[0]) / 3.0
+    if most > least:
+        for of_sensor in (0.0, 1.0):
+            for lag in np.geomspace(least, most, _LAGS):
+                yield np.array([lag, of_sensor])
+
+
+def _forms(context: Context) -> Iterator[Floats]:
+    """Yield both forms of the hysteresis."""
+    yield from (np.array([0.0]), np.array([1.0]))
+
+
 def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
     return context['temperature'] - REFERENCE_TEMPERATURE
+
+
+def _warming_squared(context: Mapping[str, Any], shape: Floats) -> Any:
+    return _warming(context, shape) ** 2
+
+
+def _lagged_warming(key: str) -> Factor:
+    """Return the factor of an effect whose acting temperature is the column `key`."""
+    def factor(context: Mapping[str, Any], shape: Floats) -> Any:
+        lag, of_sensor = shape
+        if lag == 0.0:
+            return _warming(context, shape)
+        return acting_temperature(context, key, lag, bool(of_sensor)) - REFERENCE_TEMPERATURE
+
+    return factor
+
+
+def _warming_rate(context: Mapping[str, Any], shape: Floats) -> Any:
+    return rate_at(context)
+
+
+def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
+    """Return the unit vector towards the previous pose, or in form 1 its sign by axis."""
+    towards: Floats = np.asarray(context['previous'], float).T
+    return np.sign(towards) if shape[0] else towards
 
 
 def _supply_change(context: Mapping[str, Any], shape: Floats) -> Any:
@@ -324,6 +430,7 @@ def _on_grid(reading: Floats, values: Floats) -> Floats:
 
 _bending = partial(Effect, plausible_g=0.5, family='force')
 _in_time = partial(Effect, plausible_g=0.5, family='time')
+_LAG = ('lag', 'of_sensor')
 
 EFFECTS: dict[str, Effect] = {
     'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, 1.0,
@@ -351,10 +458,21 @@ EFFECTS: dict[str, Effect] = {
                     for k, (i, j) in enumerate(_COUPLED))),
     'offset_temperature': _in_time(
         'offset that changes with temperature', 'zero-g offset temperature coefficient TCO', AXES,
-        'g/°C', 0.001, terms=_by_axis(ONE), factor=_warming, needs=('temperature',)),
+        'g/°C', 0.001, terms=_by_axis(ONE), factor=_lagged_warming('temperature_of_offset'),
+        needs=('temperature',), shape=_LAG, shapes=_lags, usual=(0.0, 0.0),
+        lagged='temperature_of_offset'),
+    'offset_temperature_quadratic': _in_time(
+        'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
+        1e-5, terms=_by_axis(ONE), factor=_warming_squared, needs=('temperature',)),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
-        '1/°C', 0.0003, terms=_by_axis(FORCE), factor=_warming, needs=('temperature',)),
+        '1/°C', 0.0003, terms=_by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
+        needs=('temperature',), shape=_LAG, shapes=_lags, usual=(0.0, 0.0),
+        lagged='temperature_of_gain'),
+    'temperature_rate': _in_time(
+        'offset in proportion to the rate of the temperature', 'thermal gradient sensitivity',
+        AXES, 'g·s/°C', 0.02, terms=_by_axis(ONE), factor=_warming_rate,
+        needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
         'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',)),
@@ -369,11 +487,20 @@ EFFECTS: dict[str, Effect] = {
         'offset that jumps at an instant', 'bias shift after shock', AXES, 'g', 0.005,
         terms=_by_axis(ONE), factor=_after, needs=('time',), shape=('instant',),
         shapes=_instants),
+    'gain_drift': _in_time(
+        'gain that drifts with time', 'scale-factor drift', AXES, '1/h', 0.0005,
+        terms=_by_axis(FORCE), factor=_since, needs=('time',), shape=('start',),
+        shapes=_from_start),
+    'gain_step': _in_time(
+        'gain that jumps at an instant', 'scale-factor shift after shock', AXES, 'g/g', 0.005,
+        terms=_by_axis(FORCE), factor=_after, needs=('time',), shape=('instant',),
+        shapes=_instants),
     'vibration_rectification': Effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
         'g/g²', 0.002, 0.5, _by_axis(ONE), _columns_of('std', 2), ('std',)),
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
-                         0.001, 0.5, _by_axis(ONE), _columns_of('previous'), ('previous',)),
+                         0.001, 0.5, _by_axis(ONE), _motion, ('previous',), ('form',), _forms,
+                         usual=(0.0,)),
     'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
                         'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
     'saturation': Effect('readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0,
@@ -397,9 +524,119 @@ CHANGES: dict[str, Effect] = {
 is 1 for poses taken since then and 0 for the poses of the calibration."""
 
 
+EMPIRICAL = 'empirical'
+"""Name of a smooth curve without a physical cause; see `empirical_name`."""
+
+CARRIERS: dict[str, tuple[str, ...]] = {
+    'offset': AXES, 'gain': AXES, 'cross_axis': ('xy', 'xz', 'yz'), 'force': ('all',)}
+"""What an empirical curve can change, with the names of its parts. Each part alone is a carrier,
+too, such as ``gain.z``. The carrier ``force`` is the common gain of all axes."""
+
+VARIABLES: dict[str, str] = {
+    'time': 'time', 'temperature': 'temperature', 'temperature_rate': 'rate of temperature',
+    'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis'}
+"""Quantities that an empirical curve can be a function of, by column, with their words."""
+
+_CARRIED = {'offset': _by_axis(ONE), 'gain': _by_axis(FORCE), 'cross_axis': _CROSS, 'force': _ALL}
+
+
+def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
+    """
+    Return the name of an empirical curve.
+
+    A part of the reading, the carrier, changes with a variable by Σ_k c_k cos(k π s), where s runs
+    from 0 to 1 over the range of the variable in the poses. Outside of this range, the curve is
+    constant.
+
+    Parameters
+    ----------
+    carrier : str
+        One of `CARRIERS`, or one part of it.
+    variable : str
+        One of `VARIABLES`.
+    modes : iterable of int
+        The k of the cosines, 1 to `MODES`.
+
+    """
+    return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
+
+
+def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
+    """Return carrier, variable and modes of an empirical curve; `KeyError` for another name."""
+    first, *rest = name.split('-')
+    if first != EMPIRICAL or len(rest) < 3 or not all(part.isdigit() for part in rest[2:]):
+        raise KeyError(name)
+    modes = tuple(int(part) for part in rest[2:])
+    carrier, _, part = rest[0].partition('.')
+    if (rest[1] not in VARIABLES or part not in ('', *CARRIERS[carrier])
+            or not all(1 <= mode <= MODES for mode in modes)
+            or (rest[1] == 'force' and carrier != 'offset')):
+        raise KeyError(name)
+    return rest[0], rest[1], modes
+
+
+@cache
+def _empirical(name: str) -> Effect:
+    """Return the effect of an empirical curve, from its name."""
+    carrier, variable, modes = empirical_parts(name)
+    whole, _, part = carrier.partition('.')
+    parts = CARRIERS[whole]
+    terms = []
+    for k, mode in enumerate(modes):
+        for term in _CARRIED[whole]:
+            if part in ('', parts[term.parameter]):
+                own = 0 if part else term.parameter
+                monomial = (WAVE + 3 * (mode - 1) + term.axis if variable == 'force'
+                            else term.monomial)
+                terms.append(Term(k * (1 if part else len(parts)) + own, term.axis, monomial,
+                                  term.weight))
+    each = len(terms) // len(modes)
+    names = tuple(f'{own}_{mode}' for mode in modes for own in ((part,) if part else parts))
+    words = f'{carrier.replace("_", "-")} as a smooth function of {VARIABLES[variable]}'
+    if variable == 'force':
+        return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
+                      family='force')
+    return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
+                  partial(_cosines, variable, np.repeat(modes, each)), (variable,),
+                  ('low', 'high'), partial(_ends, variable))
+
+
+def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
+    """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
+    values = np.asarray(context[variable], float)
+    found: Floats = np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
+    return found
+
+
+def _ends(variable: str, context: Context) -> Iterator[Floats]:
+    """Yield the range of a variable."""
+    values = _variable(variable, context)
+    known = values[np.isfinite(values)]
+    if len(known) and np.ptp(known) > 0.0:
+        yield np.array([np.min(known), np.max(known)])
+
+
+def _cosines(variable: str, modes: NDArray[np.intp], context: Mapping[str, Any], shape: Floats
+             ) -> Any:
+    """Return the cosine of each term, (t, n)."""
+    values = _variable(variable, context)
+    share = np.clip((values - shape[0]) / max(shape[1] - shape[0], 1e-300), 0.0, 1.0)
+    return np.cos(np.pi * np.multiply.outer(modes, share))
+
+
+def is_effect(name: str) -> bool:
+    """Return whether an effect has this name."""
+    try:
+        effect_named(name)
+    except KeyError:
+        return False
+    return True
+
+
 def effect_named(name: str) -> Effect:
-    """Return the effect with this name, from `EFFECTS`, `PROCESSES` or `CHANGES`."""
-    return EFFECTS.get(name) or PROCESSES.get(name) or CHANGES[name]
+    """Return the effect with this name: from the catalogue, or an empirical curve."""
+    found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
+    return found or _empirical(name)
 
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')

@@ -23,10 +23,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .effects import AFFINE, CHANGES, Context, Effect, effect_named, EFFECTS, FORCE, MONOMIALS, ONE
+from .effects import (
+    AFFINE,
+    Context,
+    Effect,
+    effect_named,
+    EFFECTS,
+    FORCE,
+    is_effect,
+    MONOMIALS,
+    ONE,
+    PROCESSES,
+)
 from .errors import InputError
 from .sphere import unit
 from .table import COLUMNS, Floats
+from .thermal import Lag
 
 MODELS: dict[str, tuple[str, ...]] = {
     'ideal': (),
@@ -46,8 +58,9 @@ CONVERGED_G = 1e-13
 LARGEST_FORCE_G = 1e6
 """The iteration has diverged when u is larger than this [g]."""
 
-FITTED_SHAPES = ('tau',)
-"""Shape constants that a fit changes; the others are found once from the data."""
+FITTED_SHAPES = ('tau', 'lag')
+"""Shape constants that a fit changes, unless they have their usual value; the others are found
+once from the data."""
 
 _SHAPE_STEP = 1e-4
 """Relative step of the numerical derivative by a shape constant; all others are analytic."""
@@ -291,7 +304,8 @@ class Model:
     Parameters
     ----------
     values : mapping of str to (p,) array
-        Values of each effect, by its name in `accel_calib.effects.EFFECTS`.
+        Values of each effect, by its name in `accel_calib.effects.EFFECTS`. Without a shape that
+        has usual values, these are added.
     rotation : (3, 3) array
         ΔR, transforms from the levelled frame to the sensor axes.
 
@@ -301,13 +315,16 @@ class Model:
     rotation: Floats = field(default_factory=_identity)
 
     def __post_init__(self) -> None:
+        filled = {}
         for name, values in self.values.items():
-            if name not in EFFECTS and name not in CHANGES:
+            if name in PROCESSES or not is_effect(name):
                 raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
             effect = effect_named(name)
-            if np.shape(values) != (len(effect.values),):
+            filled[name] = effect.filled(values)
+            if np.shape(filled[name]) != (len(effect.values),):
                 raise ValueError(f'effect {name} has values of shape {np.shape(values)}, expected '
                                  f'{len(effect.values)}')
+        object.__setattr__(self, 'values', filled)
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -327,7 +344,43 @@ class Model:
     @property
     def needs(self) -> tuple[str, ...]:
         """Keys of the context that the model needs."""
-        return tuple(dict.fromkeys(key for effect in self.terms.effects for key in effect.needs))
+        return tuple(dict.fromkeys(key for effect, shape in self._by_effect
+                                   for key in effect.needs_of(shape)))
+
+    @property
+    def over(self) -> tuple[str, ...]:
+        """Columns that the factors of the effects are functions of."""
+        return tuple(dict.fromkeys(key for effect, shape in self._by_effect
+                                   for key in effect.over_of(shape)))
+
+    @cached_property
+    def lags(self) -> Mapping[str, Lag]:
+        """Lag of the temperature by the column of the temperature that acts; no lag: absent."""
+        return {effect.lagged: Lag(float(shape[0]), bool(shape[1]))
+                for effect, shape in self._by_effect if effect.is_lagged(shape)}
+
+    @cached_property
+    def stated(self) -> NDArray[np.bool_]:
+        """(p,) mask of the values that are shown: all but shapes at their usual value."""
+        return np.array([part in effect.shown(values) for effect, values in zip(
+            self.terms.effects, self.values.values(), strict=True) for part in effect.values],
+            bool)
+
+    @cached_property
+    def fitted(self) -> NDArray[np.bool_]:
+        """(p,) mask of the values that a fit changes."""
+        found = [np.zeros(0, bool)]
+        for effect, shape in self._by_effect:
+            own = np.ones(len(effect.values), bool)
+            own[len(effect.parameters):] = np.isin(np.arange(len(shape)),
+                                                   fitted_places(effect, shape))
+            found.append(own)
+        return np.concatenate(found)
+
+    @property
+    def _by_effect(self) -> list[tuple[Effect, Floats]]:
+        """Effects with their shapes."""
+        return list(zip(self.terms.effects, self._shapes, strict=True))
 
     @cached_property
     def linear_part(self) -> tuple[Floats, Floats]:
@@ -421,8 +474,8 @@ class Model:
         for k, effect in enumerate(self.terms.effects):
             shape = self._shapes[k]
             which = np.arange(ends[k] - self.terms.count[k], ends[k])
-            for place, name in enumerate(effect.shape):
-                if name in FITTED_SHAPES and effect.factor is not None:
+            for place in fitted_places(effect, shape):
+                if effect.factor is not None:
                     change = difference(effect.factor, context, shape, place)
                     values = self.vector[self.terms.value[which]][:, np.newaxis]
                     moved.append(plain[which] * values * np.nan_to_num(change))
@@ -447,11 +500,17 @@ def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
 
 
-def fitted_values(effects: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Return a (p,) mask of the values of these effects that a fit changes."""
-    entries = [effect_named(name) for name in effects]
-    return np.array([part in effect.parameters or part in FITTED_SHAPES
-                     for effect in entries for part in effect.values], bool)
+def fitted_places(effect: Effect, shape: Floats) -> list[int]:
+    """
+    Return the indices of the shape constants that a fit changes.
+
+    A constant at its usual value, such as a lag of 0, is not fitted: the effect stays the plain
+    one.
+
+    """
+    usual = dict(enumerate(effect.usual))
+    return [place for place, name in enumerate(effect.shape)
+            if name in FITTED_SHAPES and usual.get(place) != shape[place]]
 
 
 def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:

@@ -26,7 +26,7 @@ from .model import (
     check_context,
     CONVERGED_G,
     difference,
-    FITTED_SHAPES,
+    fitted_places,
     LARGEST_FORCE_G,
     LARGEST_ITERATIONS,
     too_large,
@@ -160,7 +160,8 @@ class OneReading:
         root = axes * np.sqrt(np.maximum(variances, 0.0))
         rows, monomials, start = [], [], 0
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
-            shapes = [start + len(effect.parameters) + place for place in _fitted(effect)]
+            shapes = [start + len(effect.parameters) + place
+                      for place in fitted_places(effect, effect.split(values)[1])]
             for own in (None, *shapes):
                 for term in effect.terms:
                     at = start + term.parameter if own is None else own
@@ -185,18 +186,13 @@ class OneReading:
             count, shape = len(effect.terms), effect.split(values)[1]
             factor = _factor(effect, known, shape.tolist())
             factors += factor if isinstance(factor, list) else [factor] * count
-            for place in _fitted(effect):
+            for place in fitted_places(effect, shape):
                 if effect.factor is not None:
                     change = difference(effect.factor, known, shape, place)
                     factors += np.broadcast_to(change, count).tolist()
         which, rows = self._spread_rows
         basis: Floats = (which * factors) @ rows
         return basis
-
-
-def _fitted(effect: Effect) -> list[int]:
-    """Return the indices of the fitted constants in the shape of an effect."""
-    return [place for place, name in enumerate(effect.shape) if name in FITTED_SHAPES]
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:

@@ -54,17 +54,22 @@ def parse_effect(text: str) -> tuple[str, Floats]:
 
 
 def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
-    """Return the values of an effect; one value is used for all axes."""
+    """Return the values of an effect; one value is used for all axes, and the usual shape."""
     if name not in EFFECTS:
         raise InputError(f'effect {name!r} is not in the catalogue',
                          f'use one of {", ".join(EFFECTS)}')
     values, names = np.atleast_1d(np.asarray(given, float)), EFFECTS[name].values
-    if not np.all(np.isfinite(values)) or values.shape not in ((1,), (len(names),)):
-        count = '1 number' if len(names) == 1 else f'1 or {len(names)} numbers'
+    effect = EFFECTS[name]
+    least = len(effect.parameters) if effect.usual else len(names)
+    if not np.all(np.isfinite(values)) or values.shape not in ((1,), (least,), (len(names),)):
+        count = ' or '.join(map(str, dict.fromkeys((1, least, len(names)))))
         raise InputError(f'effect {name} has values {text or values.tolist()}, expected {count} '
-                         f'({", ".join(names)}) in {EFFECTS[name].unit}',
-                         f'write for example {name}={",".join(["0.001"] * len(names))}')
-    return np.broadcast_to(values, len(names)).copy()
+                         f'{"number" if len(names) == 1 else "numbers"} ({", ".join(names)}) in '
+                         f'{effect.unit}', f'write for example {name}='
+                         f'{",".join(["0.001"] * least)}')
+    if len(values) == 1:
+        values = np.repeat(values, least)
+    return np.array(effect.filled(values), float)
 
 
 def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None) -> Model:

@@ -58,6 +58,12 @@ COLUMNS: dict[str, Column] = {
                         'true specific force (known orientation); in g for native units'),
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
                        'pose; computed from the order of the poses'),
+    'temperature_rate': Column(('temperature_rate',), '°C/s', 'rate of the temperature',
+                               made=True),
+    'temperature_of_offset': Column(('temperature_of_offset',), '°C', 'temperature that acts on '
+                                    'the offset, after a lag', made=True),
+    'temperature_of_gain': Column(('temperature_of_gain',), '°C', 'temperature that acts on the '
+                                  'gain, after a lag', made=True),
     'orientation': Column(('orientation',), '',
                           'rows with the same number have the same orientation'),
     'label': Column(('label',), '', 'free text'),

@@ -3,6 +3,7 @@
 
 """Tables and calibrations on disk: what is written is read, and errors are one line."""
 
+from dataclasses import replace
 import os
 
 from accel_calib.calibrate import check_sensor, fit_poses
@@ -16,6 +17,7 @@ from accel_calib.files import (
 )
 from accel_calib.files.atomic import previous
 from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
+from accel_calib.model import Model
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import spread_directions
 from accel_calib.table import COLUMNS, numbered, Poses
@@ -110,6 +112,24 @@ def test_a_stored_calibration_is_read_with_all_digits(calibration, tmp_path):
     reading = np.random.default_rng(3).normal(size=(5, 3))
     np.testing.assert_array_equal(found.correct(reading), calibration.correct(reading))
     np.testing.assert_array_equal(found.gain_sd, calibration.gain_sd)
+
+
+@pytest.mark.parametrize(('values', 'text'), [
+    ([1e-3, 2e-3, -1e-3], 'x: 0.001, y: 0.002, z: -0.001}'),
+    ([1e-3, 2e-3, -1e-3, 60.0, 0.0], 'z: -0.001, lag: 60.0}'),
+    ([1e-3, 2e-3, -1e-3, 60.0, 1.0], 'z: -0.001, lag: 60.0, of_sensor: 1.0}')])
+def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
+    model = Model({**calibration.model.values, 'offset_temperature': np.array(values)})
+    size = len(calibration.covariance) + (4 if len(values) == 5 else 3) + (values[-1] == 1.0)
+    root = np.random.default_rng(1).normal(size=(size, size)) * 1e-6
+    given = replace(calibration, model=model, covariance=root @ root.T)
+    stored = format_calibration(given)
+    assert text in ' '.join(stored.split())
+    found = parse_calibration(stored, 'calibration.yaml')
+    np.testing.assert_array_equal(found.model.vector, model.vector)
+    np.testing.assert_array_equal(found.covariance, given.covariance)
+    again = format_calibration(found)
+    assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
 
 
 def test_the_previous_calibration_is_kept(calibration, tmp_path):

@@ -6,7 +6,7 @@
 from dataclasses import replace
 import struct
 
-from accel_calib.calibrate import fit_poses, level
+from accel_calib.calibrate import fit_poses, level, thermal_stream
 from accel_calib.calibrate.rest_noise import SampleNoise
 from accel_calib.errors import InputError
 from accel_calib.messages import layout as imu
@@ -294,6 +294,48 @@ def test_each_message_is_corrected_at_its_own_temperature(calibration):
         np.testing.assert_allclose(every(rewriter(data, temperature)), expected, rtol=1e-9)
     with pytest.raises(InputError, match='temperature'):
         rewriter(data, float('nan'))
+
+
+def lagged(calibration):
+    """Return a calibration with lags of both kinds."""
+    values = {**calibration.model.values, 'temperature_rate': np.array([0.02, -0.03, 0.01]),
+              'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 8.0, 1.0]),
+              'gain_temperature': np.array([1e-3, -1e-3, 5e-4, 5.0, 0.0])}
+    size = len(calibration.covariance) + 13
+    return replace(calibration, model=Model(values), covariance=np.eye(size) * 1e-8)
+
+
+def test_single_messages_and_arrays_have_the_same_lag(calibration):
+    calibration, rng = lagged(calibration), np.random.default_rng(7)
+    first = bytearray(random_message(rng, 'imu'))
+    rewriter = Rewriter(layout_of(first), calibration, 1.0, STANDARD_GRAVITY, 'imu')
+    datas = []
+    for k in range(400):
+        struct.pack_into('<II', first, 4, 100 + k // 10, k % 10 * 100_000_000)
+        datas.append(bytes(first))
+    together = joined(datas, 37, 'imu')
+    temperature = 25.0 + 3.0 * np.sin(np.arange(400) / 90.0)
+    expected = corrected(calibration, doubles_at(together, slice(0, 37)),
+                         {**samples_of(together), 'temperature': temperature})
+    found = [every(rewriter(*each))[0] for each in zip(datas, temperature.tolist(), strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    assert np.ptp(expected[:, imu.ACCELERATION.start]) > 1e-3
+
+
+def test_lag_carries_over_from_block_to_block(calibration):
+    calibration = lagged(calibration)
+    doubles = np.repeat(every(random_message(np.random.default_rng(7), 'imu')), 300, axis=0)
+    context = {'time': 100.0 + np.arange(300) * 0.1, 'rate': np.zeros((300, 3)),
+               'temperature': 25.0 + np.arange(300) * 0.01}
+    expected = corrected(calibration, doubles, context)
+    stream = thermal_stream(calibration.model)
+    parts = [corrected(calibration, doubles[rows],
+                       {key: values[rows] for key, values in context.items()}, stream)
+             for rows in (slice(0, 77), slice(77, 300))]
+    np.testing.assert_allclose(np.concatenate(parts), expected, rtol=1e-9)
+    alone = corrected(calibration, doubles[77:], {key: values[77:] for key, values in
+                                                  context.items()})
+    assert np.max(np.abs(alone - expected[77:])) > 1e-3
 
 
 def test_no_force_beyond_100_g_is_published(calibration):

@@ -39,7 +39,8 @@ def context(rng):
 
 OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
 ADDED = [name for name in EFFECTS if name not in OUTPUT]
-SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0}
+SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
+          'form': 1.0}
 
 
 def values_of(name, rng):
@@ -64,7 +65,7 @@ def test_basis_is_the_derivative_of_the_reading_by_the_values(name, rng, context
     force, values = random_directions(40, rng), values_of(name, rng)
     basis = parameter_basis(Model({name: values}), force, context)
     for k, part in enumerate(EFFECTS[name].values):
-        if part in ('start', 'instant'):  # taken from the data, not fitted
+        if part in ('start', 'instant', 'of_sensor', 'form'):  # taken from the data, not fitted
             continue
         step = np.zeros(len(values))
         step[k] = 1e-4 * max(abs(values[k]), 1.0)
@@ -97,7 +98,8 @@ def test_effects_by_hand():
     force = np.array([[0.5, -2.0, 3.0]])
     context = {'temperature': np.array([35.0]), 'std': np.array([[0.1, 0.2, 0.3]]),
                'time': np.array([7300.0]), 'supply_voltage': np.array([3.63]),
-               'rate': np.array([[0.0, 0.0, 2.0]]), 'previous': np.array([[0.6, 0.0, -0.8]])}
+               'rate': np.array([[0.0, 0.0, 2.0]]), 'previous': np.array([[0.6, 0.0, -0.8]]),
+               'temperature_rate': np.array([0.01])}
     cases = {
         'offset=1,2,3': (1, 2, 3), 'gain=0.1': (0.05, -0.2, 0.3),
         'axis_gain=0.1,0.2,0.3': (0.05, -0.4, 0.9), 'cross_axis=1,0,0': (-2.0, 0.5, 0),
@@ -108,7 +110,9 @@ def test_effects_by_hand():
         'supply_ratio=1,0,0,2': (0.05, -0.2, 0.5), 'offset_drift=1,2,3,100': (2, 4, 6),
         'warm_up=1,2,3,100,7200': (np.exp(-1), 2 * np.exp(-1), 3 * np.exp(-1)),
         'offset_step=1,2,3,7300': (1, 2, 3), 'vibration_rectification=1': (0.01, 0.04, 0.09),
-        'hysteresis=1': (0.6, 0.0, -0.8), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
+        'hysteresis=1': (0.6, 0.0, -0.8), 'temperature_rate=1,2,3': (0.01, 0.02, 0.03),
+        'offset_temperature_quadratic=1': (100, 100, 100), 'gain_drift=1,2,3,100': (1, -8, 18),
+        'gain_step=1,2,3,7300': (0.5, -4, 9), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
     }
     assert {case.partition('=')[0] for case in cases} == set(ADDED)
     for text, added in cases.items():
@@ -150,6 +154,49 @@ def test_vector_and_names_have_the_same_order(name):
     model = with_vector(MODELS[name], np.arange(float(len(names))))
     assert model.effects == MODELS[name]
     np.testing.assert_array_equal(model.vector, np.arange(len(names)))
+
+
+@pytest.mark.parametrize(('text', 'values'), [
+    ('offset_temperature=1', [1, 1, 1, 0, 0]), ('offset_temperature=1,2,3', [1, 2, 3, 0, 0]),
+    ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0]),
+    ('hysteresis=1,2,3,1', [1, 2, 3, 1])])
+def test_shape_that_is_not_stated_has_its_usual_value(text, values):
+    name, found = parse_effect(text)
+    np.testing.assert_array_equal(found, values)
+    stated = np.array(values[:len(text.split(','))] if ',' in text else values[:3], float)
+    np.testing.assert_array_equal(Model({name: stated}).vector, values)
+    shown = EFFECTS[name].shown(found)
+    assert list(shown) == list(EFFECTS[name].values[:len(stated)])
+
+
+def test_hysteresis_of_form_1_is_the_sign_of_the_motion():
+    context = {'previous': np.array([[0.6, 0.0, -0.8]])}
+    model = Model({'hysteresis': np.array([0.1, 0.2, 0.3, 1.0])})
+    np.testing.assert_allclose(predict(model, np.zeros((1, 3)), context), [[0.1, 0.0, -0.3]])
+
+
+@pytest.mark.parametrize('name', ['offset_temperature', 'gain_temperature', 'hysteresis'])
+def test_search_tries_the_usual_shape_first(name, context):
+    shapes = list(EFFECTS[name].shapes(context))
+    np.testing.assert_array_equal(shapes[0], EFFECTS[name].usual)
+    assert len(shapes) == (2 if name == 'hysteresis' else 41)
+    assert len({tuple(shape) for shape in shapes}) == len(shapes)
+
+
+def test_search_tries_no_lag_without_time():
+    shapes = list(EFFECTS['offset_temperature'].shapes({'temperature': np.arange(20.0)}))
+    np.testing.assert_array_equal(shapes, [[0.0, 0.0]])
+
+
+@pytest.mark.parametrize('of_sensor', [0.0, 1.0])
+def test_predict_and_correct_undo_each_other_with_a_lag(of_sensor, rng, context):
+    model = Model({'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 150.0, of_sensor]),
+                   'gain_temperature': np.array([3e-4, -3e-4, 2e-4, 90.0, 1.0 - of_sensor])})
+    force = random_directions(40, rng)
+    reading = predict(model, force, context)
+    np.testing.assert_allclose(correct(model, reading, context), force, atol=1e-12)
+    plain = Model({name: values[:3] for name, values in model.values.items()})
+    assert np.max(np.abs(reading - predict(plain, force, context))) > 1e-3
 
 
 @pytest.mark.parametrize('text', ['offset', 'offset=', 'offset=1,2', 'offset=1,2,x',

@@ -22,7 +22,8 @@ OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
          'std': (0.01, 0.02, 0.03), 'previous': (0.0, 0.6, -0.8)}
 OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
-SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0}
+SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0, 'lag': 0.0, 'of_sensor': 0.0,
+          'form': 0.0}
 SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
 
 
@@ -81,6 +82,39 @@ def test_models_of_several_effects_are_those_of_the_arrays(seed):
     rng = np.random.default_rng(seed)
     names = rng.choice(OTHERS, size=4, replace=False)
     check(calibration_with(*names, unit='g', seed=seed), 9.80665)
+
+
+def test_lagged_temperature_of_one_reading_is_the_given_one():
+    calibration = calibration_with('offset_temperature', 'gain_temperature', 'temperature_rate')
+    values = dict(calibration.model.values)
+    for name in ('offset_temperature', 'gain_temperature'):
+        values[name] = np.array([*values[name][:3], 80.0, 1.0])
+    calibration = replace(calibration, model=Model(values, calibration.model.rotation))
+    acting = {'temperature_of_offset': 28.0, 'temperature_of_gain': 35.0,
+              'temperature_rate': 0.04}
+    found = OneReading(calibration).at({**KNOWN, **acting}).correct(1.0, -2.0, 9.0)
+    context = {**arrays(), **{key: np.array([value]) for key, value in acting.items()}}
+    expected = calibration.correct(np.array([[1.0, -2.0, 9.0]]), context)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    plain = OneReading(calibration).at(KNOWN).correct(1.0, -2.0, 9.0)
+    assert np.max(np.abs(np.subtract(found, plain))) > 1e-3
+
+
+def test_acting_temperature_is_limited_to_its_range_at_the_poses():
+    calibration = calibration_with('offset_temperature')
+    values = dict(calibration.model.values)
+    values['offset_temperature'] = np.array([*values['offset_temperature'][:3], 50.0, 1.0])
+    count = len(calibration.poses)
+    poses = calibration.poses.with_columns(temperature=20.0 + np.arange(count),
+                                           time=100.0 * np.arange(count))
+    calibration = replace(calibration, model=Model(values), poses=poses)
+    low, high = calibration.ranges['temperature_of_offset']
+    assert (low, high) == pytest.approx((20.5, 19.5 + count), abs=0.02)
+    assert 'time' not in calibration.ranges
+    at = [calibration.apply([[0.0, 0.0, 9.8]] * 200, time=1e6 + np.arange(200.0),
+                            temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
+    np.testing.assert_allclose(at[0], at[1], atol=1e-6)
+    assert np.max(np.abs(at[0] - at[2])) > 1e-3
 
 
 def test_context_of_one_reading_is_limited_to_the_ranges():

@@ -518,3 +518,37 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
 def test_advice_about_a_file_that_cannot_be_written_fits_the_reason(number: int, words: str
                                                                     ) -> None:
     assert words in writing_advice(OSError(number, 'reason'))
+
+
+@pytest.mark.parametrize('of_sensor', [0.0, 1.0])
+def test_lag_of_the_temperature_is_followed_while_the_node_runs(
+        of_sensor: float, stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    found = read_calibration(path)
+    lag, count = 60.0, len(found.poses)
+    values = {**found.model.values,
+              'offset_temperature': np.array([0.0, 0.0, 5e-3, lag, of_sensor])}
+    poses = found.poses.with_columns(temperature=25.0 + 20.0 * np.sin(np.arange(count) * 2.0),
+                                     time=np.arange(count) * 100.0)
+    covariance = np.zeros((len(found.covariance) + 5,) * 2)
+    covariance[:-5, :-5] = found.covariance
+    write_calibration(path, replace(found, model=Model(values), poses=poses,
+                                    covariance=covariance))
+    driver = Driver(calibration_file=str(path))
+    still = readings([[0, 0, 1]], dwell=4.0)[:60]
+    warm = 20.0 + 0.12 * np.arange(150)  # 0.1 °C/s, for 180 s
+    for each in warm:
+        driver.feed(still, temperature=each)
+    calibration, rest = driver.session.active.calibration, driver.session.active.rest
+    gravity = driver.session.active.gravity
+    assert calibration is not None
+    assert rest is not None
+    assert gravity is not None
+    time = 1000.0 + np.arange(9000) / RATE
+    during = (time >= rest.start) & (time <= rest.end)
+    expected, plain = (each.apply(
+        np.tile(still, (150, 1)), time=time, temperature=np.repeat(warm, 60))[during].mean(axis=0)
+        for each in (calibration, replace(calibration, model=Model(
+            {**values, 'offset_temperature': values['offset_temperature'][:3]}))))
+    np.testing.assert_allclose(gravity, expected, atol=0.01)
+    assert abs(expected[2] - plain[2]) > 0.15

@@ -16,7 +16,7 @@ PACKAGE = ROOT / 'accel_calib'
 LAYERS = (
     ('errors', 'html_table', 'units'),
     ('table',),
-    ('sphere', 'rotations'),
+    ('sphere', 'rotations', 'thermal'),
     ('effects',),
     ('model',),
     ('capture', 'estimate', 'simulate'),

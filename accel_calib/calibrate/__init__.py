@@ -12,7 +12,15 @@ figures, and `rest_noise` those of the gyro and of the samples.
 
 """
 
-from .calibration import Calibration, check_sensor, EDITED, of_samples, Quality, Rejected
+from .calibration import (
+    Calibration,
+    check_sensor,
+    EDITED,
+    of_samples,
+    Quality,
+    Rejected,
+    thermal_stream,
+)
 from .checks import check_units, FLAT
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .gate import gated
@@ -35,5 +43,5 @@ __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NA
            'Outlook', 'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words',
            'check_sensor', 'check_units', 'directions_of', 'fit_partial', 'fit_poses', 'gated',
            'gyro_bias_of', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_only',
-           'next_pose', 'of_samples', 'outlook', 'sample_noise_of', 'set_heading', 'verify',
-           'with_given_mounting', 'with_rest_noise']
+           'next_pose', 'of_samples', 'outlook', 'sample_noise_of', 'set_heading',
+           'thermal_stream', 'verify', 'with_given_mounting', 'with_rest_noise']

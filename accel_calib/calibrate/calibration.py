@@ -21,12 +21,16 @@ from ..errors import StoredCalibrationError
 from ..html_table import table
 from ..model import correct, force_slope, Model, parameter_names, predict
 from ..table import Floats, Poses, Table
+from ..thermal import acting_temperature, rate_at, ThermalStream
 from ..units import Units
 
 EDITED = 'the file was edited by hand since it was stored'
 """Warning of a calibration whose file does not match its checksum."""
 
-HELD = ('time', 'temperature', 'supply_voltage')
+THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
+"""Context that is computed from time and temperature."""
+
+HELD = ('time', 'temperature', *THERMAL, 'supply_voltage')
 """Context that is limited to the range of the poses; effects are not extrapolated."""
 
 _Known = TypeVar('_Known', bound=Table)
@@ -96,7 +100,8 @@ class Calibration:
     date : str
         Date of the fit, ISO 8601.
     covariance : (p, p) array
-        Covariance of ``model.vector`` [g²].
+        Covariance of ``model.vector`` [g²]. Rows of shapes at their usual value may be left out;
+        they are 0.
     quality : Quality
         Residuals and other figures over the poses used.
     poses : Poses
@@ -134,7 +139,11 @@ class Calibration:
     noise: SampleNoise | None = None
 
     def __post_init__(self) -> None:
-        size = len(self.model.vector)
+        size, stated = len(self.model.vector), self.model.stated
+        if self.covariance.shape == (np.sum(stated), np.sum(stated)) and not np.all(stated):
+            covariance = np.zeros((size, size))
+            covariance[np.ix_(stated, stated)] = self.covariance
+            object.__setattr__(self, 'covariance', covariance)
         if self.covariance.shape != (size, size):
             raise ValueError(f'covariance has shape {self.covariance.shape}, expected '
                              f'{(size, size)}')
@@ -222,16 +231,31 @@ class Calibration:
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Range of time, temperature and supply over the poses, for the context of the effects."""
-        used = self.used_poses
-        return {key: (float(np.min(used[key])), float(np.max(used[key])))
-                for key in HELD if key in self.model.needs and key in used and len(used)}
+        """
+        Range over the poses of what the effects depend on.
+
+        A lag needs the time, but does not depend on it; its range is that of the temperature that
+        acts.
+
+        """
+        known = self._with_acting(self.poses.columns)
+        used = ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
+        wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
+        return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
+                for key in HELD if key in wanted and key in known and np.any(used)}
+
+    def _with_acting(self, known: Context) -> Context:
+        """Return a context with rate and lag of the temperature, from its rows as history."""
+        wanted = [key for key in self.model.over if key in THERMAL and key not in known]
+        if not wanted or 'time' not in known or 'temperature' not in known:
+            return known
+        known = {**known, 'temperature_rate': rate_at(known)}
+        return {**known, **{key: acting_temperature(known, key, *lag)
+                            for key, lag in self.model.lags.items()}}
 
     def held(self, known: _Known) -> _Known:
         """Return a table with its context limited to `ranges`."""
-        if not any(key in known for key in self.ranges):
-            return known
-        return known.with_columns(**_held(known.columns, self.ranges))
+        return known.with_columns(**self.held_context(known.columns))
 
     def correct(self, reading: Floats, context: Context | None = None) -> Floats:
         """
@@ -286,7 +310,7 @@ class Calibration:
         context = {key: np.broadcast_to(np.asarray(values, float),
                                         (len(rows), 3) if key == 'rate' else (len(rows),))
                    for key, values in known.items()}
-        return self.correct(rows, of_samples(context, len(rows))).reshape(given.shape)
+        return self.correct(rows, of_samples(context, len(rows), self.model)).reshape(given.shape)
 
     def predict(self, force: Floats, context: Context | None = None) -> Floats:
         """Return the (n, 3) readings for an (n, 3) force; the inverse of `correct`."""
@@ -320,7 +344,8 @@ class Calibration:
     def held_context(self, context: Context | None) -> Context:
         if not context or not self.ranges:
             return context or {}
-        return {**context, **_held(context, self.ranges)}
+        known = self._with_acting(context)
+        return {**known, **_held(known, self.ranges)}
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:
@@ -339,12 +364,13 @@ def check_sensor(calibration: Calibration, sensor: str) -> None:
                                      'use the calibration of this sensor, or fit one')
 
 
-def of_samples(known: Context, count: int) -> Context:
+def of_samples(known: Context, count: int, model: Model,
+               stream: ThermalStream | None = None) -> Context:
     """
     Return the context of single samples.
 
     A single sample does not show the vibration or the previous pose. Both are set to zero, and so
-    is a rate that is NaN.
+    is a rate that is NaN. Lag and rate of the temperature come from earlier samples.
 
     Parameters
     ----------
@@ -352,11 +378,25 @@ def of_samples(known: Context, count: int) -> Context:
         Known context of the samples.
     count : int
         Number of samples.
+    model : Model
+        Model that the context is for.
+    stream : ThermalStream, optional
+        Temperature before these samples; these samples are added.
 
     """
     none = np.zeros((count, 3))
-    return {**known, 'std': none, 'previous': none,
-            'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
+    found = {**known, 'std': none, 'previous': none,
+             'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
+    stream = thermal_stream(model) if stream is None else stream
+    if stream is not None and 'time' in known and 'temperature' in known:
+        found.update(stream.add_all(known['time'], known['temperature']))
+    return found
+
+
+def thermal_stream(model: Model) -> ThermalStream | None:
+    """Return the lag and rate of the temperature that a model needs; None if it needs none."""
+    rate = 'temperature_rate' in model.over
+    return ThermalStream(model.lags, rate=rate) if model.lags or rate else None
 
 
 def _held(context: Context, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Floats]:

@@ -143,7 +143,7 @@ def _check_effects(calibration: Calibration) -> None:
         effect = model.terms.effects[0]
         if name in LADDER or effect.output is not None or not len(used):
             continue
-        if any(key not in used for key in effect.needs if key != 'previous'):
+        if any(key not in used for key in model.needs if key != 'previous'):
             continue
         added = _contribution(model, used, calibration.units)
         if added > effect.plausible_g:
@@ -188,7 +188,7 @@ def deviations_g(calibration: Calibration, up: Floats) -> Floats:
     context = {key: np.full(len(up), sum(limits) / 2.0)
                for key, limits in calibration.ranges.items()}
     none = np.zeros((len(up), 3))
-    known = {'std': none, 'previous': none, 'rate': none, **context}
+    known = {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(len(up)), **context}
     if any(key not in known for key in model.needs):
         return np.zeros(len(up))
     across = times(model.at(known).inverse_slope(up).swapaxes(-1, -2), up)

@@ -7,7 +7,8 @@ Residuals of a calibration, on the poses it was fitted to and on other poses.
 The error of a pose is |force| - 1 g. For model 12 and poses of known orientation it is the length
 of the vector error. The residual of a calibration is the RMS of the errors over the poses.
 
-**Previous pose.** The previous pose of each pose: the context of the effect `hysteresis`.
+**Context from the order of the poses.** The previous pose of each pose, for `hysteresis`, and the
+rate of the temperature, for `temperature_rate` and lags.
 
 """
 
@@ -24,33 +25,42 @@ from ..estimate.geometry import coverage, WEAK_DILUTION
 from ..model import correct, Model, sensor_force
 from ..sphere import unit
 from ..table import Floats, Poses
+from ..thermal import rate_at
 from ..units import MG, Units
 
 _MOVED = np.radians(3.0)
 """Smallest change of direction of a move [rad]; less may be noise or settling."""
 
 
-def with_previous(poses_g: Poses, model: Model) -> Poses:
+def with_history(poses_g: Poses, model: Model) -> Poses:
     """
-    Return poses with the unit vector towards the previous pose, in order of time, or of rows.
+    Return poses with the context that comes from the poses before and after.
 
-    If successive poses have the same orientation, the last motion counts for all of them.
+    That is the unit vector towards the previous pose, in order of time, or of rows, and the rate
+    of the temperature. If successive poses have the same orientation, the last motion counts for
+    all of them.
 
     Parameters
     ----------
     poses_g : Poses
-        Poses in g. A table that has the column already is returned unchanged.
+        Poses in g. Columns that the table has already are kept.
     model : Model
         Model whose gain and offset are used to compute the directions.
 
     Returns
     -------
     Poses
-        The poses with the column ``previous``; it is zero before the first motion.
+        The poses with the column ``previous``, which is zero before the first motion, and, if time
+        and temperature are known, ``temperature_rate``.
 
     """
-    if 'previous' in poses_g:
-        return poses_g
+    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
+        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
+    return poses_g if 'previous' in poses_g else _with_previous(poses_g, model)
+
+
+def _with_previous(poses_g: Poses, model: Model) -> Poses:
+    """Return poses with the unit vector towards the previous pose."""
     mat_w, vec_v = model.linear_part
     force = unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T)
     order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
@@ -64,6 +74,8 @@ def with_previous(poses_g: Poses, model: Model) -> Poses:
             towards, resting = step / length, here
         previous[here] = towards
     return poses_g.with_columns(previous=previous)
+
+
 
 
 _LEAST_OWN = 1e-9
@@ -125,7 +137,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
     model, units = calibration.model, calibration.units
     check_sensor(calibration, poses.sensor)
-    poses_g = calibration.held(with_previous(in_g(poses, units), model))
+    poses_g = calibration.held(with_history(in_g(poses, units), model))
     vectors = calibration.name == '12' and 'reference' in poses
     before = _before(poses_g, units, vectors=vectors)
     after = _errors(model, poses_g, vectors=vectors)

@@ -60,7 +60,7 @@ def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
     if recording.units not in ('', calibration.units.name):
         raise InputError(f'{path} is in {recording.units}, but the calibration is for readings in '
                          f'{calibration.units.name}', 'use a recording in that unit')
-    known = of_samples(recording.columns, len(recording))
+    known = of_samples(recording.columns, len(recording), calibration.model)
     columns = {'reading': calibration.correct(recording.reading, known)}
     units: UnitName = 'g' if calibration.units.name == 'native' else calibration.units.name
     if 'rate' in recording:

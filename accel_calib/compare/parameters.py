@@ -49,7 +49,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..calibrate import Calibration, in_g
-from ..calibrate.quality import with_previous
+from ..calibrate.quality import with_history
 from ..effects import Context, EFFECTS
 from ..estimate.fit import Fit, judge
 from ..model import force_slope, Model, parameter_basis, reading_of
@@ -263,7 +263,7 @@ def _run_of(calibration: Calibration) -> _Run:
 def _fit_of(calibration: Calibration) -> Fit:
     """Return the model of a calibration at the poses it was fitted to."""
     model = Model(calibration.model.values)
-    poses_g = with_previous(in_g(calibration.poses, calibration.units), model)
+    poses_g = with_history(in_g(calibration.poses, calibration.units), model)
     poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
     if calibration.name != '12':
         poses_g = Poses({key: values for key, values in poses_g.columns.items()

@@ -41,7 +41,7 @@ from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, noise_of, variance_factor
 from ..effects import CHANGES, effect_named, LADDER
 from ..errors import RefusedFitError
-from ..model import FITTED_SHAPES, fitted_values, Model, parameter_names, with_vector
+from ..model import fitted_places, Model, parameter_names, with_vector
 from ..sphere import unit
 from ..table import Floats, Poses
 
@@ -304,19 +304,7 @@ class Fit:
     @cached_property
     def by_pose(self) -> ByPose:
         """Return the equations by pose."""
-        pose, count = self.equations.pose, len(self.poses_g)
-        rows = np.bincount(pose, minlength=count)
-        if len(pose) == count:
-            order = np.argsort(pose)
-            return ByPose(self.residual[order][:, np.newaxis],
-                          self.columns[order][:, np.newaxis], rows, self.prior)
-        order = np.argsort(pose, kind='stable')
-        slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
-        residual = np.zeros((count, int(rows.max())))
-        columns = np.zeros((*residual.shape, self.columns.shape[1]))
-        residual[pose[order], slot] = self.residual[order]
-        columns[pose[order], slot] = self.columns[order]
-        return ByPose(residual, columns, rows, self.prior)
+        return by_pose(self.residual, self.columns, self.equations.pose, self.prior)
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
@@ -351,10 +339,26 @@ class Fit:
         return variance_factor(self.chi2, self.dof, self.noise_known)
 
 
-def free_of(effects: tuple[str, ...]) -> Floats:
-    """Return the (p, q) matrix from the fitted values of these effects to all their values."""
-    fitted = fitted_values(effects)
-    return np.eye(len(fitted))[:, fitted]
+def by_pose(residual: Floats, columns: Floats, pose: NDArray[np.intp],
+            prior: Point | None = None) -> ByPose:
+    """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
+    rows = np.bincount(pose)
+    count = len(rows)
+    if len(pose) == count:
+        order = np.argsort(pose)
+        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
+    order = np.argsort(pose, kind='stable')
+    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
+    by_row = np.zeros((count, int(rows.max())))
+    derivative = np.zeros((*by_row.shape, columns.shape[1]))
+    by_row[pose[order], slot] = residual[order]
+    derivative[pose[order], slot] = columns[order]
+    return ByPose(by_row, derivative, rows, prior)
+
+
+def free_of(model: Model) -> Floats:
+    """Return the (p, q) matrix from the fitted values of a model to all its values."""
+    return np.eye(len(model.fitted))[:, model.fitted]
 
 
 def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
@@ -364,7 +368,7 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     By default, all fitted values of the effects are free.
 
     """
-    ties = free_of(model.effects) if ties is None else ties
+    ties = free_of(model) if ties is None else ties
     near = equations(model, poses_g, noise_of(poses_g))
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
 
@@ -398,7 +402,7 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
         If the fit does not converge.
 
     """
-    fitted, noise = fitted_values(start.effects), noise_of(poses_g)
+    fitted, noise = start.fitted, noise_of(poses_g)
     vector = start.vector.copy()
     weight = None if prior is None else np.sqrt(1.0 if factor is None else factor) / prior
 
@@ -426,7 +430,7 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
     count = len(found.source.residual)
     own = None if prior is None else Point(found.residual[count:], found.columns[count:])
     return Fit(model_at(values), poses_g, found.source, found.columns[:count],
-               free_of(start.effects), at_bound, own, factor)
+               free_of(start), at_bound, own, factor)
 
 
 def _with_prior(point: Point, values: Floats, weight: Floats | None) -> Point:
@@ -447,9 +451,10 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
             size = _largest_contribution(Model({name: values}), poses_g)
             most = effect.plausible_g / np.maximum(size, effect.plausible_g * _SMALLEST)
             limits[:, :len(most)] = -most, most
-            for k, part in enumerate(effect.shape):
-                if part in FITTED_SHAPES and effect.shapes is not None:
-                    tried = [shape[k] for shape in effect.shapes(poses_g.columns)]
+            for k in fitted_places(effect, effect.split(values)[1]):
+                if effect.shapes is not None:
+                    tried = [shape[k] for shape in effect.shapes(poses_g.columns)
+                             if k in fitted_places(effect, shape)]
                     limits[:, len(most) + k] = (min(tried, default=0.0) / _SHAPE_ROOM,
                                                 max(tried, default=np.inf) * _SHAPE_ROOM)
         lower.append(np.minimum(limits[0], values))

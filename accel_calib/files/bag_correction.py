@@ -26,7 +26,7 @@ from .bag import (
     TEMPERATURE,
     temperature_track,
 )
-from ..calibrate import Calibration, check_sensor
+from ..calibrate import Calibration, check_sensor, thermal_stream
 from ..errors import InputError
 from ..messages.correction import corrected, output_frame
 from ..messages.layout import (
@@ -121,6 +121,7 @@ class _Correction:
         self._frame_id = output_frame(calibration, sensor)
         needed = 'temperature' in calibration.model.needs and bag.topics(TEMPERATURE)
         self._track = temperature_track(bag) if needed else None
+        self._thermal = thermal_stream(calibration.model)
         self.topic, self.done = topic, 0
 
     def __call__(self, raws: list[bytes]) -> Messages:
@@ -131,7 +132,7 @@ class _Correction:
         if self._track is not None:
             context['temperature'] = self._track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
-        put_doubles(messages, corrected(self._calibration, doubles, context))
+        put_doubles(messages, corrected(self._calibration, doubles, context, self._thermal))
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 

@@ -38,10 +38,10 @@ from ..calibrate import (
     STORED_METHODS,
 )
 from ..calibrate.mounting import mounting_figures
-from ..effects import EFFECTS
+from ..effects import Effect, EFFECTS
 from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
 from ..estimate.fit import judge
-from ..model import Model, parameter_names
+from ..model import Model
 from ..table import COLUMNS, Floats, Poses
 from ..units import UNIT_NAMES, Units
 
@@ -71,12 +71,12 @@ def format_calibration(calibration: Calibration) -> str:
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
         'effects': {name: {'what': EFFECTS[name].words, 'unit': EFFECTS[name].unit,
-                           **dict(zip(EFFECTS[name].values, values.tolist(), strict=True))}
+                           **EFFECTS[name].shown(values)}
                     for name, values in model.values.items()},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
         **({'mounting': mounting_figures(model.rotation, calibration.sensor)}
            if calibration.is_levelled else {}),
-        'covariance': calibration.covariance.tolist(),
+        'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality), **_rest_noise(calibration),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
         'warnings': [line for line in calibration.warnings if line != EDITED],
@@ -188,15 +188,16 @@ def _check_version(content: Any, name: str) -> None:
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Return the record with the content of a file; raise ValueError for an unexpected value."""
-    values = {str(name): np.array([_number(effect, part) for part in EFFECTS[name].values])
+    values = {str(name): _values(EFFECTS[name], effect)
               for name, effect in _known_effects(content).items()}
-    size = len(parameter_names(tuple(values)))
+    model = Model(values, _array(content, 'rotation', (3, 3)))
+    size = int(np.sum(model.stated))
     units = _mapping(content, 'units')
     rejected = [Rejected(_whole(each, 'row'), _text(each, 'reason'))
                 for each in _list(content, 'rejected')]
     calibration = Calibration(
         name=_one_of(content, 'model', _NAMES), method=_one_of(content, 'method', STORED_METHODS),
-        model=Model(values, _array(content, 'rotation', (3, 3))),
+        model=model,
         units=Units(_one_of(units, 'readings', UNIT_NAMES), _number(units, 'per_g')),
         sensor=_text(content, 'sensor'), stream=str(content.get('stream', '')),
         frame=_one_of(content, 'frame', FRAMES), date=_text(content, 'date'),
@@ -206,6 +207,12 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         warnings=tuple(_text({'warning': line}, 'warning') for line in _list(content, 'warnings')),
         gyro=_gyro_bias(content), noise=_sample_noise(content))
     return _from_version_1(calibration) if content['version'] == 1 else calibration
+
+
+def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
+    """Return the values of an effect; shape constants that are not stated are the usual ones."""
+    known = {**dict(zip(effect.shape, effect.usual)), **stated}
+    return np.array([_number(known, part) for part in effect.values])
 
 
 def _from_version_1(calibration: Calibration) -> Calibration:

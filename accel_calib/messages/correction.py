@@ -57,19 +57,20 @@ from .layout import (
     STAMP_AT,
     THREE,
 )
-from ..calibrate import Calibration, of_samples
+from ..calibrate import Calibration, of_samples, thermal_stream
 from ..effects import Context
 from ..errors import InputError
 from ..one_reading import AtReading, OneReading, Triple
 from ..rotations import quaternion_of
 from ..table import Floats
+from ..thermal import ThermalStream
 
 if TYPE_CHECKING:
     from ..calibrate import SampleNoise
 
 
-def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None
-              ) -> Floats:
+def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
+              stream: ThermalStream | None = None) -> Floats:
     """
     Return the corrected doubles of Imu messages.
 
@@ -81,6 +82,8 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         One row per message; see `accel_calib.messages.layout`.
     context : mapping of str to array, optional
         Columns that the effects need, n rows each.
+    stream : ThermalStream, optional
+        Temperature before these messages; they are added to it.
 
     Returns
     -------
@@ -88,7 +91,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         The corrected messages.
 
     """
-    known = of_samples(context or {}, len(doubles))
+    known = of_samples(context or {}, len(doubles), calibration.model, stream)
     rotation = calibration.model.rotation
     result = doubles.copy()
     force = calibration.correct(doubles[:, ACCELERATION], known)
@@ -184,6 +187,8 @@ class Rewriter:
         frame_id of the corrected messages.
     noise : SampleNoise, optional
         Noise of the samples, stated in messages whose covariance is unknown.
+    thermal : ThermalStream, optional
+        Lag and rate of the temperature before the messages; by default they start in equilibrium.
 
     Attributes
     ----------
@@ -195,7 +200,8 @@ class Rewriter:
     """
 
     def __init__(self, layout: Layout, calibration: Calibration, scale: float, gravity: float,
-                 frame_id: str, noise: SampleNoise | None = None) -> None:
+                 frame_id: str, noise: SampleNoise | None = None,
+                 thermal: ThermalStream | None = None) -> None:
         self.bias: Triple = _NONE
         self._turns = calibration.is_levelled
         self._turn = tuple(calibration.rotation.T.ravel().tolist())
@@ -203,6 +209,7 @@ class Rewriter:
         self._inverse = calibration.rotation.T @ np.linalg.inv(calibration.gain) * scale
         self._calibration = OneReading(calibration, scale)
         self._needs = calibration.model.needs
+        self._thermal = thermal if thermal is not None else thermal_stream(calibration.model)
         self._per_message = bool(_PER_MESSAGE.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
         self._warm = math.nan
@@ -303,11 +310,15 @@ class Rewriter:
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
         rate: Triple = THREE.unpack_from(data, self._rate)
         absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
+        time = seconds + nanoseconds * 1e-9
         known: dict[str, Any] = {
-            'time': seconds + nanoseconds * 1e-9, 'std': _NONE, 'previous': _NONE,
+            'time': time, 'std': _NONE, 'previous': _NONE,
             'rate': _NONE if absent or not math.isfinite(sum(rate)) else rate}
         if not math.isnan(temperature):
             known['temperature'] = temperature
+            if self._thermal is not None:
+                self._thermal.add(time, temperature)
+                known.update(self._thermal.value)
         self._at, self._warm = self._calibration.at(known), temperature
         return self._at
 

@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 
 from .live_capture import LONG_REST, overlap
+from .temperature_history import TemperatureHistory
 from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
 from ..effects import Context
+from ..model import Model
 from ..monitor import compared, Drift, monitor, rests_of
 from ..table import Floats
 from ..units import Units
@@ -64,6 +66,8 @@ class ActiveCalibration:
         m/s² per unit of corrected force.
     gravity : (3,) array or None
         Corrected force of the last rest [m/s²].
+    temperatures : TemperatureHistory
+        Temperatures of the stream, for lags.
 
     """
 
@@ -78,6 +82,7 @@ class ActiveCalibration:
         self.enabled = True
         self.rest: Dwell | None = None
         self.gravity: Floats | None = None
+        self.temperatures = TemperatureHistory()
 
     def adopt(self, calibration: Calibration | None) -> None:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
@@ -85,6 +90,7 @@ class ActiveCalibration:
             self._past = None if calibration is None else monitor(calibration)
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
+        self.temperatures.follow(Model({}) if calibration is None else calibration.model)
         self.scale = 1.0 if calibration is None else output_scale(calibration, self._g)
         self.set_rotates(self._rotates)
 
@@ -186,9 +192,14 @@ class ActiveCalibration:
         """Return the context of a rest, or None if the calibration needs more context."""
         if self.calibration is None:
             return None
-        context = context_of_rest(rest, self.calibration.units)
+        context = self.context_of(rest, self.calibration)
         known = all(key in context for key in self.calibration.model.needs)
         return context if known else None
+
+    def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
+        """Return the context of a rest as one row, for this calibration."""
+        return {**context_of_rest(rest, calibration.units),
+                **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     @property
     def residual(self) -> float:

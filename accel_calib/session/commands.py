@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .active_calibration import context_of_rest
 from .events import Compute, Job
 from .guidance import next_action, Plan
 from .store import Store, writing_advice
@@ -186,7 +185,8 @@ class Commands:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
         rest = self._rest()
-        headed = set_heading(calibration, rest.mean, context_of_rest(rest, self._session.units))
+        headed = set_heading(calibration, rest.mean,
+                             self._session.active.context_of(rest, calibration))
         return self._job_to_use(headed, ['the heading is set by this pose'])
 
     def calibrate_at_rest(self) -> Job:
@@ -205,7 +205,7 @@ class Commands:
         """Return a calibration levelled by a rest; check it against the given mounting."""
         session = self._session
         levelled = level(calibration, rest.mean, session.settings.frame,
-                         context_of_rest(rest, session.units))
+                         session.active.context_of(rest, calibration))
         if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
             raise InputError('this pose differs by more than 10° of tilt from the mounting in '
                              'mounting_rpy or base_frame', 'place the robot level, or correct the '

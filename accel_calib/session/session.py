@@ -182,6 +182,7 @@ class Session:
             samples = samples[good]
         if len(samples):
             self.statistics.add(samples, arrived)
+            self.active.temperatures.add(samples[:, 0], samples[:, 7])
             self._change(self.live.push(samples, self.settings.auto_capture))
 
     def drop_unreadable(self, size: int) -> None:
@@ -319,9 +320,9 @@ class Session:
         return with_given_mounting(calibration, self._given)
 
     def present_context(self) -> Context:
-        """Return the temperature as one row of context, if known."""
-        temperature = self.statistics.temperature
-        return {} if math.isnan(temperature) else {'temperature': np.array([temperature])}
+        """Return the present time and temperature as one row of context, if known."""
+        known = {'time': self.statistics.stamp, 'temperature': self.statistics.temperature}
+        return {key: np.array([value]) for key, value in known.items() if math.isfinite(value)}
 
     def offer(self, calibration: Calibration) -> None:
         """Publish this calibration on ~/preview only."""

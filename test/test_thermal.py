@@ -1,0 +1,233 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
+
+from accel_calib.calibrate.quality import with_history
+from accel_calib.errors import InputError
+from accel_calib.estimate.fit import estimate
+from accel_calib.model import Model, predict
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions
+from accel_calib.thermal import acting_temperature, Lag, low_passed, rate_of, ThermalStream
+import numpy as np
+import pytest
+
+KEY = 'temperature_of_offset'
+START = 1.7e9
+"""Stamps are seconds since 1970."""
+
+
+class Wave:
+    """A temperature of two periods, and its low pass in the steady state."""
+
+    def __init__(self, rng, lag):
+        self.size, self.phase = rng.uniform(2.0, 6.0, 2), rng.uniform(0.0, 6.0, 2)
+        self.speed, self.lag = 2.0 * np.pi / rng.uniform(400.0, 1500.0, 2), lag
+
+    def true(self, time):
+        angle = np.multiply.outer(time, self.speed) + self.phase
+        return 25.0 + np.sin(angle) @ self.size
+
+    def low_passed(self, time):
+        angle = np.multiply.outer(time, self.speed) + self.phase
+        angle = angle - np.arctan(self.speed * self.lag)
+        return 25.0 + np.sin(angle) @ (self.size / np.hypot(1.0, self.speed * self.lag))
+
+
+def rms(errors):
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def stepped(temperature, step):
+    return np.round(temperature / step) * step
+
+
+def test_low_pass_of_a_ramp_falls_behind_by_slope_times_lag():
+    time = np.array([0.0, 3.0, 50.0, 51.0, 400.0, 9000.0])
+    expected = 20.0 + 0.01 * time - 0.01 * 60.0 * (1.0 - np.exp(-time / 60.0))
+    for rate in (None, np.full(6, 0.01)):
+        found = low_passed(START + time, 20.0 + 0.01 * time, 60.0, rate)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_low_pass_of_a_jump_decays_with_the_lag():
+    time = np.array([0.0, 100.0, 100.0, 130.0, 160.0])
+    found = low_passed(time, np.array([20.0, 20.0, 30.0, 30.0, 30.0]), 30.0)
+    np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 30 - 10 / np.e, 30 - 10 / np.e ** 2],
+                               atol=1e-12)
+
+
+def test_low_pass_of_a_cubic_temperature_is_exact_with_its_rates():
+    time = np.array([0.0, 7.0, 30.0, 31.0, 95.0, 400.0]) - 40.0
+    a, b, c, lag = 2e-7, -3e-5, 0.01, 25.0
+    warm, rate = a * time ** 3 + b * time ** 2 + c * time, 3 * a * time ** 2 + 2 * b * time + c
+    bend, twist = 6 * a * time + 2 * b, 6 * a
+    steady = warm - lag * rate + lag ** 2 * bend - lag ** 3 * twist
+    expected = steady + (warm - steady)[0] * np.exp(-(time - time[0]) / lag)
+    np.testing.assert_allclose(low_passed(time, warm, lag, rate), expected, atol=1e-12)
+
+
+def test_order_of_the_rows_and_rows_without_values_do_not_matter():
+    rng = np.random.default_rng(1)
+    time = START + np.cumsum(rng.uniform(5.0, 30.0, 50))
+    warm = 20.0 + np.cumsum(rng.normal(size=50))
+    mixed = rng.permutation(52)
+    given = np.append(time, [np.nan, time[3]])[mixed], np.append(warm, [20.0, np.nan])[mixed]
+    for function, of in ((rate_of, ()), (low_passed, (70.0,))):
+        expected = np.append(function(time, warm, *of), [np.nan, np.nan])[mixed]
+        np.testing.assert_allclose(function(*given, *of), expected, atol=1e-9)
+
+
+def test_equal_times_and_single_rows_have_no_rate_and_no_lag():
+    time, warm = np.full(4, 7.0), np.array([20.0, 22.0, 24.0, 26.0])
+    np.testing.assert_array_equal(rate_of(time, warm), 0.0)
+    for of_sensor in (False, True):
+        context = {'time': time[:1], 'temperature': warm[:1]}
+        assert acting_temperature(context, KEY, 100.0, of_sensor) == warm[:1]
+
+
+def test_rate_of_a_ramp_is_its_slope_also_beside_pauses_and_close_rows():
+    time = np.array([0.0, 10.0, 10.3, 25.0, 40.0, 7000.0, 7020.0, 7030.0])
+    np.testing.assert_allclose(rate_of(START + time, 0.01 * time), 0.01, rtol=5e-3)
+
+
+@pytest.mark.parametrize(('step', 'most'), [(0.01, 0.1), (0.06, 0.25)])
+@pytest.mark.parametrize('spacing', [10.0, 20.0, 30.0, 60.0])
+@pytest.mark.parametrize('lag', [30.0, 100.0, 300.0])
+def test_temperature_ahead_of_a_lagging_sensor_is_found_at_poses(spacing, lag, step, most):
+    rng = np.random.default_rng(int(spacing + lag))
+    time = START + np.cumsum(rng.uniform(0.7, 1.3, 80) * spacing)
+    wave = Wave(rng, lag)
+    context = {'time': time, 'temperature': stepped(wave.low_passed(time), step)}
+    found = acting_temperature(context, KEY, lag, True)
+    behind = rms(context['temperature'] - wave.true(time))
+    assert rms(found - wave.true(time)) < min(most, 0.3 * behind)
+
+
+@pytest.mark.parametrize('spacing', [10.0, 30.0, 60.0])
+@pytest.mark.parametrize('lag', [30.0, 300.0])
+def test_temperature_of_a_lagging_die_is_found_at_poses(spacing, lag):
+    rng = np.random.default_rng(int(spacing + lag))
+    time = np.cumsum(rng.uniform(0.7, 1.3, 400) * spacing)
+    wave = Wave(rng, lag)
+    context = {'time': START + time, 'temperature': stepped(wave.true(time), 0.01)}
+    found = acting_temperature(context, KEY, lag, False)
+    settled = time > time[0] + 8.0 * lag
+    assert rms((found - wave.low_passed(time))[settled]) < 0.03
+
+
+@pytest.mark.parametrize('lag', [30.0, 300.0])
+def test_temperature_ahead_of_a_lagging_sensor_is_found_in_a_stream(lag):
+    wave, time = Wave(np.random.default_rng(4), lag), np.arange(0.0, 1200.0, 0.01)
+    warm = stepped(wave.low_passed(time), 0.06)
+    stream = ThermalStream({KEY: Lag(lag, True)}, rate=True)
+    found = stream.add_all(START + time, warm)
+    settled = time > 100.0
+    behind = rms((warm - wave.true(time))[settled])
+    assert rms((found[KEY] - wave.true(time))[settled]) < 0.25 * behind
+    true_rate = np.gradient(wave.low_passed(time), time)
+    assert rms((found['temperature_rate'] - true_rate)[settled]) < 0.2 * rms(true_rate)
+
+
+def samples(count=3000):
+    """Return uneven times with a pause, and a stepped temperature; some are missing."""
+    rng = np.random.default_rng(3)
+    time = START + np.cumsum(rng.uniform(0.0, 0.4, count))
+    time[count // 2:] += 500.0
+    warm = stepped(25.0 + 6.0 * np.sin(time / 90.0), 0.06)
+    warm[rng.random(count) < 0.05] = np.nan
+    return time, warm
+
+
+LAGS = {KEY: Lag(40.0, True), 'temperature_of_gain': Lag(25.0, False)}
+
+
+def test_stream_and_array_give_the_same_numbers():
+    time, warm = samples()
+    expected = ThermalStream(LAGS, rate=True).add_all(time, warm)
+    stream = ThermalStream(LAGS, rate=True)
+    for k, (moment, temperature) in enumerate(zip(time.tolist(), warm.tolist(), strict=True)):
+        stream.add(moment, temperature)
+        if np.isfinite(temperature):
+            for key, values in expected.items():
+                assert stream.value[key] == pytest.approx(values[k], abs=1e-9), (key, k)
+        else:
+            assert all(np.isnan(values[k]) for values in expected.values())
+
+
+def test_stream_can_be_added_in_parts():
+    time, warm = samples()
+    whole = ThermalStream(LAGS, rate=True).add_all(time, warm)
+    stream = ThermalStream(LAGS, rate=True)
+    parts = [stream.add_all(*part) for part in zip(
+        np.split(time, [1, 700, 705, 2000]), np.split(warm, [1, 700, 705, 2000]), strict=True)]
+    for key, values in whole.items():
+        np.testing.assert_allclose(np.concatenate([part[key] for part in parts]), values,
+                                   atol=1e-9)
+
+
+def test_low_pass_of_a_stream_is_that_of_the_rows():
+    time, warm = samples()
+    found = ThermalStream(LAGS, rate=False).add_all(time, warm)
+    np.testing.assert_allclose(found['temperature_of_gain'], low_passed(time, warm, 25.0),
+                               atol=1e-9)
+
+
+def test_stream_is_empty_before_the_first_temperature():
+    stream = ThermalStream(LAGS, rate=True)
+    stream.add(1.0, np.nan)
+    assert stream.value == {}
+    stream.add(2.0, 20.0)
+    assert stream.value == {'temperature_rate': 0.0, **dict.fromkeys(LAGS, 20.0)}
+
+
+def test_stream_starts_again_if_the_time_jumps_back():
+    stream = ThermalStream(LAGS, rate=False)
+    stream.add_all(START + np.arange(100.0), 20.0 + np.arange(100.0))
+    assert stream.value['temperature_of_gain'] < 110.0
+    stream.add(START - 3600.0, 30.0)
+    assert stream.value == dict.fromkeys(LAGS, 30.0)
+
+
+BASE = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
+        'cross_axis': [0.004, 0.002, -0.003]}
+
+
+@pytest.mark.parametrize('effect', ['offset_temperature', 'gain_temperature'])
+@pytest.mark.parametrize('of_sensor', [0.0, 1.0])
+@pytest.mark.parametrize('lag', [40.0, 150.0])
+def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
+    rng = np.random.default_rng(int(lag + of_sensor))
+    count = 80
+    time = START + np.cumsum(rng.uniform(15.0, 30.0, count))
+    temperature = stepped(Wave(rng, 60.0).low_passed(time), 0.01)
+    context = {'time': time, 'temperature': temperature}
+    values = np.array([1e-3, -1.5e-3, 1.2e-3, lag, of_sensor])
+    true = Model({**{name: np.array(each) for name, each in BASE.items()}, effect: values})
+    poses = simulate_poses(true, random_directions(count, rng), rng, context=context)
+    start = Model({**{name: np.zeros(3) for name in BASE},
+                   effect: np.array([5e-4, -5e-4, 5e-4, 1.5 * lag, of_sensor])})
+    fit = estimate(start, with_history(poses, start))
+    assert fit.model.needs == ('temperature', 'time')
+    found, sd = fit.model.values[effect], np.sqrt(np.diag(fit.covariance))[-5:]
+    assert sd[3] < 0.15 * lag
+    np.testing.assert_array_less(np.abs(found - values)[:4], 3.5 * sd[:4])
+    assert (found[4], sd[4]) == (of_sensor, 0.0)
+
+
+def test_fit_leaves_a_lag_of_zero_as_it_is():
+    rng = np.random.default_rng(1)
+    context = {'temperature': rng.uniform(5.0, 45.0, 60)}
+    true = Model({'offset': np.full(3, 0.01), 'offset_temperature': np.full(3, 1e-3)})
+    poses = simulate_poses(true, random_directions(60, rng), rng, context=context)
+    fit = estimate(Model({'offset': np.zeros(3), 'offset_temperature': np.zeros(3)}), poses)
+    assert fit.model.fitted.tolist() == [True] * 6 + [False, False]
+    np.testing.assert_array_equal(fit.model.values['offset_temperature'][3:], 0.0)
+    np.testing.assert_array_equal(fit.covariance[6:], 0.0)
+
+
+def test_a_lag_needs_the_time():
+    model = Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, 60.0, 0.0])})
+    with pytest.raises(InputError, match='need time'):
+        predict(model, np.ones((1, 3)), {'temperature': np.array([20.0])})
