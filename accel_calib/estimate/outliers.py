@@ -135,17 +135,40 @@ def outliers(fit: Fit, total: int) -> Outliers:
         them.
 
     """
-    data = fit.by_pose
-    limit = most_outliers(fit, total, int(data.rows.max())) - (total - len(data.rows))
+    return outliers_among(fit.by_pose, fit.chi2, fit.dof, total, noise_known=fit.noise_known)
+
+
+def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_known: bool
+                   ) -> Outliers:
+    """
+    Find the outliers among poses, given their equations at a fit.
+
+    Parameters
+    ----------
+    data : ByPose
+        The equations.
+    chi2 : float
+        Sum of the squared residuals.
+    dof : int
+        Number of equations minus number of fitted values.
+    total : int
+        Number of poses before any was left out.
+    noise_known : bool
+        Whether the noise was measured.
+
+    """
+    rows = int(data.rows.max())
+    out = total - len(data.rows)
+    limit = _limit(dof + rows * out, total, rows) - out
     if limit <= 0:
-        return Outliers(np.zeros(0, np.intp), fit.chi2)
+        return Outliers(np.zeros(0, np.intp), chi2)
     if len(data.rows) > _MANY:
-        return _far_out(data, fit, limit)
-    order = _removed_in_turn(data, fit, limit)
-    count = order.extreme(belief_in(fit.noise_known))
+        return _far_out(data, chi2, dof, limit, noise_known=noise_known)
+    order = _removed_in_turn(data, dof, limit)
+    count = order.extreme(belief_in(noise_known))
     if count:
-        left = fit.dof - int(np.sum(order.rows[:count]))
-        count = order.extreme(belief_beside(left, order.rss[count], fit.noise_known))
+        left = dof - int(np.sum(order.rows[:count]))
+        count = order.extreme(belief_beside(left, order.rss[count], noise_known))
     return Outliers(np.sort(order.pose[:count]), float(order.rss[count]))
 
 
@@ -158,9 +181,8 @@ def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
     return belief_in(noise_known)
 
 
-def most_outliers(fit: Fit, total: int, rows: int = 1) -> int:
+def _limit(spare: int, total: int, rows: int) -> int:
     """Return the largest number of poses to leave out, each with `rows` equations."""
-    spare = fit.dof + rows * (total - len(fit.poses_g))
     return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
 
 
@@ -207,12 +229,12 @@ def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Float
     return chance
 
 
-def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
+def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
     """Remove the most extreme pose repeatedly, and update the fit to first order."""
-    spread = data.spread
-    flat = data.flat
-    residual = data.residual - (flat @ (spread @ data.downhill)).reshape(data.residual.shape)
-    own, left = data.own(spread), np.ones(len(residual), bool)
+    spread, flat = data.spread, data.flat
+    count, rows = data.residual.shape
+    residual = data.residual - (flat @ (spread @ data.downhill)).reshape(count, rows)
+    own, left = data.own(spread), np.ones(count, bool)
     poses, sizes = [], []
     rss = [float(np.sum(residual ** 2))]
     for _ in range(most):
@@ -221,15 +243,17 @@ def _removed_in_turn(data: ByPose, fit: Fit, most: int) -> _Removed:
         poses.append(at)
         sizes.append(float(size[at]))
         rss.append(max(rss[-1] - sizes[-1], 0.0))
-        moved = spread @ data.columns[at].T @ np.linalg.pinv(own[at])
-        along = data.columns @ moved
-        residual = residual + (along @ residual[at][:, np.newaxis])[:, :, 0]
-        onto = data.columns @ (spread @ data.columns[at].T)
-        own = own - along @ np.swapaxes(onto, 1, 2)
-        spread = spread + moved @ data.columns[at] @ spread
+        inverse = 1.0 / own[at] if rows == 1 else np.linalg.pinv(own[at])
+        onto = spread @ data.columns[at].T
+        along = flat @ onto
+        residual = residual + (along @ (inverse @ residual[at])).reshape(count, rows)
+        spread = spread + onto @ inverse @ onto.T
+        along = along.reshape(count, rows, rows)
+        own = own - (along ** 2 * inverse if rows == 1
+                     else along @ inverse @ np.swapaxes(along, 1, 2))
         left[at] = False
     return _Removed(np.array(poses, np.intp), data.rows[poses], np.array(sizes), np.array(rss),
-                    fit.dof, len(left))
+                    dof, len(left))
 
 
 def _squared(own: Floats, residual: Floats) -> Floats:
@@ -245,18 +269,19 @@ def _squared(own: Floats, residual: Floats) -> Floats:
     return np.sum(squares, axis=1)
 
 
-def _far_out(data: ByPose, fit: Fit, limit: int) -> Outliers:
+def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bool
+             ) -> Outliers:
     """Find outliers among many poses, all at once, relative to the median."""
     alone = _squared(data.own(data.spread), data.residual)
     size = alone / data.rows
     usual = np.array([_MEDIAN_OF_CHI2[int(rows)] / rows for rows in data.rows])
-    belief = belief_in(fit.noise_known)
+    belief = belief_in(noise_known)
     scale = float(np.median(size / usual))
-    size = size * (belief + fit.dof) / (belief + scale * fit.dof)
-    extreme = beyond(size, data.rows, belief + fit.dof) < LEVEL / len(size)
+    size = size * (belief + dof) / (belief + scale * dof)
+    extreme = beyond(size, data.rows, belief + dof) < LEVEL / len(size)
     largest = np.argsort(-size, kind='stable')[:limit]
     found = np.sort(largest[extreme[largest]])
-    return Outliers(found, max(fit.chi2 - float(np.sum(alone[found])), 0.0))
+    return Outliers(found, max(chi2 - float(np.sum(alone[found])), 0.0))
 
 
 _ROUNDS = 6

@@ -17,9 +17,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .candidates import Candidate
+from .linear import linearised
 from .state import State
-from ..effects import CHANGES, effect_named, EFFECTS, PROCESSES, TO_SEPARATE
+from ..effects import (
+    CHANGES,
+    effect_named,
+    EFFECTS,
+    EMPIRICAL,
+    empirical_parts,
+    PROCESSES,
+    TO_SEPARATE,
+    VARIABLES,
+)
 from ..errors import counted
 from ..estimate.equations import kinds
 from ..model import parameter_names
@@ -34,7 +43,7 @@ _LEAST_VISIBLE = 0.1
 """Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
 
 
-def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tuple[str, ...]
+def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
                  ) -> list[tuple[str, str]]:
     """
     Return the effects that these poses cannot show, with the data to record.
@@ -43,8 +52,8 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
     ----------
     poses_g : Poses
         Poses in g.
-    testable : mapping of str to Candidate
-        Effects that the poses distinguish from the model.
+    testable : mapping of str to float
+        Effects that the poses distinguish from the model, and how visible they are.
     present : tuple of str
         Effects of the model and their rivals.
 
@@ -54,7 +63,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
     for name, effect in {**EFFECTS, **PROCESSES}.items():
         if name in present or effect.output is not None:
             continue
-        if name in testable and (effect.needs or testable[name].visible > _LEAST_VISIBLE):
+        if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
             continue
         if name in ('gain', 'axis_gain') and {'gain', 'axis_gain'} & set(present):
             continue
@@ -71,6 +80,54 @@ def not_testable(poses_g: Poses, testable: Mapping[str, Candidate], present: tup
         else:
             missing.append((name, 'more poses in more directions'))
     return missing
+
+
+_NEAREST = 2
+"""Number of known effects that are named as the nearest to a curve."""
+
+
+def curve_words(name: str, before: State, after: State) -> str:
+    """Return a description of an empirical curve, and of the known effects nearest to it."""
+    carrier, variable, _ = empirical_parts(name)
+    share = before.fit.equations.of_poses(before.fit.residual - after.fit.residual) * MG
+    whole, _, part = carrier.partition('.')
+    what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
+    of = f' of {part}' if part else ''
+    lines = [f'the {what}{of} changes with {VARIABLES[variable]} by up to '
+             f'{np.max(np.abs(share)):.2g} mg{_steepest(variable, before, share)}']
+    left = _left_by_known(before)
+    if left:
+        lines.append('no known effect has this form, the nearest are ' + ', '.join(
+            f'{effect} (leaves {gap:.2g} mg)' for effect, gap in left))
+    return '; '.join(lines)
+
+
+def _steepest(variable: str, before: State, share: Floats) -> str:
+    """Return where a curve is steepest, for a variable of one number."""
+    if variable in ('force', 'std'):
+        return ''
+    values = before.poses_g[variable]
+    order = np.argsort(values, kind='stable')
+    parts = np.array_split(order, 5)
+    middle = [float(np.mean(values[part])) for part in parts]
+    size = [float(np.sqrt(np.mean(share[part] ** 2))) for part in parts]
+    at = int(np.argmax(np.abs(np.diff(size))))
+    unit = COLUMNS[variable].unit
+    return f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} {unit}'
+
+
+def _left_by_known(before: State) -> list[tuple[str, float]]:
+    """Return the known effects that leave least of the residual, and what they leave [mg]."""
+    names = tuple(name for name in EFFECTS if name not in before.model.values)
+    linear = linearised(before.fit, before.model.effects, names)
+    nothing = linear.made()
+    gain, rank = linear.gains(nothing)
+    found: dict[str, float] = {}
+    for number in np.argsort(-gain):
+        if rank[number] and linear.blocks[number].effect not in found and len(found) < _NEAREST:
+            left = linear.made((int(number),)).residual
+            found[linear.blocks[number].effect] = before.gap_mg(left)
+    return list(found.items())
 
 
 _LARGEST = 3
@@ -230,6 +287,8 @@ def _separating(step: Step) -> str:
 
 def _remarks(step: Step) -> list[str]:
     """Return a remark on values that are far larger than in common parts."""
+    if step.effect == EMPIRICAL:
+        return []
     effect = effect_named(step.effect)
     largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                   default=0.0)

@@ -13,7 +13,7 @@ from ..calibrate import Calibration
 from ..html_table import table
 from ..table import Floats, Poses
 
-Verdict = Literal['no_gap', 'explained', 'unexplained']
+Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class Refinement:
 
     Parameters
     ----------
-    verdict : {'no_gap', 'explained', 'unexplained'}
-        No gap beyond the noise; the effects are named and the rest is noise; or a gap remains.
+    verdict : {'no_gap', 'explained', 'described', 'unexplained'}
+        No gap beyond the noise; the effects are named and the rest is noise; the rest is noise
+        only with an empirical curve; or a gap remains.
     noise_floor_mg : float or None
         Expected residual of a correct model [mg]; None if the noise is not known.
     gap_mg, remaining_gap_mg : float

@@ -15,14 +15,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+import math
 
 import numpy as np
 
-from .candidates import fall_of, probability, RIVAL
-from .findings import advice_for, change_words, not_testable, where
+from .curves import is_curve
+from .findings import advice_for, change_words, curve_words, not_testable, where
+from .linear import linearised
 from .records import Refinement, Stage, Step, Verdict
+from .rivals import rivals
 from .search import Found, search
-from .state import is_noise, State
+from .state import fitted_state, is_noise, State
 from .stored import beside_stored, with_changes, with_stored
 from ..calibrate import (
     Calibration,
@@ -37,8 +40,8 @@ from ..calibrate import (
 )
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.pose_planning import refuse_if_unfit
-from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_previous
-from ..effects import CHANGES, effect_named, LADDER, WANDER
+from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_history
+from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, WANDER
 from ..errors import counted, listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import fit_4
 from ..estimate.equations import variance_factor
@@ -136,7 +139,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(sound, units, str(base))
-    poses_g = with_previous(in_g(sound, calibration.units), calibration.model)
+    poses_g = with_history(in_g(sound, calibration.units), calibration.model)
     if stored is not None:
         poses_g = beside_stored(poses_g, stored)
     model = Model(calibration.model.values)
@@ -149,7 +152,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     if found.base.dof < 1:
         raise RefusedFitError(
             f'found {counted(len(sound), "pose")} for '
-            f'{counted(found.base.fitted.onto.shape[1], "parameter")} of the base, expected more '
+            f'{counted(found.base.linear.onto.shape[1], "parameter")} of the base, expected more '
             'poses to find an effect', 'take 24 poses or more')
     given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound))
     return _record(calibration, found, given, sensor or poses.sensor, date)
@@ -179,7 +182,7 @@ def _record(calibration: Calibration, found: Found, given: _Given, sensor: str, 
         _step(name, pair, found, calibration.date, unseen=given.joint and k == 0)
         for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))))
     remaining, noise = _remaining(found)
-    verdict: Verdict = 'unexplained' if not noise else 'explained' if steps else 'no_gap'
+    verdict = _verdict(found, bool(steps), noise)
     rejected = _rejected(found, given)
     clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
     outliers = tuple(each.row for each in rejected if each.row not in clipped)
@@ -191,7 +194,15 @@ def _record(calibration: Calibration, found: Found, given: _Given, sensor: str, 
         verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
         outliers, untestable, advice_for(verdict, found, steps, untestable, len(outliers)),
         refined, refusal,
-        found.final.poses_g, found.final.fit.equations.force, _stages(states, steps))
+        found.final.poses_g, found.final.fit.equations.force, _stages(found, states, steps))
+
+
+def _verdict(found: Found, named: bool, noise: bool) -> Verdict:
+    if not noise:
+        return 'unexplained'
+    if found.curve is not None:
+        return 'described'
+    return 'explained' if named else 'no_gap'
 
 
 def _as_stored(calibration: Calibration, found: Found) -> State:
@@ -218,14 +229,15 @@ def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
 
 def _sequence(found: Found, start: State) -> list[State]:
     """Return the initial state and the state after each added effect."""
-    states, state = [start], found.base
+    states, values = [start], dict(found.base.model.values)
     for name in found.added:
-        if name == WANDER:
-            break
-        among = state.candidates_among((name,))
-        state = (state.plus(among[name]) if name in among else None) or state
-        states.append(state)
-    if len(states) > 1 and found.added[-1] != WANDER:
+        if name != WANDER:
+            if name == 'axis_gain':
+                values.pop('gain', None)
+            own = found.final.model.values.get(name)
+            values[name] = np.zeros(len(effect_named(name).values)) if own is None else own
+            states.append(fitted_state(Model(dict(values)), found.base.poses_g) or states[-1])
+    if len(states) > 1:
         states[-1] = State(judge(found.final.model, states[-1].poses_g))
     return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
 
@@ -235,32 +247,44 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
     """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
     before, after = states
     if name == WANDER:
-        return _wander_step(before)
-    among = {**before.found, **before.candidates_among((name,))}
-    values = after.model.values.get(name, np.zeros(0))
-    p_value = (probability(among[name], before.fitted, before.dof, len(among))
-               if name in among else 1.0)
+        return _wander_step(before, found)
+    values = after.model.values.get(name, np.zeros(len(effect_named(name).values)))
     seen = where(name, before, after.fit.residual)
+    if is_curve(name):
+        seen = curve_words(name, before, after)
     if name in CHANGES:
         seen = f'{change_words(name, after, date)}; {seen}'
-    held_out = before.fit.residual if unseen else before.fitted.held_out
-    return Step(name.removesuffix('_change'), _rivals(name, found),
-                dict(zip(effect_named(name).values, values.tolist(), strict=False)),
+    held_out = before.fit.residual if unseen else before.held_out
+    return Step(EMPIRICAL if is_curve(name) else name.removesuffix('_change'), rivals(name, found.near),
+                effect_named(name).shown(values),
                 before.gap_mg(before.fit.residual), after.gap_mg(after.fit.residual),
-                before.gap_mg(held_out), after.gap_mg(after.fitted.held_out), p_value, seen)
+                before.gap_mg(held_out), after.gap_mg(after.held_out),
+                _p_value(name, before, found), seen)
+
+
+def _p_value(name: str, before: State, found: Found) -> float:
+    """Return the probability that noise alone makes an effect this good."""
+    near = found.near
+    if found.curve is not None and name == found.curve.name:
+        return found.curve.p_value
+    if name in near.names:
+        return near.linear.probability(near.chosen, near.chosen.blocks[near.names.index(name)])
+    linear = linearised(before.fit, before.model.effects, LADDER)
+    own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
+    return linear.probability(linear.made(own), own[0]) if own else 1.0
 
 
 def _output_steps(found: Found) -> tuple[Step, ...]:
     """Return the steps for readings clipped at a limit or on a grid."""
     steps = []
     base = found.base
-    gap, held_out = base.gap_mg(base.fitted.residual), base.gap_mg(base.fitted.held_out)
+    gap, held_out = base.gap_mg(base.residual), base.gap_mg(base.held_out)
     if found.clipped is not None and found.with_clipped is not None:
         whole = found.with_clipped
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
         steps.append(Step('saturation', (), {'limit': found.clipped.limit_g},
-                          whole.gap_mg(whole.fitted.residual), gap,
-                          whole.gap_mg(whole.fitted.held_out), held_out, 0.0,
+                          whole.gap_mg(whole.residual), gap,
+                          whole.gap_mg(whole.held_out), held_out, 0.0,
                           f'in {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
                           'samples hardly scatter'))
     if found.grid_g is not None:
@@ -270,63 +294,46 @@ def _output_steps(found: Found) -> tuple[Step, ...]:
     return tuple(steps)
 
 
-def _wander_step(before: State) -> Step:
-    walk = before.wander
-    if walk is None:
-        raise ValueError('the state has no random walk')
-    p_value = float(np.exp(-walk.likelihood_ratio / 2.0))
-    return Step(WANDER, (), {}, before.gap_mg(before.fitted.residual),
-                before.gap_mg(walk.residual), before.gap_mg(before.fitted.held_out),
-                before.gap_mg(walk.held_out), p_value, where(WANDER, before, walk.residual))
+def _wander_step(before: State, found: Found) -> Step:
+    residual, held_out = _beside_walk(found)
+    p_value = math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
+    return Step(WANDER, rivals(WANDER, found.near), {}, before.gap_mg(before.residual),
+                before.gap_mg(residual), before.gap_mg(before.held_out),
+                before.gap_mg(held_out), p_value, where(WANDER, before, residual))
 
 
-def _rivals(name: str, found: Found) -> tuple[str, ...]:
-    """Return the effects that would explain the data about as well as this one."""
+def _beside_walk(found: Found) -> tuple[Floats, Floats]:
+    """Return the final residual without the walk, and the same held out."""
     final = found.final
-    if name not in final.model.values or name in found.base.model.values:
-        return ()
-    without = final.without_effect(name)
-    if without is None:
-        return ()
-    among = {**without.found, **without.candidates_among((name,))}
-    if name not in among:
-        return ()
-    falls = {key: fall_of(c, without.fitted, without.dof) for key, c in among.items()}
-    rivals = [key for key, falls_by in falls.items()
-              if key != name and (key in LADDER or name not in LADDER)
-              and falls_by > max(falls[name] - RIVAL, 0.0)]
-    walk = without.wander
-    if walk is not None and walk.fall > falls[name] - RIVAL:
-        rivals.append(WANDER)
-    return tuple(dict.fromkeys(rival.removesuffix('_change') for rival in rivals))
+    if found.walk is None:
+        return final.residual, final.held_out
+    return found.walk.residuals(final.linear, final.nothing)
 
 
 def _remaining(found: Found) -> tuple[float, bool]:
     """Return the remaining residual, and whether noise explains it."""
-    final = found.final
-    if found.added[-1:] != (WANDER,) or final.wander is None:
-        return final.gap_mg(final.fitted.residual), final.is_noise
-    residual = final.wander.residual
+    final, (residual, _) = found.final, _beside_walk(found)
     noise = not final.fit.noise_known or is_noise(float(residual @ residual), final.dof)
     return final.gap_mg(residual), noise
 
 
 def _untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
     final = found.final
-    testable = {**final.found, **final.candidates_among(LADDER)}
-    rivals = tuple(rival for step in steps for rival in step.rivals)
-    return tuple(not_testable(final.poses_g, testable, (*final.model.effects, *rivals)))
+    names = tuple(name for name in EFFECTS if name not in final.model.effects)
+    linear = linearised(final.fit, final.model.effects, names)
+    others = tuple(rival for step in steps for rival in step.rivals)
+    return tuple(not_testable(final.poses_g, linear.visible(), (*final.model.effects, *others)))
 
 
-def _stages(states: list[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
+def _stages(found: Found, states: list[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
     """Return the residuals of the base and after each step; limit and grid leave those kept."""
     of_output = len(steps) + 1 - len(states)
     stages = []
     for name, state in zip(('base', *(step.effect for step in steps)),
                            (*states[:1] * of_output, *states), strict=True):
         residual = state.fit.residual
-        if name == WANDER and state.wander is not None:
-            residual = state.wander.residual
+        if name == WANDER:
+            residual = _beside_walk(found)[0]
         stages.append(Stage(name, state.fit.equations.of_poses(residual) * MG))
     return tuple(stages)
 

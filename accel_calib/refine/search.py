@@ -5,54 +5,40 @@
 The search for missing effects.
 
 1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
-   added, always the one that reduces the criterion most.
-2. Outliers are left out, if this reduces the criterion more than any effect.
-3. The best effect is added, or the best pair if it is clearly better, and all values are fitted
-   again. Then every named effect is tested again, against its removal and against every other
-   effect. This step is repeated.
+   added.
+2. `.sets` searches for the set of effects, outliers and a random walk of the offset with the best
+   score, in the equations near the model.
+3. All values are fitted again, without the outliers, and the equations are set up near the new
+   model. Steps 2 and 3 are repeated until the set remains the same.
 4. If the named effects explain only a small part of the residual above the noise, they are
    removed: the residual then has a cause outside of the catalogue.
 
-An effect is kept only if its fit converged, the cost decreased and its values are plausible.
+A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .candidates import (
-    agrees,
-    best_of,
-    best_pair,
-    Candidate,
-    fall,
-    fall_of,
-    LEVEL,
-    pair_is_better,
-    probability,
-    projected,
-)
+from .curves import best_curve, Curve
+from .linear import Linear, linearised, Set
 from .output import Clipped, off_grid, unclipped
-from .state import beginning, State
-from ..effects import LADDER, WANDER
+from .sets import accepted, explored, is_significant, names_of
+from .state import beginning, changes_beside, fitted_state, State
+from .wander import Process, processes, SIGNIFICANT, Walk, walk_beside
+from ..effects import EFFECTS, LADDER, WANDER
 from ..estimate.equations import kinds
 from ..estimate.fit import judge
-from ..estimate.outliers import outliers
 from ..model import Model
-from ..table import Poses
+from ..table import Floats, Poses
 
-_LARGEST = 5
-"""Largest number of added effects."""
-
-_OUTLIERS_BETTER = 2.0
-"""Outliers are left out first if they explain this many times more than any effect."""
-
-_WALK_SIGNIFICANT = 8.0
-"""Twice the logarithm of the likelihood ratio above which a walk is named: p = 0.002."""
+_ROUNDS = 4
+"""Largest number of searches, each near the model of the one before."""
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
@@ -71,6 +57,12 @@ class Found:
         Added effects, in order; `WANDER` is last if the rest is a random walk of the offset.
     outliers : (d,) array of int
         Indices of the outliers.
+    near : Near
+        The equations near the final model, with the chosen set.
+    walk : Walk or None
+        The random walk of the offset, beside the final model at the poses kept.
+    curve : Curve or None
+        The empirical curve.
     taken_back : tuple of str
         Effects that were removed because they did not explain enough.
     clipped : Clipped or None
@@ -86,10 +78,50 @@ class Found:
     final: State
     added: tuple[str, ...]
     outliers: NDArray[np.intp]
+    near: Near
+    walk: Walk | None = None
+    curve: Curve | None = None
     taken_back: tuple[str, ...] = ()
     clipped: Clipped | None = None
     grid_g: float | None = None
     with_clipped: State | None = None
+
+
+@dataclass(frozen=True)
+class Near:
+    """
+    The equations of all poses near a model, and what was chosen in them.
+
+    Parameters
+    ----------
+    linear : Linear
+        The equations, with candidates; whitened if there is a walk.
+    chosen : Set
+        The chosen effects and outliers.
+    walk : Walk or None
+        The random walk of the offset.
+    plain : Linear
+        The equations before they were whitened.
+    processes : tuple of Process
+        The processes that a walk may follow.
+
+    """
+
+    linear: Linear
+    chosen: Set
+    walk: Walk | None
+    plain: Linear
+    processes: tuple[Process, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the chosen effects."""
+        return names_of(self.linear, self.chosen)
+
+    @property
+    def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
+        """Return what was chosen, apart from values and shapes."""
+        return frozenset(self.names), self.chosen.out, self.walk is not None
 
 
 def search(poses_g: Poses, base: Model) -> Found:
@@ -115,87 +147,153 @@ def search(poses_g: Poses, base: Model) -> Found:
         everyone = np.delete(everyone, clip.poses)
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
-    found = _search(poses_g, base, _OUTLIERS_BETTER)
-    if not found.final.is_noise:  # a few outliers may look like an effect
-        other = _search(poses_g, base, 0.0)
-        if other.outliers.size and other.final.is_noise:
-            found = other
+    found = _search(poses_g, base)
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
 
 
-def _search(poses_g: Poses, base: Model, patience: float) -> Found:
-    """
-    Search among the effects that are columns of the equations.
-
-    Outliers are left out first if they explain more than `patience` times any effect.
-
-    """
+def _search(poses_g: Poses, base: Model) -> Found:
+    """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
-    state, ladder = _with_ladder(start)
-    state, out = _without_outliers(state, patience)
-    begun, added = state, ladder
-    names: tuple[str, ...] = ()
-    tried: set[frozenset[str]] = set()  # effects may replace each other, but not in a cycle
-    while len(names) < _LARGEST and not (names and state.is_down_to_noise):
-        if frozenset(names) in tried:
-            break
-        tried.add(frozenset(names))
-        after, new = _next(state)
-        if not new:
-            break
-        state, more = _with_ladder(after)  # the missing effect may have hidden an effect of V or W
-        names, added = (*names, *new), (*added, *more)
-        state, names = _tested_again(state, names)
-    if out.size or names:
-        state, out, begun = _outliers_again(start, begun, state)
-    names, state, back = _judged(begun, state, names)
-    if _walks(state):
-        state, names = _significant_beside_walk(state, names)
-        added = (*added, *names, WANDER)
-    else:
-        added = (*added, *names)
-    return _end(start, state, added, out, back)
+    poses_g = start.poses_g
+    state, ladder, _ = _settled(start, poses_g, base.effects, _ladder_effects(start),
+                                walks=False)
+    fixed = (*base.effects, *ladder)
+    if 'axis_gain' in fixed:
+        fixed = tuple(name for name in fixed if name != 'gain')
+    names = (*_ladder_effects(state), *(name for name in EFFECTS if name not in LADDER),
+             *changes_beside(state.model))
+    begun = state
+    state, added, near = _settled(state, poses_g, fixed, names)
+    begun = _without(begun, poses_g, np.array(near.chosen.out, np.intp))
+    state, added, back = _judged(begun, state, added) if near.walk is None else (state, added, ())
+    near = _at(state, near, fixed, names, added, poses_g)
+    walks = (WANDER,) if near.walk is not None else ()
+    named = _end(start, state, (*ladder, *near.names, *walks), near, back, poses_g)
+    return _described(named, start, poses_g)
 
 
-def _end(start: State, state: State, added: tuple[str, ...], out: NDArray[np.intp],
-         back: tuple[str, ...]) -> Found:
-    there = {*state.model.values, WANDER}
-    if 'axis_gain' in there:
-        there.add('gain')  # axis_gain includes it
-    base = start.without(out) if out.size else start
-    return Found(base or start, state, tuple(name for name in added if name in there), out, back)
+def _described(found: Found, start: State, poses_g: Poses) -> Found:
+    """Add an empirical curve if the names leave a gap, or if it is better than a walk."""
+    if found.walk is None and found.final.is_noise:
+        return found
+    curve = best_curve(found.final, poses_g, found.near.chosen.out)
+    if curve is None or (found.near.walk is not None and curve.score < _score_of_walk(found.near)):
+        return found
+    kept = np.delete(np.arange(len(poses_g)), curve.out)
+    after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
+                         poses_g.take(kept))
+    if after is None or after.fit.at_bound:
+        return found
+    out = np.array(curve.out, np.intp)
+    near = replace(found.near, walk=None)
+    return replace(found, base=_without(start, poses_g, out), final=after, near=near,
+                   walk=None, outliers=out, curve=curve,
+                   added=(*(name for name in found.added if name != WANDER), curve.name))
 
 
-def _with_ladder(state: State) -> tuple[State, tuple[str, ...]]:
-    """Add the effects of V and W that the base lacks and the poses support."""
+def _score_of_walk(near: Near) -> float:
+    """Return the score of a walk relative to the same effects without it."""
+    plain = near.plain.made(near.chosen.blocks, near.chosen.out)
+    return 0.0 if near.walk is None else near.walk.score - plain.score
+
+
+def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
+             walks: bool = True) -> tuple[State, tuple[str, ...], Near]:
+    """Search and fit in turn until the set remains; return the state, the names and the set."""
+    names = tuple(name for name in names if name not in fixed)
     added: tuple[str, ...] = ()
-    while True:
-        found = state.candidates_among(_ladder_effects(state))
-        best = best_of(found, state.fitted, state.dof)
-        if best is None or not _is_supported(best, found, state):
-            return state, added
-        if best.effect == 'axis_gain' and 'gain' in found and probability(
-                found['gain'], state.fitted, state.dof, len(found)) < LEVEL:
-            best = found['gain']  # the smaller model first
-        after = state.plus(best)
-        if after is None:
-            return state, added
-        state, added = after, (*added, best.effect)
+    seen = []
+    refused: set[frozenset[str]] = set()
+    for _ in range(_ROUNDS):
+        near = _best_near(State(judge(state.model, poses_g)), fixed, names, refused, walks=walks)
+        if near.key in seen:
+            break
+        after = _fitted(near, state, poses_g, fixed)
+        while after is None:
+            refused.add(frozenset(near.names))
+            near = _best_near(State(judge(state.model, poses_g)), fixed, names, refused,
+                              walks=walks)
+            after = _fitted(near, state, poses_g, fixed)
+        state, added = after, near.names
+        seen.append(near.key)
+    return state, added, near
 
 
-def _is_supported(best: Candidate, found: dict[str, Candidate], state: State) -> bool:
-    """Return whether an effect is significant, alone or with all others that it may hide."""
-    columns = projected(np.zeros(len(state.fit.residual)), state.fitted.onto[:, :0])
-    for candidate in found.values():
-        columns = columns.with_columns(candidate.columns)
-    together = replace(best, columns=columns.onto)
-    return any(probability(candidate, state.fitted, state.dof, len(found)) < LEVEL
-               for candidate in (best, together))
+def _best_near(state: State, fixed: tuple[str, ...], names: tuple[str, ...],
+               refused: set[frozenset[str]], *, walks: bool) -> Near:
+    """Return the best set near a model, with or without a walk."""
+    linear = linearised(state.fit, fixed, names)
+
+    def best_of(problem: Linear) -> Set:
+        return next((each for each in accepted(problem, explored(problem))
+                     if frozenset(names_of(problem, each)) not in refused), problem.made())
+
+    every = tuple(processes(linear, state.poses_g)) if walks else ()
+    best = Near(linear, best_of(linear), None, linear, every)
+    most = best.chosen.score
+    if linear.worth and _is_all_noise(linear, best.chosen):
+        return best
+    for process in every:
+        for beside in {(): linear.made(), best.chosen.blocks: best.chosen}.values():
+            walk = walk_beside(linear, beside, process)
+            if walk.likelihood_ratio < SIGNIFICANT:
+                continue
+            white = walk.whitened(linear)
+            chosen = best_of(white)
+            if chosen.score > most:
+                plain = linear.made(chosen.blocks, chosen.out)
+                again = walk_beside(linear, plain, process)
+                if again.likelihood_ratio > SIGNIFICANT:
+                    best, most = Near(white, chosen, again, linear, every), chosen.score
+    return best
+
+
+def _is_all_noise(linear: Linear, chosen: Set) -> bool:
+    from .state import is_noise
+
+    return is_noise(chosen.rss, linear.dof - chosen.parameters)
+
+
+def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]) -> State | None:
+    """Return the fit of a set, or None if it is not sound."""
+    values = near.linear.values_of(near.chosen)
+    model = {name: part for name, part in state.model.values.items() if name in fixed}
+    for block, part in values.items():
+        entry = near.linear.blocks[block]
+        if entry.effect == 'axis_gain':
+            model.pop('gain', None)
+        model[entry.effect] = np.concatenate([part, entry.shape])
+    kept = np.delete(np.arange(len(poses_g)), near.chosen.out)
+    after = fitted_state(Model(model), poses_g.take(kept))
+    if after is None or (near.chosen.blocks and after.fit.at_bound):
+        return None
+    return after
+
+
+def _at(state: State, near: Near, fixed: tuple[str, ...], names: tuple[str, ...],
+        added: tuple[str, ...], poses_g: Poses) -> Near:
+    """Return the final equations and set; its effects are in the order of their contribution."""
+    linear = linearised(judge(state.model, poses_g), fixed, names)
+    blocks = [max(number for number, block in enumerate(linear.blocks) if block.effect == name)
+              for name in added]
+    plain = linear.made(blocks, near.chosen.out)
+    walk = None if near.walk is None else walk_beside(linear, plain, near.walk.process)
+    problem = linear if walk is None else walk.whitened(linear)
+    whole = problem.made(blocks, near.chosen.out)
+    blocks.sort(key=lambda block: -problem.without(whole, block).rss)
+    return Near(problem, problem.made(blocks, near.chosen.out), walk, linear,
+                tuple(processes(linear, poses_g)))
+
+
+def _without(state: State, poses_g: Poses, out: NDArray[np.intp]) -> State:
+    """Return a model fitted to all poses but these."""
+    kept = np.delete(np.arange(len(poses_g)), out)
+    return fitted_state(state.model, poses_g.take(kept)) or state
 
 
 def _ladder_effects(state: State) -> tuple[str, ...]:
-    """Return the effects of the ladder that can be added next."""
+    """Return the effects of the ladder that can be added."""
     present = state.model.values
     possible = ['offset', 'cross_axis']
     if 'axis_gain' not in present:
@@ -205,138 +303,33 @@ def _ladder_effects(state: State) -> tuple[str, ...]:
     return tuple(name for name in LADDER if name in possible and name not in present)
 
 
-def _without_outliers(state: State, patience: float) -> tuple[State, NDArray[np.intp]]:
-    """Leave out outliers, if this explains more than any effect."""
-    none = np.zeros(0, np.intp)
-    out = outliers(state.fit, len(state.poses_g))
-    if not out.poses.size:
-        return state, none
-    best = best_of(state.found, state.fitted, state.dof)
-    rival = 0.0 if best is None else fall_of(best, state.fitted, state.dof)
-    if state.wander is not None:
-        rival = max(rival, state.wander.fall)
-    rows = np.isin(state.fit.equations.pose, out.poses)
-    # 2 log n per outlier is the cost of its selection among n poses.
-    falls = (fall(max(state.fitted.rss - out.chi2, 0.0), state.fitted.rss, state.dof,
-                  float(np.sum(rows)))
-             - 2.0 * len(out.poses) * np.log(len(state.poses_g)))
-    after = state.without(out.poses) if falls > patience * rival else None
-    return (state, none) if after is None else (after, out.poses)
-
-
-def _outliers_again(start: State, begun: State, state: State
-                    ) -> tuple[State, NDArray[np.intp], State]:
-    """Find the outliers among all poses again, with the model of the search."""
-    # Linearised at the model of the good poses, because outliers distort other models.
-    whole = State(judge(state.model, start.poses_g))
-    out = outliers(whole.fit, len(start.poses_g)).poses
-    again = whole.without(out)
-    before = State(judge(begun.model, start.poses_g)).without(out)
-    if again is None or before is None:
-        kept = np.isin(start.poses_g.row, state.poses_g.row)
-        return state, np.flatnonzero(~kept), begun
-    return again, out, before
-
-
-def _next(state: State) -> tuple[State, tuple[str, ...]]:
-    """Return the state with one more effect or pair of effects, and their names; () if none."""
-    found = dict(state.found)
-    while found:
-        new = _admitted(state, found)
-        if not new:
-            break
-        after = _with(state, new)
-        if after is not None:
-            return after, tuple(candidate.effect for candidate in new)
-        del found[new[0].effect]  # it has no sound fit, so try the next one
-    return state, ()
-
-
-def _with(state: State, new: tuple[Candidate, ...]) -> State | None:
-    """Return the state with these candidates in the model, or None without a sound fit."""
-    for candidate in new:
-        among = state.candidates_among((candidate.effect,))
-        after = state.plus(among[candidate.effect]) if among else None
-        if after is None:
-            return None
-        state = after
-    return state
-
-
-def _admitted(state: State, found: dict[str, Candidate]) -> tuple[Candidate, ...]:
-    """Return the best effect, or the best pair of effects, if it is significant."""
-    fitted, dof = state.fitted, state.dof
-    single = best_of(found, fitted, dof)
-    if single is None:
-        return ()
-    falls = fall_of(single, fitted, dof)
-    pair = best_pair(found, fitted, dof) if falls > 0.0 else None
-    if pair is not None and pair_is_better(pair, single, fitted, dof, found):
-        return pair
-    walk = state.wander
-    if walk is not None and walk.fall > falls and not state.is_noise:
-        return _admitted_beside_walk(state, found)
-    admitted = (probability(single, fitted, dof, len(found)) < LEVEL and agrees(single, fitted))
-    return (single,) if admitted else ()
-
-
-def _admitted_beside_walk(state: State, among: dict[str, Candidate]) -> tuple[Candidate, ...]:
-    """Return the best effect if it is significant in addition to a walk of the offset."""
-    found = {name: each for name, each in state.found_beside_walk().items() if name in among}
-    single = best_of(found, state.beside_walk, state.dof)
-    if single is None or probability(single, state.beside_walk, state.dof, len(found)) > LEVEL:
-        return ()
-    return (single,) if agrees(among[single.effect], state.fitted) else ()
-
-
-def _tested_again(state: State, names: tuple[str, ...]) -> tuple[State, tuple[str, ...]]:
-    """Test each effect against its removal, and against every other effect."""
-    for name in names:
-        without = state.without_effect(name) if name in state.model.values else None
-        if without is None or name not in without.found:
-            continue
-        found = without.found
-        best = best_of(found, without.fitted, without.dof)
-        if best is None or probability(found[name], without.fitted, without.dof,
-                                       len(found)) > LEVEL:
-            state, names = without, tuple(other for other in names if other != name)
-        elif best.effect != name and best.effect not in names:
-            after = without.plus(best)
-            if after is not None:
-                state = after
-                names = tuple(best.effect if other == name else other for other in names)
-    return state, names
-
-
 def _judged(begun: State, state: State, names: tuple[str, ...]
-            ) -> tuple[tuple[str, ...], State, tuple[str, ...]]:
+            ) -> tuple[State, tuple[str, ...], tuple[str, ...]]:
     """Remove all effects if a gap remains and they explain too little of the residual."""
     if not names or not state.fit.noise_known or state.is_noise:
-        return names, state, ()
-    above = begun.fitted.rss - begun.dof
-    explained = 1.0 - (state.fitted.rss - state.dof) / max(above, 1e-300)
+        return state, names, ()
+    above = begun.rss - begun.dof
+    explained = 1.0 - (state.rss - state.dof) / max(above, 1e-300)
     if explained >= _LEAST_SHARE:
-        return names, state, ()
-    return (), begun, names
+        return state, names, ()
+    return begun, (), names
 
 
-def _significant_beside_walk(state: State, names: tuple[str, ...]
-                             ) -> tuple[State, tuple[str, ...]]:
-    """Keep the effects that are significant in addition to a walk of the offset."""
-    for name in names:
-        without = state.without_effect(name)
-        if without is None:
-            continue
-        found = without.found_beside_walk()
-        if name not in found or probability(found[name], without.beside_walk, without.dof,
-                                            len(found)) > LEVEL:
-            state, names = without, tuple(other for other in names if other != name)
-    return state, names
+def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
+         poses_g: Poses) -> Found:
+    there = {*state.model.values, WANDER}
+    if 'axis_gain' in there:
+        there.add('gain')  # axis_gain includes it
+    out = np.array(near.chosen.out, np.intp)
+    base = _without(start, poses_g, out) if out.size else start
+    return Found(base, state, tuple(name for name in added if name in there), out, near,
+                 _walk(state, near), None, back)
 
 
-def _walks(state: State) -> bool:
-    """Return whether the remaining residual is a random walk of the offset."""
-    walk = state.wander
-    if walk is None or walk.likelihood_ratio < _WALK_SIGNIFICANT or state.is_noise:
-        return False
-    return bool(walk.held_out @ walk.held_out < state.fitted.held_out @ state.fitted.held_out)
+def _walk(state: State, near: Near) -> Walk | None:
+    """Return the walk beside a state, at the poses kept."""
+    if near.walk is None:
+        return None
+    walks = [walk_beside(state.linear, state.nothing, process)
+             for process in processes(state.linear, state.poses_g)]
+    return max(walks, key=lambda walk: walk.score, default=None)

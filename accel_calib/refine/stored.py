@@ -67,7 +67,7 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     count = (len(poses_g), len(stored))
     columns = {key: _joined(key, poses_g, stored) for key in COLUMNS
                if (key in poses_g and key in stored) or (key in _EITHER and key in poses_g)}
-    if 'time' in calibration.model.needs:  # limited to the range of the calibration
+    if 'time' in calibration.ranges:  # limited to the range of the calibration
         held = np.clip(poses_g['time'], *calibration.ranges['time'])
         columns['time'] = np.concatenate([held, stored['time']])
     elif 'time' in poses_g:

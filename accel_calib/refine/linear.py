@@ -1,0 +1,437 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The equations near a model as a linear problem: candidates as columns, and sets of them.
+
+With the model of the base projected out, the equations are
+
+    residual = columns · values + noise of variance λ
+
+One block of columns belongs to one effect with one shape. A set is a choice of blocks, with
+poses that are left out; leaving a pose out is a further column, 1 at the pose and 0 elsewhere.
+To first order, the gain of a set is that of the joint fit of all its values, at the cost of one
+projection. The gain of every block beside a set is computed at once, by one matrix product.
+
+**Moderated variance.** The measured noise says λ = 1, and the residuals say what λ is. The noise is
+a prior worth ν = 4 degrees of freedom (Smyth 2004, with ν fixed). In F tests, the variance is
+
+    (ν + RSS) / (ν + dof)
+
+and twice the logarithm of the likelihood of a set is -(ν + N) log(ν + RSS). A test with a free
+scale (ν = 0) finds little with few poses, and one with the measured noise alone (ν = ∞) finds
+effects where the poses repeat worse than their samples.
+
+**Criterion.** The score of a set, which is larger if the set is better (Schwarz 1978):
+
+    (ν + N) log((ν + RSS₀) / (ν + RSS)) - q log N (ν + N) / (ν + N - q - 1)
+                                        - 2 Σ log(tried) - Σ unusual
+
+for q values (corrected for few equations, McQuarrie and Tsai 1998), with the number of shapes tried, and a penalty if an effect is far larger than in
+common sensors. Each pose that is left out costs 2 log n for its selection among n poses.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects import Context, effect_named
+from ..estimate.equations import Equations
+from ..estimate.fit import Fit
+from ..model import Model
+from ..table import Floats
+
+WORTH = 4.0
+"""ν, degrees of freedom that the measured noise counts as."""
+
+LEVEL = 0.01
+"""Probability that any effect is named if there is no hidden effect."""
+
+_SEEN = 0.02
+"""Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
+
+_USUAL = 1.6
+"""Standard deviation of the logarithm of the size of an effect relative to its typical size."""
+
+_MOST_UNUSUAL = 6.0
+"""Largest penalty for an unusual size."""
+
+_RARE = 5.0
+"""Additional cost of each pose that is left out: few poses are knocked."""
+
+_SHAPES_AT_ONCE = 250
+"""If there are more shapes, only evenly spread shapes are tried."""
+
+_MANY_POSES, _FEW_SHAPES = 1000, 60
+"""The same for more poses than this."""
+
+_SHAPES_ALIKE = 3.0
+"""Number of neighbouring shapes that count as one independent trial."""
+
+_OFFSET = Model({'offset': np.zeros(3)})
+
+
+class Block(NamedTuple):
+    """
+    The columns of one effect with one shape.
+
+    Parameters
+    ----------
+    effect : str
+        Name of the effect.
+    shape : (s,) array
+        Its shape.
+    columns : slice
+        Its columns in `Linear.columns`.
+    searched : int
+        Number of values of the shape that were searched in the same data.
+    tried : float
+        Number of independent shapes tried.
+
+    """
+
+    effect: str
+    shape: Floats
+    columns: slice
+    searched: int = 0
+    tried: float = 1.0
+
+
+@dataclass(frozen=True)
+class Linear:
+    """
+    The equations of all poses near a model, with the base projected out.
+
+    Parameters
+    ----------
+    onto : (m, p) array
+        Orthonormal columns that span the base.
+    residual : (m,) array
+        Residual of the base, in units of the noise.
+    pose : (m,) array of int
+        Index of the pose of each equation.
+    blocks : tuple of Block
+        The candidates.
+    columns : (m, c) array
+        Columns of all blocks outside of the base, relative to `sizes`.
+    sizes : (c,) array
+        Norms of the columns before the base was projected out.
+    worth : float
+        ν; 0 if the noise is not known.
+    dof : int
+        N, number of independent equations minus number of values of the base.
+    base_rss : float
+        Residual sum of squares of the base, to which scores are relative.
+    offset : (m, 3) array
+        Columns of an offset.
+    choice : float
+        What the choice of one effect among the candidates, or of a walk, costs.
+    penalty : float
+        Subtracted from all scores.
+
+    """
+
+    onto: Floats
+    residual: Floats
+    pose: NDArray[np.intp]
+    blocks: tuple[Block, ...]
+    columns: Floats
+    sizes: Floats
+    worth: float
+    dof: int
+    base_rss: float
+    offset: Floats
+    choice: float
+    penalty: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the candidates."""
+        return tuple(dict.fromkeys(block.effect for block in self.blocks))
+
+    @cached_property
+    def along(self) -> Floats:
+        """(c,) array, products of the columns with the residual."""
+        return self.columns.T @ self.residual
+
+    @cached_property
+    def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+        """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
+        groups: dict[int, list[int]] = {}
+        for number, block in enumerate(self.blocks):
+            groups.setdefault(block.columns.stop - block.columns.start, []).append(number)
+        found = []
+        for width, numbers in groups.items():
+            starts = np.array([self.blocks[number].columns.start for number in numbers], np.intp)
+            index = starts[:, np.newaxis] + np.arange(width)
+            products = np.empty((len(numbers), width, width))
+            for one in range(width):
+                for other in range(one, width):
+                    products[:, one, other] = products[:, other, one] = np.einsum(
+                        'mk,mk->k', self.columns[:, index[:, one]], self.columns[:, index[:, other]])
+            found.append((np.array(numbers, np.intp), index, products))
+        return found
+
+    def score(self, rss: float, parameters: float, charge: float) -> float:
+        """Return the score of a set from its RSS, number of values and other charges."""
+        fall = (self.worth + self.dof) * math.log(
+            (self.worth + self.base_rss + 1e-300) / (self.worth + max(rss, 1e-12 * self.base_rss)
+                                                     + 1e-300))
+        whole = self.worth + self.dof
+        few = whole / max(whole - parameters - 1.0, 1e-9)
+        return fall - few * parameters * math.log(max(self.dof, 2)) - charge - self.penalty
+
+    def made(self, blocks: Sequence[int] = (), out: Iterable[int] = ()) -> Set:
+        """Return the set of these blocks, with these poses left out."""
+        out = tuple(sorted(out))
+        rows = np.flatnonzero(np.isin(self.pose, out)) if out else np.zeros(0, np.intp)
+        units = -self.onto @ self.onto[rows].T
+        units[rows, np.arange(len(rows))] += 1.0
+        onto, ranks = np.linalg.qr(units)[0], [float(len(rows))]
+        raw = [self.columns[:, self.blocks[block].columns] for block in blocks]
+        for columns in raw:
+            new = outside(columns, onto)
+            onto, ranks = np.hstack([onto, new]), [*ranks, float(new.shape[1])]
+        residual = self.residual - onto @ (onto.T @ self.residual)
+        searched = sum(self.blocks[block].searched for block in blocks)
+        charge = 2.0 * sum(math.log(self.blocks[block].tried) for block in blocks)
+        charge += sum(self._unusual(blocks, raw, out, onto[:, :len(rows)]))
+        charge += len(blocks) * self.choice
+        charge += len(out) * (2.0 * math.log(max(self.poses, 2)) + _RARE)
+        parameters = sum(ranks) + searched
+        rss = float(residual @ residual)
+        return Set(tuple(blocks), out, onto, residual, rss, tuple(ranks[1:]), parameters,
+                   charge, self.score(rss, parameters, charge))
+
+    @property
+    def poses(self) -> int:
+        """Return the number of poses."""
+        return int(self.pose.max()) + 1
+
+    def _unusual(self, blocks: Sequence[int], raw: list[Floats], out: tuple[int, ...],
+                 units: Floats) -> Iterator[float]:
+        """Yield the penalty for the size of each effect."""
+        if not blocks:
+            return
+        values = self._values(blocks, raw, units)
+        for block in blocks:
+            effect = effect_named(self.blocks[block].effect)
+            size = float(np.max(np.abs(values[block]))) / effect.typical
+            yield min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
+
+    def _values(self, blocks: Sequence[int], raw: list[Floats], units: Floats
+                ) -> dict[int, Floats]:
+        columns = np.hstack(raw)
+        columns = columns - units @ (units.T @ columns)
+        values = np.linalg.lstsq(columns, self.residual, rcond=1e-7)[0]
+        found, start = {}, 0
+        for block in blocks:
+            part = self.blocks[block].columns
+            width = part.stop - part.start
+            found[block] = values[start:start + width] / self.sizes[part]
+            start += width
+        return found
+
+    def values_of(self, chosen: Set) -> dict[int, Floats]:
+        """Return the (p,) values of the effect of each block of a set."""
+        if not chosen.blocks:
+            return {}
+        raw = [self.columns[:, self.blocks[block].columns] for block in chosen.blocks]
+        rows = int(chosen.onto.shape[1] - sum(chosen.ranks))
+        return self._values(chosen.blocks, raw, chosen.onto[:, :rows])
+
+    def visible(self) -> dict[str, float]:
+        """Return the effect on the residuals of each candidate of typical size, per noise."""
+        found: dict[str, float] = {}
+        for block in self.blocks:
+            left = outside(self.columns[:, block.columns], self.onto[:, :0])
+            if left.shape[1]:
+                own = self.columns[:, block.columns] * self.sizes[block.columns]
+                size = float(np.linalg.norm(own, 2)) * effect_named(block.effect).typical
+                found[block.effect] = max(size, found.get(block.effect, 0.0))
+        return found
+
+    def gains(self, beside: Set) -> tuple[Floats, Floats]:
+        """Return the (b,) gain of each block in addition to a set, and its (b,) rank."""
+        across = beside.onto.T @ self.columns
+        along = self.along - across.T @ (beside.onto.T @ self.residual)
+        gain, rank = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
+        for numbers, index, products in self.by_width:
+            parts = np.moveaxis(across[:, index], 0, 2)
+            left = products - parts @ np.swapaxes(parts, 1, 2)
+            size, axes = np.linalg.eigh(left)
+            kept = (size > _SEEN ** 2) & (size > _SEEN ** 2 * size[:, -1:])
+            towards = (np.swapaxes(axes, 1, 2) @ along[index][:, :, np.newaxis])[:, :, 0]
+            squares = np.where(kept, towards ** 2 / np.where(kept, size, 1.0), 0.0)
+            gain[numbers], rank[numbers] = np.sum(squares, axis=1), np.sum(kept, axis=1)
+        return gain, rank
+
+    def without(self, chosen: Set, block: int) -> Set:
+        """Return a set without one of its blocks."""
+        return self.made([other for other in chosen.blocks if other != block], chosen.out)
+
+    def score_with(self, before: Set, block: int, gain: float, rank: float) -> float:
+        """Return the score of a set with one more block, without the penalty for its size."""
+        entry = self.blocks[block]
+        return self.score(before.rss - gain, before.parameters + rank + entry.searched,
+                          before.charge + self.choice + 2.0 * math.log(entry.tried))
+
+    def probability(self, chosen: Set, block: int) -> float:
+        """Return the probability that noise alone makes a block this good beside the others."""
+        from scipy.special import fdtrc
+
+        others = self.without(chosen, block)
+        gain = others.rss - chosen.rss
+        entry = self.blocks[block]
+        added = chosen.parameters - others.parameters
+        left = self.worth + self.dof - chosen.parameters
+        if added < 1 or left < 1:
+            return 1.0
+        p = float(fdtrc(added, left, gain / added / ((self.worth + chosen.rss + 1e-300) / left)))
+        return min(1.0, p * len(self.names) * entry.tried)
+
+
+@dataclass(frozen=True)
+class Set:
+    """
+    Effects that are added to the base, and poses that are left out.
+
+    Parameters
+    ----------
+    blocks : tuple of int
+        Indices of the blocks.
+    out : tuple of int
+        Indices of the poses left out.
+    onto : (m, q) array
+        Orthonormal columns that span both; those of the poses first.
+    residual : (m,) array
+        The residual that they leave.
+    rss : float
+        Its sum of squares.
+    ranks : tuple of float
+        Number of values that each block determines beside the blocks before it.
+    parameters : float
+        Number of values, with searched shapes and equations left out.
+    charge : float
+        What is subtracted from its score apart from these values.
+    score : float
+        The criterion; 0 for the base.
+
+    """
+
+    blocks: tuple[int, ...]
+    out: tuple[int, ...]
+    onto: Floats = field(repr=False)
+    residual: Floats = field(repr=False)
+    rss: float
+    ranks: tuple[float, ...]
+    parameters: float
+    charge: float
+    score: float
+
+
+def outside(columns: Floats, onto: Floats) -> Floats:
+    """Return the part of (m, w) columns outside of an orthonormal basis, orthonormal (m, r)."""
+    left = columns - onto @ (onto.T @ columns)
+    vectors, scales, _ = np.linalg.svd(left, full_matrices=False)
+    return vectors[:, (scales > _SEEN) & (scales > _SEEN * scales[:1])]
+
+
+def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str], worth: float = WORTH
+               ) -> Linear:
+    """
+    Return the linear problem at a model, with candidates.
+
+    Parameters
+    ----------
+    fit : Fit
+        The model at all poses; it may have more effects than the base.
+    base : tuple of str
+        Effects of the base.
+    names : iterable of str
+        Names of the candidates.
+    worth : float
+        ν, for known noise.
+
+    """
+    near, model = fit.equations, fit.model
+    held = Model({name: values for name, values in model.values.items() if name in base})
+    further = Model({name: values for name, values in model.values.items() if name not in base})
+    residual = near.residual
+    if further.values:
+        residual = residual + near.columns(further) @ _amplitudes(further)
+    onto = _orthonormal(near.columns(held)[:, held.fitted])
+    residual = residual - onto @ (onto.T @ residual)
+    blocks, columns = _blocks(near, fit.poses_g.columns, further, names, len(fit.poses_g))
+    sizes = np.linalg.norm(columns, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    columns = columns / sizes
+    columns = columns - onto @ (onto.T @ columns)
+    rss = float(residual @ residual)
+    return Linear(onto, residual, near.pose, blocks, columns, sizes,
+                  worth if near.noise_known else 0.0, near.count - onto.shape[1], rss,
+                  near.columns(_OFFSET), 2.0 * math.log(1.0 + len({b.effect for b in blocks})))
+
+
+def _amplitudes(model: Model) -> Floats:
+    """Return the (p,) values of a model with those of its shapes set to zero."""
+    parts = [np.concatenate([values[:len(effect_named(name).parameters)],
+                             np.zeros(len(effect_named(name).shape))])
+             for name, values in model.values.items()]
+    return np.concatenate(parts)
+
+
+def _orthonormal(columns: Floats) -> Floats:
+    if not columns.shape[1]:
+        return columns
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    vectors, scales, _ = np.linalg.svd(columns / size, full_matrices=False)
+    found: Floats = vectors[:, scales > 1e-6 * scales[0]]
+    return found
+
+
+def _blocks(near: Equations, context: Context, present: Model, names: Iterable[str], poses: int
+            ) -> tuple[tuple[Block, ...], Floats]:
+    """Return the blocks of the candidates, and their columns."""
+    blocks: list[Block] = []
+    columns: list[Floats] = [np.zeros((len(near.pose), 0))]
+    start = 0
+    for name in names:
+        effect = effect_named(name)
+        if effect.output is not None or any(key not in context for key in effect.needs):
+            continue
+        count = len(effect.parameters)
+        shapes = _shapes(name, context, present, poses)
+        for shape, searched, tried in shapes:
+            model = Model({name: np.concatenate([np.zeros(count), shape])})
+            columns.append(near.columns(model)[:, :count])
+            blocks.append(Block(name, shape, slice(start, start + count), searched, tried))
+            start += count
+    return tuple(blocks), np.hstack(columns)
+
+
+def _shapes(name: str, context: Context, present: Model, poses: int
+            ) -> list[tuple[Floats, int, float]]:
+    """Return the shapes of an effect to try, with the values searched and the number tried."""
+    effect = effect_named(name)
+    if effect.shapes is None:
+        return [(np.zeros(0), 0, 1.0)]
+    shapes = list(effect.shapes(context))
+    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
+    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
+    if len(shapes) == 1:
+        return [(shapes[0], 0, 1.0)]
+    tried = max(len(shapes) / _SHAPES_ALIKE, 1.0)
+    if name in present.values:
+        shapes = [*shapes, effect.split(present.values[name])[1]]
+    return [(shape, 0, 1.0) if np.array_equal(shape, effect.usual) else (shape, 1, tried)
+            for shape in shapes]

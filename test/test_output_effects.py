@@ -1,0 +1,193 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recordings that are clipped or coarsely quantised: their poses, their noise, and the names."""
+
+from __future__ import annotations
+
+from accel_calib.calibrate import fit_poses, in_g
+from accel_calib.capture import capture, CaptureSettings, StillDetector
+from accel_calib.capture.window import rounding_left
+from accel_calib.files import read_recording
+from accel_calib.model import Model
+from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
+from accel_calib.simulate import simulate_recording
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.table import Poses, Recording
+from accel_calib.units import STANDARD_GRAVITY, Units, units_of
+import numpy as np
+import pytest
+from shared import data, sensor
+
+G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
+COUNTS_PER_G = 4056.0
+
+
+def limited(recording, low, high):
+    return with_reading(recording, np.clip(recording.reading, low, high))
+
+
+def rounded(recording, step):
+    return with_reading(recording, np.round(recording.reading / step) * step)
+
+
+def with_reading(recording, reading):
+    return Recording({**recording.columns, 'reading': reading}, recording.row)
+
+
+def simulated(seed, noise=1e-3, count=24):
+    rng = np.random.default_rng(seed)
+    return simulate_recording(sensor(rng), spread_directions(count), rng, noise_g=noise,
+                              dwell=3.0, turn=0.6)
+
+
+def found(recording, units):
+    """Return the captured poses in g."""
+    return in_g(capture(recording, units).poses, units)
+
+
+@pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
+@pytest.mark.parametrize('limit', [9.0, 9.4, 9.6, 9.75, 9.9])
+def test_a_clipped_recording_has_the_poses_of_the_recording(name, limit):
+    recording = read_recording(data(name))
+    whole = capture(recording, MPS2).poses
+    poses = capture(limited(recording, -limit, limit), MPS2).poses
+    assert len(poses) == len(whole) == 21
+    free = np.all(np.abs(whole.reading) < limit - 0.3, axis=1)
+    np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.02)
+
+
+def test_a_clipped_stream_has_the_dwells_of_the_recording():
+    recording = limited(read_recording(data('mpu9150_imu0.csv')), -9.6, 9.6)
+    samples = np.column_stack([recording['time'], recording.reading, recording['rate'],
+                               np.full((len(recording), 2), np.nan)])
+    detector = StillDetector(CaptureSettings(), MPS2)
+    for block in np.array_split(samples, len(samples) // 23):
+        detector.push(block)
+    detector.close()
+    poses = capture(recording, MPS2).poses
+    assert len(poses) == 21
+    np.testing.assert_allclose([each.mean for each in detector.dwells()], poses.reading,
+                               rtol=1e-9)
+
+
+@pytest.mark.parametrize('limit', [0.8, 0.9, 0.95, 1.0])
+@pytest.mark.parametrize('noise', [3e-4, 3e-3])
+def test_all_rests_of_a_clipped_sensor_are_captured(limit, noise):
+    for seed in range(3):
+        assert len(capture(limited(simulated(seed, noise), -limit, limit), G).poses) == 24
+
+
+@pytest.mark.parametrize('limit', [9.0, 9.4, 9.6, 9.75])
+def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
+    poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -limit, limit), MPS2)
+    clip = clipped(poses)
+    assert clip is not None
+    assert clip.limit_g == pytest.approx(limit / STANDARD_GRAVITY, abs=2e-4)
+    at_limit = np.any(np.abs(poses.reading) > clip.limit_g - 1e-3, axis=1)
+    assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
+    whole, named = unclipped(poses, fit_poses(poses, G, model='10').model)
+    assert whole is not None
+    assert named is not None
+    assert grid_step(poses) is None
+
+
+def test_counts_around_an_offset_are_clipped_at_different_limits():
+    poses = capture(limited(read_recording(data('xsens_mti_counts.csv')), 29400, 36900),
+                    NATIVE).poses
+    assert len(poses) == 38
+    clip = clipped(in_g(poses, Units('native', COUNTS_PER_G)))
+    assert clip is not None
+    at_limit = np.any((poses.reading < 29401) | (poses.reading > 36899), axis=1)
+    assert np.sum(at_limit) > 4
+    assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
+
+
+def test_a_single_clipped_pose_is_detected():
+    poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -9.8, 9.8), MPS2)
+    clip = clipped(poses)
+    assert clip is not None
+    assert clip.poses.tolist() == [17]
+
+
+def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
+    poses = found(limited(simulated(3), -0.93, 0.93), G)
+    too_small = Model({'offset': np.zeros(3)})
+    assert unclipped(poses, too_small)[1] is not None
+
+
+@pytest.mark.parametrize('step', [None, 2e-4, 2e-3, 8e-3])
+def test_a_sensor_that_is_not_clipped_has_no_limit(step):
+    for seed in range(6):
+        recording = simulated(seed)
+        poses = found(recording if step is None else rounded(recording, step), G)
+        assert clipped(poses) is None
+
+
+@pytest.mark.parametrize(('step_mg', 'least'), [(2, 38), (4, 38), (8, 38), (12, 37), (20, 37)])
+def test_a_coarsely_quantised_real_recording_has_its_poses(step_mg, least):
+    recording = rounded(read_recording(data('xsens_mti_counts.csv')),
+                        round(step_mg * 1e-3 * COUNTS_PER_G))
+    assert least <= len(capture(recording, NATIVE).poses) <= 38
+
+
+@pytest.mark.parametrize('step_mg', [4, 6, 8, 12, 16, 20])
+def test_quantisation_of_a_real_recording_is_detected_with_its_step(step_mg):
+    counts = round(step_mg * 1e-3 * COUNTS_PER_G)
+    taken = capture(rounded(read_recording(data('xsens_mti_counts.csv')), counts), NATIVE).poses
+    base = fit_poses(taken, NATIVE, model='10')
+    poses = in_g(taken, base.units)
+    assert grid_step(poses) == pytest.approx(counts / base.units.per_g, rel=2e-3)
+    assert off_grid(poses, base.model)[1] == grid_step(poses)
+    assert clipped(poses) is None
+
+
+@pytest.mark.parametrize(('ratio', 'relevant'), [
+    (0.02, True), (0.1, True), (0.2, True), (0.3, True), (0.5, False), (1.0, False),
+    (3.0, False)])
+def test_a_grid_is_named_if_the_noise_is_clearly_less_than_a_step(ratio, relevant):
+    for seed in range(6):
+        step = grid_step(found(rounded(simulated(seed, 1e-3), 1e-3 / ratio), G))
+        assert step == (pytest.approx(1e-3 / ratio, rel=2e-3) if relevant else None)
+
+
+def test_readings_without_a_grid_have_no_step():
+    assert [grid_step(found(simulated(seed), G)) for seed in range(8)] == [None] * 8
+    assert grid_step(found(read_recording(data('mpu9150_imu0.csv')), MPS2)) is None
+
+
+@pytest.mark.parametrize('ratio', [0.0, 0.05, 0.1, 0.2, 0.25, 0.4, 1.0])
+def test_the_error_that_rounding_leaves_follows_from_the_variance_of_the_samples(ratio):
+    rng = np.random.default_rng(1)
+    true = rng.uniform(size=4000)
+    samples = np.round(true[:, np.newaxis] + ratio * rng.normal(size=(4000, 400)))
+    error = np.mean((samples.mean(axis=1) - true)**2)
+    stated = float(rounding_left(np.mean(np.var(samples, axis=1, ddof=1, keepdims=True))))
+    assert error == pytest.approx(stated + ratio**2 / 400.0, rel=0.1, abs=3e-4)
+
+
+@pytest.mark.parametrize('ratio', [0.03, 0.1, 0.2, 0.3])
+def test_the_stated_noise_of_means_on_a_coarse_grid_is_correct(ratio):
+    scores = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        recording = simulate_recording(Model({}), random_directions(40, rng), rng, noise_g=1e-3,
+                                       dwell=3.0, turn=0.6)
+        poses = capture(rounded(recording, 1e-3 / ratio), G).poses
+        assert poses.noise is not None
+        rest = np.array([np.searchsorted(recording['time'], time) for time in poses['time']])
+        error = poses.reading - recording['reference'][rest]
+        scores.append(np.sum(error**2) / np.sum(poses.noise**2))
+    assert 0.6 < np.mean(scores) < 1.4
+
+
+def test_a_table_whose_noise_lacks_the_grid_gets_it():
+    poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
+    assert poses.noise is not None
+    lacking = Poses({**poses.columns, 'std': np.where(poses['std'] < 2.31e-3, 0.0, poses['std']),
+                     'count': np.full(len(poses), 300.0)}, poses.row)
+    model = fit_poses(poses, G, model='10').model
+    with_it, step = off_grid(lacking, model)
+    assert step == pytest.approx(8e-3, rel=1e-3)
+    assert with_it.noise is not None
+    np.testing.assert_allclose(np.median(with_it.noise), np.median(poses.noise), rtol=0.3)
