@@ -27,7 +27,7 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, Literal, NamedTuple
@@ -564,13 +564,13 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
 def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
     """Return carrier, variable and modes of an empirical curve; `KeyError` for another name."""
     first, *rest = name.split('-')
-    if first != EMPIRICAL or len(rest) < 3 or not all(part.isdigit() for part in rest[2:]):
+    if first != EMPIRICAL or len(rest) < 3 or not all(part.isdecimal() for part in rest[2:]):
         raise KeyError(name)
     modes = tuple(int(part) for part in rest[2:])
-    carrier, _, part = rest[0].partition('.')
-    if (rest[1] not in VARIABLES or part not in ('', *CARRIERS[carrier])
-            or not all(1 <= mode <= MODES for mode in modes)
-            or (rest[1] == 'force' and carrier != 'offset')):
+    whole, dot, part = rest[0].partition('.')
+    if (whole not in CARRIERS or (dot and part not in CARRIERS[whole])
+            or rest[1] not in VARIABLES or (rest[1] == 'force' and whole != 'offset')
+            or list(modes) != sorted(set(modes)) or not 1 <= modes[0] <= modes[-1] <= MODES):
         raise KeyError(name)
     return rest[0], rest[1], modes
 

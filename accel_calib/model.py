@@ -326,6 +326,10 @@ class Model:
                                  f'{len(effect.values)}')
         object.__setattr__(self, 'values', filled)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make the model again; its caches contain functions."""
+        return Model, (dict(self.values), self.rotation)
+
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
@@ -475,9 +479,9 @@ class Model:
             shape = self._shapes[k]
             which = np.arange(ends[k] - self.terms.count[k], ends[k])
             for place in fitted_places(effect, shape):
-                if effect.factor is not None:
+                values = self.vector[self.terms.value[which]][:, np.newaxis]
+                if effect.factor is not None and np.any(values):
                     change = difference(effect.factor, context, shape, place)
-                    values = self.vector[self.terms.value[which]][:, np.newaxis]
                     moved.append(plain[which] * values * np.nan_to_num(change))
                     of.append(which)
                     start = self.terms.starts[k] + len(effect.parameters) + place

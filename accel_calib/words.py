@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .effects import effect_named
+from .effects import effect_named, empirical_parts
 from .errors import counted
+from .table import COLUMNS
 from .units import MG
 
 if TYPE_CHECKING:
@@ -19,9 +20,14 @@ if TYPE_CHECKING:
 
 _LEAST_P = 1e-16
 _IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
+_WITHOUT_UNIT = ('of_sensor', 'form')
+"""Constants of a shape that select one of two forms."""
+
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
     'explained': 'The gap is explained: only noise remains beyond the named effects.',
+    'described': 'The gap is described, not explained: only noise remains beyond an empirical '
+                 'curve, but no known effect has its form.',
     'unexplained': 'A gap remains that no effect of the catalogue explains.',
 }
 
@@ -73,12 +79,31 @@ def chance(p_value: float) -> str:
 
 def values_of(step: Step) -> list[tuple[str, str]]:
     """Return name and text of each value of a step; values in g are given in mg."""
-    effect = effect_named(step.effect)
-    milli = effect.unit in _IN_MILLI
-    unit, scale = (f'm{effect.unit}', MG) if milli else (effect.unit, 1.0)
+    effect = effect_named(step.name)
+    own = effect.unit if not step.curve else curve_unit(step.curve)
+    unit, scale = (f'm{own}', MG) if own in _IN_MILLI else (own, 1.0)
     values = []
     for name, value in step.parameters.items():
         words = (f'{value * scale:+.3g} {unit}'.replace('-', '−') if name in effect.parameters
-                 else f'{value:.5g} s')
+                 else f'{value:.5g} {_shape_unit(name, step)}'.rstrip())
         values.append((name, words))
     return values
+
+
+def curve_unit(name: str) -> str:
+    """Return the unit of an empirical curve."""
+    return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
+
+
+def _shape_unit(name: str, step: Step) -> str:
+    """Return the unit of a constant of the shape of an effect."""
+    if name in _WITHOUT_UNIT:
+        return ''
+    if step.curve:
+        return unit_of(empirical_parts(step.curve)[1])
+    return 's'
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a quantity of the context, with readings in g."""
+    return 'g' if column == 'std' else COLUMNS[column].unit

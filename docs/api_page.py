@@ -18,7 +18,7 @@ from accel_calib.calibrate import GyroBias, Quality, Rejected, SampleNoise, Veri
 from accel_calib.capture import CaptureSettings
 from accel_calib.compare import Comparison
 from accel_calib.compare.comparison import Parameter, Run
-from accel_calib.refine import Stage, Step
+from accel_calib.refine import PlannedPose, PosePlan, Stage, Step
 from accel_calib.units import Units
 
 FUNCTIONS = ('capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify', 'compare',
@@ -27,6 +27,7 @@ RECORDS = ('Poses', 'Recording', 'Calibration', 'Refinement')
 """The names of ``accel_calib.__all__``, in the order of the page."""
 
 OTHER_RECORDS = (Quality, Rejected, Units, GyroBias, SampleNoise, Verification, Step, Stage,
+                 PosePlan, PlannedPose,
                  Comparison, Run, Parameter, CaptureSettings)
 ERRORS = (errors.AccelCalibError, errors.InputError, errors.RefusedFitError,
           errors.StoredCalibrationError, errors.DamagedCalibrationError)

@@ -7,15 +7,19 @@ from dataclasses import replace
 import json
 
 from accel_calib.calibrate import fit_poses, verify
+from accel_calib.calibrate.quality import with_history
 from accel_calib.cli.main import main
 from accel_calib.errors import StoredCalibrationError
-from accel_calib.files import write_calibration, write_table
+from accel_calib.files import read_poses, write_calibration, write_table
 from accel_calib.model import Model
 from accel_calib.refine import refine
+from accel_calib.refine.findings import advice_for
+from accel_calib.refine.search import search
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
 from accel_calib.table import Poses
 from accel_calib.units import units_of
+import generator
 import numpy as np
 import pytest
 from shared import sensor
@@ -136,6 +140,39 @@ def test_a_dead_zone_ends_in_a_result(seed):
         reading=poses.reading + (felt - force) @ model.linear_part[0].T), G)
     assert found.verdict == 'unexplained'
     np.testing.assert_allclose(found.calibration.offset, model.linear_part[1], atol=0.02)
+
+
+def test_poor_repeatability_is_reported_with_its_size(tmp_path):
+    advised = []
+    for seed in range(2, 10):
+        made = generator.simulate(np.random.default_rng(seed), {'repeatability': 4.0},
+                                  generator.Setup(poses=60))
+        generator.write_csv(tmp_path / 'poses.csv', made.columns)
+        found = refine(read_poses(tmp_path / 'poses.csv'), units_of('m/s2'), base='10')
+        lines = [line for line in found.advice if line.startswith('poses repeat ')]
+        assert len(lines) <= 1
+        if lines:
+            assert found.verdict == 'unexplained'
+            assert not any('gap remains' in line for line in found.advice)
+            advised += lines
+    assert len(advised) >= 5  # in a few sets the search finds structure by chance
+    for line in advised:
+        ratio, rest = line.removeprefix('poses repeat ').split(' ', 1)
+        assert float(ratio) == pytest.approx(np.hypot(1.0, 4.0), rel=0.3)
+        assert rest == ('times worse than their samples, and the scatter has no structure: clamp '
+                        'the sensor, let it settle longer')
+
+
+@pytest.mark.parametrize('structure', [{'taken_back': ('cubic',)}, {'added': ('offset_wander',)}])
+def test_structure_that_is_not_understood_remains_a_gap(structure):
+    rng = np.random.default_rng(1)
+    poses = poses_of(with_effects(rng), rng, random_directions(60, rng))
+    scattered = poses.with_columns(reading=poses.reading + 0.002 * rng.normal(size=(60, 3)))
+    found = search(with_history(scattered, Model({})), fit_poses(poses, G, model='10').model)
+    lines = advice_for('unexplained', replace(found, **structure), (), (), 0)
+    assert any('gap remains' in line for line in lines)
+    assert not any('no structure' in line for line in lines)
+    assert any('no structure' in line for line in advice_for('unexplained', found, (), (), 0))
 
 
 @pytest.mark.parametrize(('poses', 'repeats'), [(24, 5), (12, 5)])

@@ -7,12 +7,14 @@ from html.parser import HTMLParser
 import re
 
 from accel_calib.refine import refine
+from accel_calib.report.curve import curve_parts
 from accel_calib.report.drawings import all_drawings, equal_area, recorded, variables_of
 from accel_calib.report.page import page
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import random_directions
+from accel_calib.thermal import low_passed, rate_of
 from accel_calib.units import Units
-from accel_calib.words import chance, values_of
+from accel_calib.words import chance, values_of, verdict_words
 import numpy as np
 import pytest
 
@@ -134,6 +136,72 @@ def test_variables_are_those_of_the_effect(warm):
     assert len(variables_of('quadratic', poses, force)) == 3
     assert len(variables_of('hysteresis', poses, force)) == 3
     assert [v.label.split()[0] for v in recorded(poses)] == ['temperature', 'time']
+
+
+def test_variables_are_those_of_the_shape(warm):
+    poses, force = warm.poses_g, warm.force
+    assert [v.label for v in variables_of('temperature_rate', poses, force)] == [
+        'rate of temperature [°C/min]']
+    plain, lagged = (variables_of('offset_temperature', poses, force, np.array([lag, 0.0]))
+                     for lag in (0.0, 200.0))
+    assert [v.label for v in plain] == ['temperature [°C]']
+    assert [v.label for v in lagged] == ['temperature that acts on the offset [°C]']
+    expected = low_passed(poses['time'], poses['temperature'], 200.0,
+                          rate_of(poses['time'], poses['temperature']))
+    np.testing.assert_allclose(lagged[0].values, expected, atol=1e-9)
+    of_curves = [variables_of(f'empirical-{name}-1', poses, force, np.zeros(2))
+                 for name in ('offset.z-force', 'offset-force', 'gain.x-temperature')]
+    assert [v.label for v in of_curves[0]] == ['force along z [g]']
+    assert [len(found) for found in of_curves] == [1, 3, 1]
+
+
+@pytest.fixture(scope='module')
+def bumpy():
+    """Return a refinement of an offset of z that is larger near 35 °C, and that bump."""
+    rng = np.random.default_rng(5)
+    warm = rng.uniform(10.0, 50.0, 100)
+    poses = simulate_poses(
+        model_with({'offset': np.array([0.02, -0.01, 0.03])}), random_directions(100, rng), rng,
+        noise_g=0.001, context={'time': np.arange(100) * 20.0, 'temperature': warm})
+    shift = np.zeros((100, 3))
+    shift[:, 2] = bump(warm)
+    return refine(poses.with_columns(reading=poses.reading + shift), Units('g', 1.0), base='10')
+
+
+def bump(warm):
+    return 0.004 * np.exp(-((warm - 35.0) / 5.0) ** 2)
+
+
+def test_figure_of_a_curve_shows_the_truth_within_its_band(bumpy):
+    step = bumpy.steps[-1]
+    assert bumpy.verdict == 'described'
+    assert step.effect == 'empirical'
+    parts = {part.name: part for part in curve_parts(bumpy, step.curve)}
+    for name, part in parts.items():
+        truth = bump(part.at) - np.mean(bump(part.poses)) if name == 'z' else 0.0
+        np.testing.assert_array_less(np.abs(part.change - truth), 6.0 * part.deviation + 2e-4)
+        np.testing.assert_allclose(part.poses, bumpy.poses_g['temperature'])
+    assert np.ptp(parts['z'].change) == pytest.approx(0.004, rel=0.15)
+
+    figures = {drawing.name: drawing.figure for drawing in all_drawings(bumpy)}
+    panel = figures[f'step{len(bumpy.steps)}_curve'].axes[0]
+    assert panel.get_xlabel() == 'temperature [°C]'
+    assert panel.get_ylabel() == 'change from the mean [mg]'
+    assert len(panel.collections) == len(parts)
+    ticks = [line for line in panel.lines if line.get_marker() == '|']
+    np.testing.assert_allclose(ticks[0].get_xdata(), bumpy.poses_g['temperature'])
+    band = panel.collections[0].get_paths()[0].vertices[:, 1]
+    first = next(iter(parts.values()))
+    assert np.max(band) == pytest.approx(1e3 * np.max(first.change + 1.96 * first.deviation))
+
+
+def test_page_describes_a_curve(bumpy):
+    text = page(bumpy, 'poses.csv')
+    assert 'class="verdict described"' in text
+    assert 'described, not explained' in verdict_words(bumpy)
+    assert 'over temperature, with 95 % band' in text
+    assert 'as a smooth function of temperature' in text
+    assert dict(values_of(bumpy.steps[-1]))['low'].endswith('°C')
 
 
 def test_numbers_are_short(warm):

@@ -4,10 +4,22 @@
 """The node finds an effect that its calibration lacks, and corrects it."""
 
 from collections.abc import Callable
+from dataclasses import replace
+import json
+from pathlib import Path
 import time
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.calibrate import Calibration
+from accel_calib.cli import demo
+from accel_calib.cli.main import main
+from accel_calib.effects import empirical_name
+from accel_calib.estimate.geometry import coverage
+from accel_calib.files import read_calibration, write_calibration
+from accel_calib.model import Model
+from accel_calib.ros.demo_hidden import HIDDEN
+from accel_calib.ros.simulator_node import recording_of, SimulatorSettings
+from accel_calib.simulate import parse_effect
 from accel_calib.sphere import spread_directions
 import numpy as np
 import pytest
@@ -52,7 +64,8 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
     assert answer.success, answer.message
     assert 'offset_temperature' in answer.message
     found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
-    np.testing.assert_allclose(found.model.values['offset_temperature'], MOVES, atol=2e-4)
+    np.testing.assert_allclose(found.model.values['offset_temperature'], [*MOVES, 0.0, 0.0],
+                               atol=2e-4)
 
     for temperature in (15.0, 35.0):
         published(bench, publisher, temperature, 0.2)
@@ -62,6 +75,106 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
         up = np.mean([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
                       for m in corrected], axis=0)
         assert np.linalg.norm(up) == pytest.approx(9.80665, abs=0.02)
+
+
+def with_effect(path: Path, name: str, values: list[float]) -> Calibration:
+    """Add an effect of the temperature, seen from 15 to 35 °C, to a stored calibration."""
+    found = read_calibration(path)
+    count = len(found.poses)
+    poses = found.poses.with_columns(temperature=25.0 + 10.0 * np.cos(np.arange(count) * 2.0),
+                                     time=np.arange(count) * 100.0)
+    model = Model({**found.model.values, name: np.array(values)})
+    covariance = np.zeros((len(model.vector),) * 2)
+    size = len(found.covariance)
+    covariance[:size, :size] = found.covariance
+    covariance[size:, size:] = 1e-14 * np.eye(len(model.vector) - size)
+    write_calibration(path, replace(found, model=model, poses=poses, covariance=covariance))
+    return read_calibration(path)
+
+
+CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]
+
+
+@pytest.mark.parametrize(('name', 'values'), [
+    ('offset_temperature', [1e-3, -1.5e-3, 2e-3, 30.0, 0.0]),
+    ('offset_temperature', [1e-3, -1.5e-3, 2e-3, 30.0, 1.0]),
+    (empirical_name('offset', 'temperature', (1, 2)), CURVE)],
+    ids=['lag of the die', 'lag of the sensor', 'curve'])
+def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name: str,
+                                           values: list[float], stored: Callable[..., Path]
+                                           ) -> None:
+    path = stored(sensor='imu_link')
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    publisher = bench.node.create_publisher(Temperature, 'temperature', 10)
+    bench.calibrator(calibration_file=str(path))
+    bench.spin(lambda: publisher.get_subscription_count() > 0)
+    reading = readings([[0.0, 0.6, 0.8]])[0]
+    # The node knows the temperatures before the calibration: a reload continues the lag.
+    published(bench, publisher, 20.0, 1.0)
+    bench.exchange(corrected, lambda: bench.imu(reading))
+    first = bench.stamp + 1.0 / 50.0
+    times, warm = [], []
+    found: list[Any] = []
+    for k in range(60):
+        temperature = 20.0 + 0.25 * k
+        published(bench, publisher, temperature, 0.05)
+        if k == 30:
+            calibration = with_effect(path, name, values)
+            answer = bench.call('load')
+            assert answer.success, answer.message
+        bench.stamp = first + k
+        found += bench.echo([bench.imu(reading)], corrected)
+        times.append(bench.stamp)
+        warm.append(temperature)
+    expected = calibration.apply(np.tile(reading, (60, 1)), time=np.array(times),
+                                 temperature=np.array(warm))
+    vectors = np.array([[m.linear_acceleration.x, m.linear_acceleration.y,
+                         m.linear_acceleration.z] for m in found])
+    # The history has a point every 2 s, so that the rate of the past differs slightly.
+    np.testing.assert_allclose(vectors[30:], expected[30:], atol=2e-3)
+    assert np.ptp(expected[30:], axis=0).max() > 0.02
+    begun_now = calibration.apply(np.tile(reading, (30, 1)), time=np.array(times[30:]),
+                                  temperature=np.array(warm[30:]))
+    if 'lag' in calibration.model.terms.effects[-1].shape:
+        assert np.abs(begun_now - expected[30:]).max() > 0.02
+
+
+def test_simulated_temperature_swings_and_each_part_of_the_poses_is_spread() -> None:
+    settings = SimulatorSettings(poses=40, mixed=True, dwell=0.4, turn=0.1, rate=50.0,
+                                 flat_last=False, temperature=[15.0, 35.0], temperature_period=5.0)
+    recording = recording_of(settings)
+    warm = recording['temperature']
+    expected = 25.0 - 10.0 * np.cos(2.0 * np.pi * recording['time'] / 5.0)
+    np.testing.assert_allclose(warm, expected, atol=1e-9)
+    starts = np.round(np.arange(40) * 25).astype(int)
+    for first in (0, 12, 24):
+        up = recording['reference'][starts[first:first + 16]]
+        assert coverage(up) > 0.9
+    ordered = recording_of(replace(settings, mixed=False))['reference'][starts]
+    assert coverage(ordered[:16]) < 0.8
+
+
+def test_command_offers_what_the_demo_can_hide() -> None:
+    assert tuple(HIDDEN) == demo.HIDDEN
+    for hidden in HIDDEN.values():
+        assert parse_effect(hidden.parameter)[0] == hidden.effect
+
+
+def test_demo_with_a_hidden_effect_finds_it(tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                            monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.setenv(name, '')  # the demonstration sets these; restored afterwards
+    result = tmp_path / 'result.json'
+    assert main(['demo', '--hidden', 'temperature', '--json', str(result)]) == 0
+    outcome = json.loads(result.read_text())
+    assert outcome['found'] == ['offset_temperature']
+    assert outcome['rms_before_mg'] > 2.0
+    assert outcome['rms_after_mg'] < 0.3 * outcome['rms_before_mg']
+    assert outcome['seconds'] < 90.0
+    printed = capsys.readouterr().out
+    assert '~/refine: ' in printed
+    assert 'offset_temperature' in printed
+    assert printed.count('mg from the truth') == 2 * outcome['rests']
 
 
 def test_refinement_of_too_few_poses_is_refused(bench: Any, readings: Readings) -> None:

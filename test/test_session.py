@@ -359,8 +359,8 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         driver.session.set_temperature(temperature)
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
         assert driver.finding('calibration').level == level
-    assert 'temperature is 40, but the range of the calibration is 20 to 30' in driver.finding(
-        'calibration').words
+    assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
+        driver.finding('calibration').words)
     calibration = read_calibration(path)
     at = [calibration.apply([0.0, 0.0, GRAVITY], temperature=each) for each in (30.0, 40.0, 25.0)]
     np.testing.assert_array_equal(at[0], at[1])

@@ -8,7 +8,8 @@ From poses to a calibration.
 sensor that cannot be turned over. `pose_planning` explains what poses do not determine and plans
 the next pose. `mounting` computes the mounting. `checks` detects wrong units and wiring faults,
 and `gate` rejects implausible results. `calibration` is the record, `quality` computes its
-figures, and `rest_noise` those of the gyro and of the samples.
+figures, and `rest_noise` those of the gyro and of the samples. `outside` compares samples with the
+range of a calibration.
 
 """
 
@@ -26,6 +27,7 @@ from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .gate import gated
 from .levelling import ARBITRARY_HEADING, level, set_heading, with_given_mounting
 from .mounting import FrameName, FRAMES
+from .outside import joined_ranges, Outside, outside, USES_LIMIT
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
 from .quality import in_g, Verification, verify
@@ -39,9 +41,10 @@ from .rest_noise import (
 from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
 
 __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR',
-           'STORED_METHODS', 'Calibration', 'FrameName', 'GyroBias', 'Method', 'NextPose',
-           'Outlook', 'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words',
-           'check_sensor', 'check_units', 'directions_of', 'fit_partial', 'fit_poses', 'gated',
-           'gyro_bias_of', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_only',
-           'next_pose', 'of_samples', 'outlook', 'sample_noise_of', 'set_heading',
-           'thermal_stream', 'verify', 'with_given_mounting', 'with_rest_noise']
+           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FrameName', 'GyroBias', 'Method',
+           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'SampleNoise', 'Verification',
+           'carried_words', 'check_sensor', 'check_units', 'directions_of', 'fit_partial',
+           'fit_poses', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
+           'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples', 'outlook',
+           'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
+           'with_given_mounting', 'with_rest_noise']

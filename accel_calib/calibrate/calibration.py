@@ -370,7 +370,8 @@ def of_samples(known: Context, count: int, model: Model,
     Return the context of single samples.
 
     A single sample does not show the vibration or the previous pose. Both are set to zero, and so
-    is a rate that is NaN. Lag and rate of the temperature come from earlier samples.
+    is a rate that is NaN. Lag and rate of the temperature come from earlier samples, unless they
+    are known already.
 
     Parameters
     ----------
@@ -387,7 +388,8 @@ def of_samples(known: Context, count: int, model: Model,
     none = np.zeros((count, 3))
     found = {**known, 'std': none, 'previous': none,
              'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
-    stream = thermal_stream(model) if stream is None else stream
+    lacking = not all(key in known for key in model.over if key in THERMAL)
+    stream = thermal_stream(model) if stream is None and lacking else stream
     if stream is not None and 'time' in known and 'temperature' in known:
         found.update(stream.add_all(known['time'], known['temperature']))
     return found

@@ -76,8 +76,6 @@ def _with_previous(poses_g: Poses, model: Model) -> Poses:
     return poses_g.with_columns(previous=previous)
 
 
-
-
 _LEAST_OWN = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
 

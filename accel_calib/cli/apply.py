@@ -6,12 +6,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from . import options
 from .options import progress
-from ..calibrate import Calibration, check_sensor, check_units, of_samples
+from ..calibrate import (
+    Calibration,
+    check_sensor,
+    check_units,
+    of_samples,
+    Outside,
+    outside,
+)
 from ..errors import counted, InputError
 from ..files import correct_bag, is_bag, read_samples, write_table
 from ..units import UnitName
@@ -40,17 +48,22 @@ def run(args: argparse.Namespace) -> int:
     calibration = options.stored_calibration(args.calibration)
     if args.no_rotate:
         calibration = calibration.in_sensor_frame
+    left: list[Outside] = []
     if is_bag(args.recording):
         with progress('messages') as moved:
-            count = correct_bag(args.recording, calibration, args.output, args.topic, moved)
+            count = correct_bag(args.recording, calibration, args.output, args.topic, moved,
+                                left.append)
     else:
-        count = _correct_table(args.recording, calibration, args.output)
-    options.console(args).print(f'corrected {counted(count, "sample")}, stored in {args.output}',
-                                markup=False)
+        count = _correct_table(args.recording, calibration, args.output, left.append)
+    console = options.console(args)
+    for each in left:
+        console.print(f'note: {each.line}', markup=False)
+    console.print(f'corrected {counted(count, "sample")}, stored in {args.output}', markup=False)
     return 0
 
 
-def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
+def _correct_table(path: Path, calibration: Calibration, out: Path,
+                   report: Callable[[Outside], object]) -> int:
     if out.exists() and out.samefile(path):
         raise InputError(f'{out} is the recording itself, expected another file',
                          'choose another name')
@@ -61,6 +74,9 @@ def _correct_table(path: Path, calibration: Calibration, out: Path) -> int:
         raise InputError(f'{path} is in {recording.units}, but the calibration is for readings in '
                          f'{calibration.units.name}', 'use a recording in that unit')
     known = of_samples(recording.columns, len(recording), calibration.model)
+    for each in outside(calibration, known).values():
+        if each.count:
+            report(each)
     columns = {'reading': calibration.correct(recording.reading, known)}
     units: UnitName = 'g' if calibration.units.name == 'native' else calibration.units.name
     if 'rate' in recording:

@@ -18,6 +18,7 @@ from ..calibrate import Calibration
 from ..capture import capture, settings_from
 from ..errors import AccelCalibError, InputError, listed, RefusedFitError
 from ..files import is_bag, read_poses, read_recording, write_calibration
+from ..files.plan_table import write_plan
 from ..refine import BASES, refine, Refinement
 from ..report import check_matplotlib, write_page
 from ..table import Poses, Recording
@@ -38,6 +39,10 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='refined calibration to write (YAML); a folder for several POSES')
     made.add_argument('--report', type=Path, metavar='FILE',
                       help='report to write (HTML); a folder for several POSES')
+    made.add_argument('--plan', type=Path, metavar='FILE',
+                      help='poses to take next, which separate the named effects from their '
+                      'rivals (CSV); not written if there is nothing to separate; a folder for '
+                      'several POSES')
     made.add_argument('--jobs', type=int, default=1, metavar='N',
                       help='number of tables to process in parallel')
     add_inputs(made)
@@ -68,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
     """Refine and store, and print the result."""
     if args.report is not None:
         check_matplotlib()
-    for option, path in (('-o', args.output), ('--report', args.report)):
+    for option, path in (('-o', args.output), ('--report', args.report),
+                         ('--plan', args.plan)):
         if path is not None:
             _check_target(option, path, len(args.poses))
     if len(args.poses) == 1:
@@ -99,7 +105,7 @@ def _run_one(args: argparse.Namespace) -> int:
         options.write_json(args.json, {'file': path, 'error': err.message, 'advice': err.advice})
         raise
     options.write_json(args.json, {'file': path, **refine_result(result)})
-    stored = _store(result, path, args.output, args.report)
+    stored = _store(result, path, args.output, args.report, args.plan)
     _show(args, result, stored)
     if args.output is not None and args.output not in stored:
         raise RefusedFitError(f'{args.output} is not written: {result.refusal[0]}',
@@ -112,7 +118,8 @@ def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     try:
         result = refine_file(args, path)
         _store(result, path, args.output and args.output / f'{path.stem}.yaml',
-               args.report and args.report / f'{path.stem}.html')
+               args.report and args.report / f'{path.stem}.html',
+               args.plan and args.plan / f'{path.stem}.csv')
         if args.output and result.refusal:
             return options.plain({'file': path, **refine_result(result),
                                   'error': result.refusal[0], 'advice': result.refusal[1]})
@@ -158,9 +165,9 @@ def _are_samples(table: Poses) -> bool:
     return apart < _SAMPLES_APART_S or len(table) > _MANY_ROWS
 
 
-def _store(result: Refinement, source: Path, output: Path | None, report: Path | None
-           ) -> list[Path]:
-    """Write the report, and the calibration if it is usable; return the paths written."""
+def _store(result: Refinement, source: Path, output: Path | None, report: Path | None,
+           plan: Path | None) -> list[Path]:
+    """Write the report, the plan and a usable calibration; return the paths written."""
     written = []
     if report is not None:
         write_page(report, result, str(source))
@@ -168,6 +175,9 @@ def _store(result: Refinement, source: Path, output: Path | None, report: Path |
     if output is not None and not result.refusal:
         write_calibration(output, result.calibration)
         written.append(output)
+    if plan is not None and result.plan.poses:
+        write_plan(plan, result.plan)
+        written.append(plan)
     return written
 
 
@@ -183,6 +193,9 @@ def _show(args: argparse.Namespace, result: Refinement, stored: list[Path]) -> N
         console.print(f'note: {line}', markup=False)
     for line in result.advice:
         console.print(f'advice: {line}', markup=False)
+    if args.plan is not None:
+        for line in result.plan.lines:
+            console.print(f'plan: {line}', markup=False)
     if result.not_testable:
         names = ', '.join(effect for effect, _ in result.not_testable)
         console.print(f'these data cannot show: {names}', markup=False)

@@ -135,13 +135,14 @@ def refine_result(result: Refinement) -> dict[str, Any]:
         'verdict': result.verdict, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
         'gap_mg': result.gap_mg,
-        'steps': [{**asdict(step), 'words': effect_named(step.effect).words}
+        'steps': [{**asdict(step), 'words': effect_named(step.name).words}
                   for step in result.steps],
         'remaining_gap_mg': result.remaining_gap_mg,
         'disturbed_poses': result.disturbed_poses,
         'not_testable': [{'effect': effect, 'needs': needs}
                          for effect, needs in result.not_testable],
-        'advice': result.advice, 'warnings': result.calibration.warnings,
+        'advice': result.advice, 'plan': result.plan.lines,
+        'warnings': result.calibration.warnings,
         'refusal': result.refusal[0] if result.refusal else None}
 
 
@@ -168,7 +169,7 @@ def steps_table(result: Refinement) -> Table:
     for number, step in enumerate(result.steps, 1):
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        effect = f'{step.effect}\n{effect_named(step.effect).words}\n{step.where}'
+        effect = f'{step.effect}\n{effect_named(step.name).words}\n{step.where}'
         table.add_row(str(number), effect, gap, chance(step.p_value),
-                      '\n'.join(step.rivals) or 'none')
+                      '\n'.join(step.likely_rivals) or 'none')
     return table

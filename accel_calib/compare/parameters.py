@@ -50,7 +50,7 @@ import numpy as np
 
 from ..calibrate import Calibration, in_g
 from ..calibrate.quality import with_history
-from ..effects import Context, EFFECTS
+from ..effects import Context, effect_named
 from ..estimate.fit import Fit, judge
 from ..model import force_slope, Model, parameter_basis, reading_of
 from ..table import Floats, Poses
@@ -133,7 +133,7 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     reading_scale, force_scale = _scales(calibration, per_g)
     gain_scale = reading_scale / force_scale
     own = [k for k, name in enumerate(calibration.parameters)
-           if EFFECTS[name.split('.')[0]].bends]
+           if effect_named(name.rpartition('.')[0]).bends]
     size = len(model.vector)
     return RotationFree(
         (*NAMES, *(calibration.parameters[k] for k in own)),

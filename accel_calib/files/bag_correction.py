@@ -26,7 +26,15 @@ from .bag import (
     TEMPERATURE,
     temperature_track,
 )
-from ..calibrate import Calibration, check_sensor, thermal_stream
+from ..calibrate import (
+    Calibration,
+    check_sensor,
+    joined_ranges,
+    of_samples,
+    Outside,
+    outside,
+    thermal_stream,
+)
 from ..errors import InputError
 from ..messages.correction import corrected, output_frame
 from ..messages.layout import (
@@ -44,12 +52,16 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], object]
 """Function called with the number of corrected messages and the number of all messages."""
 
+Report = Callable[[Outside], object]
+"""Function called with a quantity that left the range of the calibration."""
+
 _NO_HASH = 'RIHS01_' + 64 * '0'
 """Hash of a type whose definition is neither in the bag nor in Jazzy."""
 
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
-                progress: Progress = lambda done, count: None) -> int:
+                progress: Progress = lambda done, count: None,
+                report: Report = lambda found: None) -> int:
     """
     Write a corrected copy of a bag.
 
@@ -66,6 +78,9 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         Imu topic, for a bag with several Imu topics.
     progress : callable
         Function that is called after each block of messages.
+    report : callable
+        Function that is called at the end for each quantity of the context that left the range of
+        the calibration.
 
     Returns
     -------
@@ -97,7 +112,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         sensor = first_frame_id(bag, name)
         check_sensor(calibration, sensor)
         with _new(out) as folder:
-            return _copy(bag, folder, out, _Correction(calibration, bag, name, sensor), progress)
+            correction = _Correction(calibration, bag, name, sensor)
+            count = _copy(bag, folder, out, correction, progress)
+        for each in correction.outside.values():
+            if each.count:
+                report(each)
+        return count
 
 
 @contextmanager
@@ -123,6 +143,7 @@ class _Correction:
         self._track = temperature_track(bag) if needed else None
         self._thermal = thermal_stream(calibration.model)
         self.topic, self.done = topic, 0
+        self.outside: dict[str, Outside] = {}
 
     def __call__(self, raws: list[bytes]) -> Messages:
         """Return corrected messages in a new buffer."""
@@ -132,7 +153,9 @@ class _Correction:
         if self._track is not None:
             context['temperature'] = self._track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
-        put_doubles(messages, corrected(self._calibration, doubles, context, self._thermal))
+        known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
+        self.outside = joined_ranges(self.outside, outside(self._calibration, known))
+        put_doubles(messages, corrected(self._calibration, doubles, known))
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 

@@ -38,7 +38,7 @@ from ..calibrate import (
     STORED_METHODS,
 )
 from ..calibrate.mounting import mounting_figures
-from ..effects import Effect, EFFECTS
+from ..effects import CHANGES, Effect, effect_named, is_effect, PROCESSES
 from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
 from ..estimate.fit import judge
 from ..model import Model
@@ -70,9 +70,9 @@ def format_calibration(calibration: Calibration) -> str:
         'date': calibration.date,
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
-        'effects': {name: {'what': EFFECTS[name].words, 'unit': EFFECTS[name].unit,
-                           **EFFECTS[name].shown(values)}
-                    for name, values in model.values.items()},
+        'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values)}
+                    for (name, values), effect in zip(model.values.items(), model.terms.effects,
+                                                      strict=True)},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
         **({'mounting': mounting_figures(model.rotation, calibration.sensor)}
            if calibration.is_levelled else {}),
@@ -188,7 +188,7 @@ def _check_version(content: Any, name: str) -> None:
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Return the record with the content of a file; raise ValueError for an unexpected value."""
-    values = {str(name): _values(EFFECTS[name], effect)
+    values = {str(name): _values(effect_named(name), effect)
               for name, effect in _known_effects(content).items()}
     model = Model(values, _array(content, 'rotation', (3, 3)))
     size = int(np.sum(model.stated))
@@ -226,7 +226,7 @@ def _from_version_1(calibration: Calibration) -> Calibration:
 def _known_effects(content: Mapping[str, Any]) -> Mapping[str, Any]:
     effects = _mapping(content, 'effects')
     for name, effect in effects.items():
-        if name not in EFFECTS:
+        if not is_effect(str(name)) or name in CHANGES or name in PROCESSES:
             raise ValueError(f'effect {name!r} is not in the catalogue')
         if not isinstance(effect, Mapping):
             raise ValueError(f'effect {name} is {_short(effect)}, expected names with values')

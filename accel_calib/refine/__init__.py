@@ -5,14 +5,18 @@
 From poses and a calibration to the gap, the named effect and the larger model.
 
 `refinement` is the entry point and makes the record (`records`). `stored` prepares a stored
-calibration as the base. `search` adds and removes effects. `state` is a model fitted to the poses
-kept, with or without a random walk of the offset, and `candidates` ranks the effects of the
-catalogue as columns of the equations. `output` contains the effects that are not such columns.
-`findings` describes the result.
+calibration as the base. `search` searches near a model and fits in turn; `state` is a model fitted
+to the poses kept. `linear` contains the effects of the catalogue as columns of the equations near
+a model, and the score of a set of effects and outliers. `sets` searches for the best set, and
+`wander` compares it with a random walk of the offset. `curves` finds an empirical curve where no
+effect fits, and `rivals` computes the probability of each effect. `output` contains the effects
+that are not columns of the equations. `findings` describes the result, and `plan` chooses the
+poses that separate effects from their rivals.
 
 """
 
+from .plan_words import PlannedPose, PosePlan
 from .records import Refinement, Stage, Step
 from .refinement import BASES, refine
 
-__all__ = ['BASES', 'Refinement', 'Stage', 'Step', 'refine']
+__all__ = ['BASES', 'PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine']

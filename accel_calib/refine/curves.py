@@ -42,6 +42,9 @@ _MOST_MODES = 10
 _LARGEST_SHARE = 0.35
 """Largest number of cosines, and largest share of the degrees of freedom, of a curve."""
 
+_LEAST_DOF = 30
+"""Degrees of freedom below which no curve is looked for; a few poses fit many curves."""
+
 _PATIENCE = 2
 """Cosines without a better score after which no more are added; a wave needs several."""
 
@@ -93,19 +96,21 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
 
     """
     plain = linearised(judge(state.model, poses_g), state.model.effects, ())
+    if plain.dof < _LEAST_DOF:
+        return None
     tried = [problem for carrier, variable in _pairs(poses_g)
              for problem in _problems(plain, state, poses_g, carrier, variable)]
     charge = 2.0 * math.log(max(len(tried), 1))
     best = None
     for problem in tried:
-        chosen = _grown(problem, out)
-        score = chosen.score - problem.made((), out).score - charge
+        chosen = _grown(_compressed(problem, out))
+        score = chosen.score - charge
         if chosen.blocks and (best is None or score > best[0]):
             best = score, problem, chosen
     if best is None:
         return None
     score, problem, chosen = best
-    return _accepted(score, problem, chosen, len(tried))
+    return _accepted(score, problem, problem.made(chosen.blocks, out), len(tried))
 
 
 def _pairs(poses_g: Poses) -> Iterator[tuple[str, str]]:
@@ -147,16 +152,27 @@ def _problems(plain: Linear, state: State, poses_g: Poses, carrier: str, variabl
                           for mode in range(1, MODES + 1)))
 
 
-def _grown(problem: Linear, out: tuple[int, ...]) -> Set:
+def _compressed(problem: Linear, out: tuple[int, ...]) -> Linear:
+    """Return a problem with the same products of its columns, but with few rows."""
+    nothing = problem.made((), out)
+    columns = problem.columns - nothing.onto @ (nothing.onto.T @ problem.columns)
+    rows = np.linalg.qr(np.column_stack([columns, nothing.residual]))[1]
+    count = len(rows)
+    return replace(problem, onto=np.zeros((count, 0)), residual=rows[:, -1],
+                   pose=np.arange(count), columns=rows[:, :-1], base_rss=nothing.rss,
+                   dof=problem.dof - int(nothing.parameters))
+
+
+def _grown(problem: Linear) -> Set:
     """Return the cosines with the best score."""
-    best = now = problem.made((), out)
+    best = now = problem.made()
     for _ in range(_MOST_MODES):
         gain, rank = problem.gains(now)
         scores = [problem.score_with(now, k, gain[k], rank[k])
                   if rank[k] and k not in now.blocks else -np.inf
                   for k in range(len(problem.blocks))]
-        now = problem.made((*now.blocks, int(np.argmax(scores))), out)
-        if now.parameters - len(out) > _LARGEST_SHARE * problem.dof:
+        now = problem.made((*now.blocks, int(np.argmax(scores))))
+        if now.parameters > _LARGEST_SHARE * problem.dof:
             break
         if now.score > best.score:
             best = now

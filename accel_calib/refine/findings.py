@@ -28,6 +28,7 @@ from ..effects import (
     PROCESSES,
     TO_SEPARATE,
     VARIABLES,
+    WANDER,
 )
 from ..errors import counted
 from ..estimate.equations import kinds
@@ -242,7 +243,9 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
         lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
                      f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
                      'most effects: take 24 poses or more')
-    if verdict == 'unexplained':
+    if verdict == 'unexplained' and _has_no_structure(found):
+        lines.append(_poor_repeatability(found))
+    elif verdict == 'unexplained':
         nearest = f'; {", ".join(found.taken_back)} would explain only a part' if (
             found.taken_back) else ''
         lines.append('a gap remains that no effect testable with these data explains'
@@ -251,6 +254,18 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
         if columns:
             lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
     return tuple(lines)
+
+
+def _has_no_structure(found: Found) -> bool:
+    """Return whether nothing in the scatter of the poses has a form."""
+    return not found.taken_back and found.curve is None and WANDER not in found.added
+
+
+def _poor_repeatability(found: Found) -> str:
+    """Return how much more the poses scatter than their samples say, and what to do."""
+    final = found.final
+    return (f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their samples, '
+            'and the scatter has no structure: clamp the sensor, let it settle longer')
 
 
 def _other_sensor(found: Found) -> list[str]:
@@ -279,7 +294,8 @@ def change_words(name: str, state: State, date: str) -> str:
 
 def _separating(step: Step) -> str:
     """Return advice on how to separate an effect from its rivals."""
-    families = {effect_named(name).family for name in (step.effect, *step.rivals)}
+    families = {effect_named(name).family for name in (step.effect, *step.rivals)
+                if name != EMPIRICAL}
     family = families.pop() if len(families) == 1 else ''
     return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
             f'{TO_SEPARATE[family]}')

@@ -13,8 +13,8 @@ poses that are left out; leaving a pose out is a further column, 1 at the pose a
 To first order, the gain of a set is that of the joint fit of all its values, at the cost of one
 projection. The gain of every block beside a set is computed at once, by one matrix product.
 
-**Moderated variance.** The measured noise says λ = 1, and the residuals say what λ is. The noise is
-a prior worth ν = 4 degrees of freedom (Smyth 2004, with ν fixed). In F tests, the variance is
+**Moderated variance.** The measured noise says λ = 1, and the residuals say what λ is. The noise
+is a prior worth ν = 4 degrees of freedom (Smyth 2004, with ν fixed). In F tests, the variance is
 
     (ν + RSS) / (ν + dof)
 
@@ -27,8 +27,9 @@ effects where the poses repeat worse than their samples.
     (ν + N) log((ν + RSS₀) / (ν + RSS)) - q log N (ν + N) / (ν + N - q - 1)
                                         - 2 Σ log(tried) - Σ unusual
 
-for q values (corrected for few equations, McQuarrie and Tsai 1998), with the number of shapes tried, and a penalty if an effect is far larger than in
-common sensors. Each pose that is left out costs 2 log n for its selection among n poses.
+for q values (corrected for few equations, McQuarrie and Tsai 1998), with the number of effects and
+of shapes tried, and a penalty if an effect is far larger than in common sensors. Each pose that is
+left out costs 2 log n + 5: it is selected among n poses, and few poses are knocked.
 
 """
 
@@ -136,6 +137,9 @@ class Linear:
         What the choice of one effect among the candidates, or of a walk, costs.
     penalty : float
         Subtracted from all scores.
+    white : (m, r) array, (r,) array, or None
+        Orthonormal directions along which the equations were whitened, and the part of each that
+        was taken away.
 
     """
 
@@ -151,6 +155,7 @@ class Linear:
     offset: Floats
     choice: float
     penalty: float = 0.0
+    white: tuple[Floats, Floats] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -168,15 +173,16 @@ class Linear:
         groups: dict[int, list[int]] = {}
         for number, block in enumerate(self.blocks):
             groups.setdefault(block.columns.stop - block.columns.start, []).append(number)
-        found = []
+        found: list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]] = []
         for width, numbers in groups.items():
             starts = np.array([self.blocks[number].columns.start for number in numbers], np.intp)
             index = starts[:, np.newaxis] + np.arange(width)
             products = np.empty((len(numbers), width, width))
             for one in range(width):
                 for other in range(one, width):
-                    products[:, one, other] = products[:, other, one] = np.einsum(
-                        'mk,mk->k', self.columns[:, index[:, one]], self.columns[:, index[:, other]])
+                    pair = self.columns[:, index[:, one]], self.columns[:, index[:, other]]
+                    products[:, one, other] = np.einsum('mk,mk->k', *pair)
+                    products[:, other, one] = products[:, one, other]
             found.append((np.array(numbers, np.intp), index, products))
         return found
 
@@ -193,8 +199,9 @@ class Linear:
         """Return the set of these blocks, with these poses left out."""
         out = tuple(sorted(out))
         rows = np.flatnonzero(np.isin(self.pose, out)) if out else np.zeros(0, np.intp)
-        units = -self.onto @ self.onto[rows].T
-        units[rows, np.arange(len(rows))] += 1.0
+        units: Floats = np.zeros((len(self.pose), len(rows)))
+        units[rows, np.arange(len(rows))] = 1.0
+        units = self.whitened(units - self.onto @ self.onto[rows].T)
         onto, ranks = np.linalg.qr(units)[0], [float(len(rows))]
         raw = [self.columns[:, self.blocks[block].columns] for block in blocks]
         for columns in raw:
@@ -232,7 +239,8 @@ class Linear:
         columns = np.hstack(raw)
         columns = columns - units @ (units.T @ columns)
         values = np.linalg.lstsq(columns, self.residual, rcond=1e-7)[0]
-        found, start = {}, 0
+        found: dict[int, Floats] = {}
+        start = 0
         for block in blocks:
             part = self.blocks[block].columns
             width = part.stop - part.start
@@ -273,6 +281,14 @@ class Linear:
             squares = np.where(kept, towards ** 2 / np.where(kept, size, 1.0), 0.0)
             gain[numbers], rank[numbers] = np.sum(squares, axis=1), np.sum(kept, axis=1)
         return gain, rank
+
+    def whitened(self, columns: Floats) -> Floats:
+        """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
+        if self.white is None:
+            return columns
+        axes, loss = self.white
+        found: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
+        return found
 
     def without(self, chosen: Set, block: int) -> Set:
         """Return a set without one of its blocks."""

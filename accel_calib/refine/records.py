@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
+from .plan_words import percent, PosePlan
 from ..calibrate import Calibration
+from ..effects import EMPIRICAL
 from ..html_table import table
 from ..table import Floats, Poses
 
@@ -27,6 +29,8 @@ class Step:
         Name in the catalogue.
     rivals : tuple of str
         Effects that these data cannot distinguish from it.
+    probabilities : dict
+        Probability of the effect and of each effect in its place, by name.
     parameters : dict
         Values by name. For a change of a stored calibration: the changes of the values.
     gap_before_mg, gap_after_mg : float
@@ -37,11 +41,15 @@ class Step:
         Probability that noise alone makes one of all candidates this good.
     where : str
         Directions, range or poses of the disagreement.
+    curve : str
+        Name of an empirical curve in the model, with carrier, variable and modes; empty for other
+        effects.
 
     """
 
     effect: str
     rivals: tuple[str, ...]
+    probabilities: dict[str, float]
     parameters: dict[str, float]
     gap_before_mg: float
     gap_after_mg: float
@@ -49,6 +57,17 @@ class Step:
     held_out_after_mg: float
     p_value: float
     where: str
+    curve: str = ''
+
+    @property
+    def name(self) -> str:
+        """Return the name by which `accel_calib.effects.effect_named` finds the effect."""
+        return self.curve or self.effect
+
+    @property
+    def likely_rivals(self) -> tuple[str, ...]:
+        """Return the rivals with their probabilities, such as ``quadratic (11 %)``."""
+        return tuple(f'{name} ({percent(self.probabilities[name])})' for name in self.rivals)
 
 
 @dataclass(frozen=True)
@@ -101,6 +120,8 @@ class Refinement:
         Unit force of each pose kept, in the sensor axes.
     stages : tuple of Stage
         Residuals of the base and after each step.
+    plan : PosePlan
+        Poses that separate the effects from their rivals soonest.
 
     """
 
@@ -117,6 +138,16 @@ class Refinement:
     poses_g: Poses
     force: Floats
     stages: tuple[Stage, ...]
+    plan: PosePlan
+
+    def __post_init__(self) -> None:
+        model = self.calibration.model
+        curves = [name for name in model.effects if name.startswith(f'{EMPIRICAL}-')]
+        steps = []
+        for step in reversed(self.steps):  # earlier curves belong to the base
+            steps.append(replace(step, curve=curves.pop()) if step.effect == EMPIRICAL and curves
+                         else step)
+        object.__setattr__(self, 'steps', tuple(reversed(steps)))
 
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
@@ -127,7 +158,8 @@ class Refinement:
         """Return the steps as a table, for notebooks."""
         rows = [[step.effect, f'{step.gap_before_mg:.3g} → {step.gap_after_mg:.3g}',
                  f'{step.held_out_before_mg:.3g} → {step.held_out_after_mg:.3g}',
-                 f'{step.p_value:.1g}', ', '.join(step.rivals), step.where] for step in self.steps]
+                 f'{step.p_value:.1g}', ', '.join(step.likely_rivals), step.where]
+                for step in self.steps]
         head = ['effect', 'residual [mg]', 'held out [mg]', 'p', 'rivals', 'where']
         lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.advice))
         return (table(head, rows) if rows else '') + lines

@@ -12,7 +12,7 @@ See `accel_calib.refine.search` for the method, and `.stored` for a stored calib
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
@@ -22,8 +22,9 @@ import numpy as np
 from .curves import is_curve
 from .findings import advice_for, change_words, curve_words, not_testable, where
 from .linear import linearised
+from .plan import plan_poses
 from .records import Refinement, Stage, Step, Verdict
-from .rivals import rivals
+from .rivals import LEAST, probabilities
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .stored import beside_stored, with_changes, with_stored
@@ -190,11 +191,13 @@ def _record(calibration: Calibration, found: Found, given: _Given, sensor: str, 
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
     untestable = _untestable(found, steps)
+    plan = plan_poses(found)
     return Refinement(
         verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
-        outliers, untestable, advice_for(verdict, found, steps, untestable, len(outliers)),
-        refined, refusal,
-        found.final.poses_g, found.final.fit.equations.force, _stages(found, states, steps))
+        outliers, untestable, (
+            *advice_for(verdict, found, steps, untestable, len(outliers)), *plan.advice),
+        refined, refusal, found.final.poses_g, found.final.fit.equations.force,
+        _stages(found, states, steps), plan)
 
 
 def _verdict(found: Found, named: bool, noise: bool) -> Verdict:
@@ -255,11 +258,29 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
     if name in CHANGES:
         seen = f'{change_words(name, after, date)}; {seen}'
     held_out = before.fit.residual if unseen else before.held_out
-    return Step(EMPIRICAL if is_curve(name) else name.removesuffix('_change'), rivals(name, found.near),
-                effect_named(name).shown(values),
+    own, chances = _shown(name), _probabilities(name, found)
+    return Step(own, _rivals(own, chances), chances, effect_named(name).shown(values),
                 before.gap_mg(before.fit.residual), after.gap_mg(after.fit.residual),
                 before.gap_mg(held_out), after.gap_mg(after.held_out),
                 _p_value(name, before, found), seen)
+
+
+def _probabilities(name: str, found: Found) -> dict[str, float]:
+    """Return the probability of an effect and of each effect in its place, by its name."""
+    parts: dict[str, float] = {}
+    for each, part in probabilities(name, found.near).items():
+        parts[_shown(each)] = parts.get(_shown(each), 0.0) + part
+    return parts
+
+
+def _rivals(name: str, chances: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the other effects whose probability is not small."""
+    return tuple(other for other, part in chances.items() if other != name and part > LEAST)
+
+
+def _shown(name: str) -> str:
+    """Return the name of an effect in the record."""
+    return EMPIRICAL if is_curve(name) else name.removesuffix('_change')
 
 
 def _p_value(name: str, before: State, found: Found) -> float:
@@ -282,14 +303,15 @@ def _output_steps(found: Found) -> tuple[Step, ...]:
     if found.clipped is not None and found.with_clipped is not None:
         whole = found.with_clipped
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
-        steps.append(Step('saturation', (), {'limit': found.clipped.limit_g},
+        steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': found.clipped.limit_g},
                           whole.gap_mg(whole.residual), gap,
                           whole.gap_mg(whole.held_out), held_out, 0.0,
                           f'in {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
                           'samples hardly scatter'))
     if found.grid_g is not None:
-        steps.append(Step('quantisation', (), {'step': found.grid_g}, gap, gap, held_out, held_out,
-                          0.0, f'pose means are multiples of {found.grid_g * MG:.3g} mg, which '
+        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g},
+                          gap, gap, held_out, held_out, 0.0,
+                          f'pose means are multiples of {found.grid_g * MG:.3g} mg, which '
                           f'causes {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS per axis'))
     return tuple(steps)
 
@@ -297,8 +319,10 @@ def _output_steps(found: Found) -> tuple[Step, ...]:
 def _wander_step(before: State, found: Found) -> Step:
     residual, held_out = _beside_walk(found)
     p_value = math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
-    return Step(WANDER, rivals(WANDER, found.near), {}, before.gap_mg(before.residual),
-                before.gap_mg(residual), before.gap_mg(before.held_out),
+    chances = _probabilities(WANDER, found)
+    return Step(WANDER, _rivals(WANDER, chances), chances, {},
+                before.gap_mg(before.residual), before.gap_mg(residual),
+                before.gap_mg(before.held_out),
                 before.gap_mg(held_out), p_value, where(WANDER, before, residual))
 
 

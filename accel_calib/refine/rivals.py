@@ -5,7 +5,9 @@
 Rivals: effects that would explain the data about as well as a named one.
 
 The probability of an effect against its rivals follows from the score of the set with each of them
-in its place, exp(score / 2), all else being equal (Kass and Raftery 1995).
+in its place, exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is
+estimated from the same equations, so differences are less certain: c is the share of the degrees
+of freedom that the set leaves.
 
 """
 
@@ -17,7 +19,7 @@ from .search import Near
 from .wander import walk_beside
 from ..effects import LADDER, WANDER
 
-_LEAST = 0.01
+LEAST = 0.01
 """Smallest probability of a rival."""
 
 
@@ -42,17 +44,17 @@ def probabilities(name: str, near: Near) -> dict[str, float]:
         return {name: 1.0}
     scores = _scores(name, near)
     most = max(scores.values())
-    weights = {key: float(np.exp((score - most) / 2.0)) for key, score in scores.items()}
+    weights = {key: float(np.exp(_certainty(near) * (score - most) / 2.0))
+               for key, score in scores.items()}
     total = sum(weights.values())
     ordered = sorted(weights, key=lambda key: -weights[key])
     return {key: weights[key] / total for key in ordered}
 
 
-def rivals(name: str, near: Near) -> tuple[str, ...]:
-    """Return the other effects whose probability is not small."""
-    found = probabilities(name, near)
-    return tuple(dict.fromkeys(key.removesuffix('_change') for key, part in found.items()
-                               if key != name and part > _LEAST))
+def _certainty(near: Near) -> float:
+    """Return the share of the equations that the set leaves for an estimate of the noise."""
+    whole = near.plain.worth + near.plain.dof
+    return max((whole - near.chosen.parameters) / whole, LEAST)
 
 
 def _scores(name: str, near: Near) -> dict[str, float]:
@@ -64,7 +66,7 @@ def _scores(name: str, near: Near) -> dict[str, float]:
     others = problem.made([block for block in near.chosen.blocks if block not in own],
                           near.chosen.out)
     scores = {name: near.chosen.score}
-    least = near.chosen.score + 2.0 * np.log(_LEAST)
+    least = near.chosen.score + 2.0 * np.log(LEAST) / _certainty(near)
     gain, rank = problem.gains(others)
     for number, block in enumerate(problem.blocks):
         if (rank[number] and block.effect not in near.names
@@ -72,7 +74,6 @@ def _scores(name: str, near: Near) -> dict[str, float]:
                 and problem.score_with(others, number, gain[number], rank[number]) > least):
             score = problem.made((*others.blocks, number), others.out).score
             scores[block.effect] = max(score, scores.get(block.effect, -np.inf))
-    if name != WANDER and near.walk is None:
-        walks = [walk_beside(near.plain, others, process) for process in near.processes]
-        scores[WANDER] = max((walk.score for walk in walks), default=-np.inf)
+    if name != WANDER and near.walk is None and near.process is not None:
+        scores[WANDER] = walk_beside(near.plain, others, near.process).score
     return scores

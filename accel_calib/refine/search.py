@@ -19,26 +19,35 @@ A set is kept only if its fit converged, the cost decreased and its values are p
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .curves import best_curve, Curve
-from .linear import Linear, linearised, Set
+from .linear import LEVEL, Linear, linearised, Set
 from .output import Clipped, off_grid, unclipped
-from .sets import accepted, explored, is_significant, names_of
+from .sets import accepted, explored, names_of, simpler
 from .state import beginning, changes_beside, fitted_state, State
-from .wander import Process, processes, SIGNIFICANT, Walk, walk_beside
-from ..effects import EFFECTS, LADDER, WANDER
+from .wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, WANDER
 from ..estimate.equations import kinds
 from ..estimate.fit import judge
 from ..model import Model
-from ..table import Floats, Poses
+from ..table import Poses
 
 _ROUNDS = 4
 """Largest number of searches, each near the model of the one before."""
+
+_WALK_ROUNDS = 2
+"""Number of sets beside which a walk is estimated, each found beside the walk before."""
+
+_TREND = 15.0
+"""A walk may have a score lower by this, if the other effects change with time and leave a gap."""
+
+_TIMED = 30.0
+"""A curve over time must have a score better than a walk by this."""
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
@@ -102,8 +111,8 @@ class Near:
         The random walk of the offset.
     plain : Linear
         The equations before they were whitened.
-    processes : tuple of Process
-        The processes that a walk may follow.
+    process : Process or None
+        The modes of a walk; None if it is not tried.
 
     """
 
@@ -111,7 +120,7 @@ class Near:
     chosen: Set
     walk: Walk | None
     plain: Linear
-    processes: tuple[Process, ...]
+    process: Process | None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,18 +165,16 @@ def _search(poses_g: Poses, base: Model) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
-    state, ladder, _ = _settled(start, poses_g, base.effects, _ladder_effects(start),
-                                walks=False)
+    begun, near = _settled(start, poses_g, base.effects, _ladder_effects(start), walks=False)
+    ladder = near.names
     fixed = (*base.effects, *ladder)
     if 'axis_gain' in fixed:
         fixed = tuple(name for name in fixed if name != 'gain')
-    names = (*_ladder_effects(state), *(name for name in EFFECTS if name not in LADDER),
-             *changes_beside(state.model))
-    begun = state
-    state, added, near = _settled(state, poses_g, fixed, names)
+    names = (*_ladder_effects(begun), *(name for name in EFFECTS if name not in LADDER),
+             *changes_beside(begun.model))
+    state, near = _settled(begun, poses_g, fixed, names)
     begun = _without(begun, poses_g, np.array(near.chosen.out, np.intp))
-    state, added, back = _judged(begun, state, added) if near.walk is None else (state, added, ())
-    near = _at(state, near, fixed, names, added, poses_g)
+    state, near, back = _judged(begun, state, near)
     walks = (WANDER,) if near.walk is not None else ()
     named = _end(start, state, (*ladder, *near.names, *walks), near, back, poses_g)
     return _described(named, start, poses_g)
@@ -178,12 +185,13 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     if found.walk is None and found.final.is_noise:
         return found
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
-    if curve is None or (found.near.walk is not None and curve.score < _score_of_walk(found.near)):
-        return found
+    walking = _walking(found)
+    if curve is None or (walking is not None and not _is_better(curve, walking.near)):
+        return found if curve is None or walking is None else walking
     kept = np.delete(np.arange(len(poses_g)), curve.out)
     after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
                          poses_g.take(kept))
-    if after is None or after.fit.at_bound:
+    if after is None or after.fit.at_bound or not _explains(found.final, after):
         return found
     out = np.array(curve.out, np.intp)
     near = replace(found.near, walk=None)
@@ -192,60 +200,124 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
                    added=(*(name for name in found.added if name != WANDER), curve.name))
 
 
-def _score_of_walk(near: Near) -> float:
-    """Return the score of a walk relative to the same effects without it."""
+def _walking(found: Found) -> Found | None:
+    """Return what was found, with a walk; None if a walk is not significant."""
+    near = found.near
+    if found.walk is not None or near.process is None:
+        return None if found.walk is None else found
+    walk = walk_beside(near.plain, near.plain.made(near.chosen.blocks, near.chosen.out),
+                       near.process)
+    if walk.likelihood_ratio < SIGNIFICANT:
+        return None
+    white = walk.whitened(near.plain)
+    near = replace(near, linear=white, walk=walk,
+                   chosen=white.made(near.chosen.blocks, near.chosen.out))
+    return replace(found, near=near, walk=_walk(found.final, near),
+                   added=(*found.added, WANDER))
+
+
+def _is_better(curve: Curve, near: Near) -> bool:
+    """Return whether a curve is better than a walk; one over time must be clearly better."""
     plain = near.plain.made(near.chosen.blocks, near.chosen.out)
-    return 0.0 if near.walk is None else near.walk.score - plain.score
+    walk = 0.0 if near.walk is None else near.walk.score - plain.score
+    return curve.score > walk + (_TIMED if empirical_parts(curve.name)[1] == 'time' else 0.0)
 
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
-             walks: bool = True) -> tuple[State, tuple[str, ...], Near]:
-    """Search and fit in turn until the set remains; return the state, the names and the set."""
+             walks: bool = True) -> tuple[State, Near]:
+    """Search and fit in turn until the set remains; return the state, and the set near it."""
     names = tuple(name for name in names if name not in fixed)
-    added: tuple[str, ...] = ()
-    seen = []
+    settled: Near | None = None
+    seen: list[tuple[frozenset[str], tuple[int, ...], bool]] = []
     refused: set[frozenset[str]] = set()
     for _ in range(_ROUNDS):
-        near = _best_near(State(judge(state.model, poses_g)), fixed, names, refused, walks=walks)
+        linear = linearised(judge(state.model, poses_g), fixed, names)
+        near = _best_near(linear, poses_g, refused, walks=walks)
         if near.key in seen:
             break
-        after = _fitted(near, state, poses_g, fixed)
-        while after is None:
+        near, after = _best_fit(near, state, poses_g, fixed)
+        if after is None:
             refused.add(frozenset(near.names))
-            near = _best_near(State(judge(state.model, poses_g)), fixed, names, refused,
-                              walks=walks)
-            after = _fitted(near, state, poses_g, fixed)
-        state, added = after, near.names
-        seen.append(near.key)
-    return state, added, near
+        else:
+            state, settled = after, near
+            seen.append(near.key)
+    else:
+        linear = linearised(judge(state.model, poses_g), fixed, names)
+    near = _at(linear, settled or Near(linear, linear.made(), None, linear, None), poses_g)
+    return _significant(state, near, poses_g, fixed, names)
 
 
-def _best_near(state: State, fixed: tuple[str, ...], names: tuple[str, ...],
-               refused: set[frozenset[str]], *, walks: bool) -> Near:
+def _significant(state: State, near: Near, poses_g: Poses, fixed: tuple[str, ...],
+                 names: tuple[str, ...]) -> tuple[State, Near]:
+    """Remove the effects that are not significant near the fit, one by one."""
+    while True:
+        weak = [near.linear.without(near.chosen, block) for block in near.chosen.blocks
+                if near.linear.probability(near.chosen, block) > LEVEL]
+        if not weak:
+            break
+        fewer = replace(near, chosen=max(weak, key=lambda each: each.score))
+        after = _fitted(fewer, state, poses_g, fixed)
+        if after is None:
+            break
+        state = after
+        near = _at(linearised(judge(state.model, poses_g), fixed, names), fewer, poses_g)
+    return state, near
+
+
+def _best_fit(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]
+              ) -> tuple[Near, State | None]:
+    """Return the fit of a set, or of a simpler one whose fit has a better score."""
+    best, after = near, _fitted(near, state, poses_g, fixed)
+    most = -np.inf if after is None else _score_of(near, after)
+    for other in simpler(near.linear, near.chosen):
+        instead = replace(near, chosen=other)
+        tried = _fitted(instead, state, poses_g, fixed)
+        if tried is not None and _score_of(instead, tried) > most:
+            best, after, most = instead, tried, _score_of(instead, tried)
+    return best, after
+
+
+def _score_of(near: Near, fitted: State) -> float:
+    """Return the score of a set with the residual of its fit."""
+    return near.plain.score(fitted.rss, near.chosen.parameters, near.chosen.charge)
+
+
+def _best_near(linear: Linear, poses_g: Poses, refused: set[frozenset[str]], *, walks: bool
+               ) -> Near:
     """Return the best set near a model, with or without a walk."""
-    linear = linearised(state.fit, fixed, names)
-
     def best_of(problem: Linear) -> Set:
         return next((each for each in accepted(problem, explored(problem))
                      if frozenset(names_of(problem, each)) not in refused), problem.made())
 
-    every = tuple(processes(linear, state.poses_g)) if walks else ()
-    best = Near(linear, best_of(linear), None, linear, every)
-    most = best.chosen.score
-    if linear.worth and _is_all_noise(linear, best.chosen):
+    process = process_of(linear, poses_g) if walks else None
+    best = Near(linear, best_of(linear), None, linear, process)
+    in_time = any('time' in effect_named(name).needs for name in best.names)
+    if linear.worth and not in_time and _is_all_noise(linear, best.chosen):
         return best
-    for process in every:
-        for beside in {(): linear.made(), best.chosen.blocks: best.chosen}.values():
-            walk = walk_beside(linear, beside, process)
-            if walk.likelihood_ratio < SIGNIFICANT:
-                continue
-            white = walk.whitened(linear)
-            chosen = best_of(white)
-            if chosen.score > most:
-                plain = linear.made(chosen.blocks, chosen.out)
-                again = walk_beside(linear, plain, process)
-                if again.likelihood_ratio > SIGNIFICANT:
-                    best, most = Near(white, chosen, again, linear, every), chosen.score
+    return best if process is None else _with_walk(best, process, best_of)
+
+
+def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
+    """Return a set with a walk, if it has a better score than the set without one."""
+    linear, beside = best.plain, best.plain.made()
+    tried = [beside, best.chosen]
+    for _ in range(_WALK_ROUNDS):
+        walk = walk_beside(linear, beside, process)
+        if walk.likelihood_ratio < SIGNIFICANT:
+            break
+        chosen = best_of(walk.whitened(linear))
+        beside = linear.made(chosen.blocks, chosen.out)
+        tried.append(beside)
+    most = best.chosen.score
+    if all('time' in effect_named(name).needs for name in best.names) and not _is_all_noise(
+            linear, best.chosen):
+        most -= _TREND  # what changes with time only, and not as known, wanders
+    for beside in tried:
+        walk = walk_beside(linear, beside, process)
+        if walk.likelihood_ratio > SIGNIFICANT and walk.score > most:
+            white, most = walk.whitened(linear), walk.score
+            best = replace(best, linear=white, chosen=white.made(beside.blocks, beside.out),
+                           walk=walk)
     return best
 
 
@@ -271,19 +343,17 @@ def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]) ->
     return after
 
 
-def _at(state: State, near: Near, fixed: tuple[str, ...], names: tuple[str, ...],
-        added: tuple[str, ...], poses_g: Poses) -> Near:
-    """Return the final equations and set; its effects are in the order of their contribution."""
-    linear = linearised(judge(state.model, poses_g), fixed, names)
+def _at(linear: Linear, near: Near, poses_g: Poses) -> Near:
+    """Return a set near its fit; its effects are in the order of their contribution."""
     blocks = [max(number for number, block in enumerate(linear.blocks) if block.effect == name)
-              for name in added]
+              for name in near.names]
     plain = linear.made(blocks, near.chosen.out)
     walk = None if near.walk is None else walk_beside(linear, plain, near.walk.process)
     problem = linear if walk is None else walk.whitened(linear)
     whole = problem.made(blocks, near.chosen.out)
     blocks.sort(key=lambda block: -problem.without(whole, block).rss)
     return Near(problem, problem.made(blocks, near.chosen.out), walk, linear,
-                tuple(processes(linear, poses_g)))
+                process_of(linear, poses_g))
 
 
 def _without(state: State, poses_g: Poses, out: NDArray[np.intp]) -> State:
@@ -303,16 +373,19 @@ def _ladder_effects(state: State) -> tuple[str, ...]:
     return tuple(name for name in LADDER if name in possible and name not in present)
 
 
-def _judged(begun: State, state: State, names: tuple[str, ...]
-            ) -> tuple[State, tuple[str, ...], tuple[str, ...]]:
+def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[str, ...]]:
     """Remove all effects if a gap remains and they explain too little of the residual."""
-    if not names or not state.fit.noise_known or state.is_noise:
-        return state, names, ()
-    above = begun.rss - begun.dof
-    explained = 1.0 - (state.rss - state.dof) / max(above, 1e-300)
-    if explained >= _LEAST_SHARE:
-        return state, names, ()
-    return begun, (), names
+    if not near.names or near.walk is not None:
+        return state, near, ()
+    if _explains(begun, state):
+        return state, near, ()
+    return begun, replace(near, chosen=near.linear.made((), near.chosen.out)), near.names
+
+
+def _explains(before: State, after: State) -> bool:
+    """Return whether the residual is noise, or far less above it than before."""
+    share = 1.0 - (after.rss - after.dof) / max(before.rss - before.dof, 1e-300)
+    return not after.fit.noise_known or after.is_noise or share >= _LEAST_SHARE
 
 
 def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
@@ -330,6 +403,5 @@ def _walk(state: State, near: Near) -> Walk | None:
     """Return the walk beside a state, at the poses kept."""
     if near.walk is None:
         return None
-    walks = [walk_beside(state.linear, state.nothing, process)
-             for process in processes(state.linear, state.poses_g)]
-    return max(walks, key=lambda walk: walk.score, default=None)
+    process = process_of(state.linear, state.poses_g)
+    return None if process is None else walk_beside(state.linear, state.nothing, process)

@@ -22,10 +22,11 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from .linear import LEVEL, Linear, Set
+from .linear import Block, LEVEL, Linear, Set
 from ..effects import effect_named
 from ..estimate.fit import by_pose
 from ..estimate.outliers import outliers_among
+from ..model import fitted_places
 
 LARGEST = 5
 """Largest number of effects in a set."""
@@ -36,8 +37,14 @@ _WIDTH = 6
 _BRANCHES = 6
 """Number of effects by which a set is extended."""
 
-_AS_GOOD = 6.0
+_TESTED = 12
+"""Number of extended sets whose shapes and outliers are found again."""
+
+_AS_GOOD = 2.0
 """Within this difference from the best score, the set with fewest values wins."""
+
+_NEARLY = 0.3
+"""Smallest share of the score of a set that a simpler set has before its shape is fitted."""
 
 _PATIENCE = 2
 """The search ends if the best score has not risen for this number of extensions."""
@@ -46,7 +53,7 @@ _INSTEAD = ({'gain', 'axis_gain'}, {'gain_change', 'axis_gain_change'})
 """Effects of which one includes the other."""
 
 
-def explored(linear: Linear, *, least: int = 1) -> list[Set]:
+def explored(linear: Linear) -> list[Set]:
     """
     Return the sets visited, the best score first.
 
@@ -54,16 +61,15 @@ def explored(linear: Linear, *, least: int = 1) -> list[Set]:
     ----------
     linear : Linear
         The equations, with candidates.
-    least : int
-        Number of equations of a pose.
 
     """
     front = _distinct(linear, with_outliers(linear, linear.made()))
     visited = list(front)
     best, idle = max(each.score for each in front), 0
     for _ in range(LARGEST):
-        grown = [each for before in front for new in _extended(linear, before)
-                 for each in with_outliers(linear, new)]
+        grown = _distinct(linear, [new for before in front for new in _extended(linear, before)])
+        grown = [_with_best_shapes(linear, new) for new in grown[:_TESTED]]
+        grown = [each for new in grown for each in with_outliers(linear, new)]
         front = _distinct(linear, grown)[:_WIDTH]
         if not front:
             break
@@ -74,6 +80,34 @@ def explored(linear: Linear, *, least: int = 1) -> list[Set]:
         if idle == _PATIENCE:
             break
     return _distinct(linear, visited)
+
+
+def simpler(linear: Linear, chosen: Set) -> Iterator[Set]:
+    """
+    Yield sets with one effect less, in which another effect has the best searched shape.
+
+    Between the shapes that are tried, two effects may imitate one: an offset that changes with
+    temperature and with its rate is one that lags.
+
+    """
+    if len(chosen.blocks) < 2:
+        return
+    for less in _fewer(linear, chosen):
+        for effect in dict.fromkeys(block.effect for block in linear.blocks if _is_fitted(block)):
+            others = [block for block in less.blocks if linear.blocks[block].effect != effect]
+            if effect in _barred({linear.blocks[block].effect for block in others}):
+                continue
+            gain, _ = linear.gains(linear.made(others, chosen.out))
+            own = [number for number, block in enumerate(linear.blocks)
+                   if block.effect == effect and _is_fitted(block)]
+            new = linear.made([*others, max(own, key=lambda number: gain[number])], chosen.out)
+            if new.score > _NEARLY * chosen.score:
+                yield new
+
+
+def _is_fitted(block: Block) -> bool:
+    """Return whether a fit changes the shape of a block."""
+    return bool(block.searched and fitted_places(effect_named(block.effect), block.shape))
 
 
 def names_of(linear: Linear, chosen: Set) -> tuple[str, ...]:
@@ -108,8 +142,7 @@ def is_significant(linear: Linear, chosen: Set) -> bool:
 def _extended(linear: Linear, before: Set) -> Iterator[Set]:
     """Yield the set with one more effect, for the effects with the best scores."""
     gain, rank = linear.gains(before)
-    names = set(names_of(linear, before))
-    barred = names.union(*(pair for pair in _INSTEAD if pair & names))
+    barred = _barred(set(names_of(linear, before)))
     scores: dict[str, tuple[float, int]] = {}
     for number, block in enumerate(linear.blocks):
         if rank[number] and block.effect not in barred:
@@ -117,8 +150,12 @@ def _extended(linear: Linear, before: Set) -> Iterator[Set]:
             if score > scores.get(block.effect, (-np.inf, 0))[0]:
                 scores[block.effect] = score, number
     for _, number in sorted(scores.values(), reverse=True)[:_BRANCHES]:
-        new = linear.made((*before.blocks, number), before.out)
-        yield _with_best_shapes(linear, new)
+        yield linear.made((*before.blocks, number), before.out)
+
+
+def _barred(names: set[str]) -> set[str]:
+    """Return the effects that cannot be added to a set with these names."""
+    return names.union(*(group for group in _INSTEAD if group & names))
 
 
 def _with_best_shapes(linear: Linear, chosen: Set) -> Set:

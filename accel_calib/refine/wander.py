@@ -6,19 +6,17 @@ The effect `offset_wander`: an offset that changes slowly without a known form.
 
 The offset is a random process, expanded in its Karhunen-Loève modes
 
-    w(t) = Σ_k a_k sin((k - ½) π τ) / ((k - ½) π)^p,   τ from 0 to 1 over the poses
+    w(t) = Σ_k a_k sin((k - ½) π τ) / ((k - ½) π),   τ from 0 to 1 over the poses
 
-with independent amplitudes a_k of equal variance for each axis: a random walk (p = 1), or flicker
-noise (p = ½). It enters the equations through the same columns as an offset. Its size is estimated
-by maximum likelihood: with the base projected out, the residual along the singular vectors of the
-modes has the variances s² (1 + λ Λ_i). With a fixed number of modes, the cost is linear in the
-number of poses.
+with independent amplitudes a_k of equal variance for each axis. It enters the equations through
+the same columns as an offset. Its size is estimated by maximum likelihood: with the base projected
+out, the residual along the singular vectors of the modes has the variances s² (1 + λ Λ_i). With a
+fixed number of modes, the cost is linear in the number of poses.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,9 +26,6 @@ from ..table import Floats, Poses
 
 _MODES = 60
 """Modes of each axis: the rest has less than 1 % of the variance of a random walk."""
-
-_POWERS = (1.0, 0.5)
-"""p of a random walk, and of flicker noise."""
 
 _RATIOS = np.geomspace(1e-4, 1e6, 81)
 _LARGEST_RATIO = 1e3
@@ -76,7 +71,8 @@ class Walk:
     score : float
         Score of the set with the walk.
     likelihood_ratio : float
-        Twice the logarithm of the likelihood ratio against no walk.
+        Twice the logarithm of the likelihood ratio against no walk, or against an offset that
+        scatters from pose to pose.
 
     """
 
@@ -88,17 +84,13 @@ class Walk:
     def whitened(self, linear: Linear) -> Linear:
         """Return the equations whitened for the walk and the noise."""
         spread = 1.0 + self.ratio * self.process.values
-        loss, axes = 1.0 - 1.0 / np.sqrt(spread), self.process.axes
-
-        def white(columns: Floats) -> Floats:
-            found: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
-            return found
-
-        return replace(linear, residual=white(linear.residual), columns=white(linear.columns),
+        white = replace(linear, white=(self.process.axes, 1.0 - 1.0 / np.sqrt(spread)))
+        return replace(white, residual=white.whitened(linear.residual),
+                       columns=white.whitened(linear.columns),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
     def residuals(self, linear: Linear, chosen: Set) -> tuple[Floats, Floats]:
-        """Return the residual minus the estimated walk, and the same with each equation held out."""
+        """Return the residual without the walk, and the same with each equation held out."""
         spread = 1.0 + self.ratio * self.process.values
         left = self.process.axes - chosen.onto @ (chosen.onto.T @ self.process.axes)
         precision = np.diag(1.0 / np.maximum(spread - 1.0, 1e-12)) + left.T @ left
@@ -110,26 +102,25 @@ class Walk:
         return residual, residual / np.maximum(own, 1.0 / _LARGEST_GAIN)
 
 
-def processes(linear: Linear, poses: Poses) -> Iterator[Process]:
-    """Yield the processes that a walk may follow; none if the times are not known."""
+def process_of(linear: Linear, poses: Poses) -> Process | None:
+    """Return the modes of a walk; None if the times are not known."""
     if 'time' not in poses:
-        return
+        return None
     time = poses['time']
     known = np.isfinite(time)
     if not np.any(known) or not np.ptp(time[known]) > 0.0:
-        return
+        return None
     tau = np.where(known, time - np.min(time[known]), 0.0) / float(np.ptp(time[known]))
     number = np.pi * (np.arange(min(int(np.sum(known)), _MODES)) + 0.5)
     waves = np.sin(number * tau[:, np.newaxis])
-    for power in _POWERS:
-        shapes = (waves / number ** power)[linear.pose]
-        modes = np.hstack([linear.offset[:, [axis]] * shapes for axis in range(3)])
-        modes = modes - linear.onto @ (linear.onto.T @ modes)
-        values, vectors = np.linalg.eigh(modes.T @ modes)
-        kept = values > 1e-10 * values[-1]
-        if np.any(kept):
-            yield Process(modes @ (vectors[:, kept] / np.sqrt(values[kept])),
-                          values[kept] / values[-1])
+    shapes = (waves / number)[linear.pose]
+    modes = np.hstack([linear.offset[:, [axis]] * shapes for axis in range(3)])
+    modes = modes - linear.onto @ (linear.onto.T @ modes)
+    values, vectors = np.linalg.eigh(modes.T @ modes)
+    kept = values > 1e-10 * values[-1]
+    if not np.any(kept):
+        return None
+    return Process(modes @ (vectors[:, kept] / np.sqrt(values[kept])), values[kept] / values[-1])
 
 
 def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
@@ -145,15 +136,32 @@ def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
     rss = float(linear.residual @ linear.residual) - taken @ along ** 2 - explained
     dof = linear.dof - chosen.onto.shape[1]
     allowed = (rss >= _LEAST_WHITE * dof if linear.worth else _RATIOS <= _LARGEST_RATIO)
-    allowed = allowed | (_RATIOS == _RATIOS[0])
+    allowed[0] = True
     weight = linear.worth + linear.dof
     deviance = np.sum(np.log(spread), axis=1) + weight * np.log(
         (linear.worth + np.maximum(rss, 1e-300)) / (linear.worth + chosen.rss + 1e-300))
     best = int(np.argmin(np.where(allowed, deviance, np.inf)))
     fall = float(-deviance[best])
-    return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear), fall)
+    return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear),
+                fall - _fall_by_scatter(linear, chosen))
+
+
+def _fall_by_scatter(linear: Linear, chosen: Set) -> float:
+    """
+    Return twice the logarithm of the likelihood ratio of an offset that scatters.
+
+    Poses that repeat worse than their samples have the same additional variance in g, which shows
+    most where the samples vary little. This is no walk.
+
+    """
+    size = np.sum(linear.offset ** 2, axis=1)
+    spread = 1.0 + _RATIOS[:, np.newaxis] * size / max(float(np.max(size)), 1e-300)
+    rss = np.sum(chosen.residual ** 2 / spread, axis=1)
+    deviance = np.sum(np.log(spread), axis=1) + (linear.worth + linear.dof) * np.log(
+        (linear.worth + rss + 1e-300) / (linear.worth + chosen.rss + 1e-300))
+    return max(float(-np.min(deviance)), 0.0)
 
 
 def _charge(linear: Linear) -> float:
-    """Return what a walk costs in the score: its size, and the choice of the process."""
-    return float(np.log(max(linear.dof, 2)) + 2.0 * np.log(len(_POWERS)) + linear.choice)
+    """Return what a walk costs in the score: its size, and its choice among the candidates."""
+    return float(np.log(max(linear.dof, 2)) + linear.choice)

@@ -26,6 +26,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from .curve import carrier_words, curve_parts, draw_curve
 from .style import (
     ACCENT,
     AFTER,
@@ -39,10 +40,10 @@ from .style import (
     SEQUENTIAL,
     styled,
 )
-from ..effects import AXES, effect_named
-from ..table import Floats, Poses
-from ..units import MG
-from ..words import base_words, short
+from .variables import recorded, Variable, variables_of
+from ..effects import effect_named, empirical_parts, VARIABLES
+from ..table import Floats
+from ..words import base_words, curve_unit, short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -135,70 +136,6 @@ def _draw_left_out(disc: Any, left_out: Floats, rows: tuple[int, ...], *, up: bo
             disc.plot(*place, marker='s', markersize=8, fillstyle='none', color=ACCENT, zorder=4)
             disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
                           color=ACCENT, zorder=4)
-
-
-_CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
-
-
-@dataclass(frozen=True)
-class Variable:
-    """
-    A variable for the horizontal axis.
-
-    Parameters
-    ----------
-    label : str
-        Name and unit.
-    values : (n,) array
-        One value per pose.
-    unit_range : bool
-        Whether the range is -1 to 1 by definition.
-
-    """
-
-    label: str
-    values: Floats
-    unit_range: bool = False
-
-
-def variables_of(effect: str, poses_g: Poses, force: Floats) -> list[Variable]:
-    """Return the variables that an effect depends on: one variable, or one per axis."""
-    key = next((name for name in effect_named(effect).needs if name in poses_g), None)
-    if key == 'previous':
-        return [Variable(f'from the previous pose, {axis}', poses_g[key][:, k], True)
-                for k, axis in enumerate(AXES)]
-    if key is None:
-        return [Variable(f'force along {axis} [g]', force[:, k], True)
-                for k, axis in enumerate(AXES)]
-    return [_variable(key, poses_g)]
-
-
-def recorded(poses_g: Poses) -> list[Variable]:
-    """Return the variables of the context that change between poses."""
-    found = [_variable(key, poses_g) for key in _CONTEXT if key in poses_g]
-    return [variable for variable in found if np.ptp(variable.values) > 0.0]
-
-
-def _variable(key: str, poses_g: Poses) -> Variable:
-    values = poses_g[key]
-    if key == 'time':
-        return _time(values)
-    if key == 'std':
-        return Variable('standard deviation of the samples [mg]',
-                        np.sqrt(np.mean(values ** 2, axis=1)) * MG)
-    if key == 'rate':
-        return Variable('angular rate [rad/s]', np.linalg.norm(values, axis=1))
-    label, unit = {'temperature': ('temperature', '°C'), 'supply_voltage': ('supply', 'V')}[key]
-    return Variable(f'{label} [{unit}]', values)
-
-
-def _time(seconds: Floats) -> Variable:
-    since = seconds - np.min(seconds)
-    span = np.max(since)
-    for unit, size in (('h', 3600.0), ('min', 60.0)):
-        if span > 3.0 * size:
-            return Variable(f'time since the first pose [{unit}]', since / size)
-    return Variable('time since the first pose [s]', since)
 
 
 def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
@@ -362,11 +299,29 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
     for stage, words, when, _ in stages if _spread(result) else ():
         title = f'{when.capitalize()}: {words}, {_rms(stage)} mg RMS'
         yield _map(result, stage, f'{name}_sphere_{when}', title, limit_mg)
-    variables = variables_of(after.name, result.poses_g, result.force)
+    variables = _variables_of_step(result, step)
     for stage, words, when, colour in stages:
         title = f'{when.capitalize()}: {words}, {_rms(stage)} mg RMS'
         yield _against(result, stage, variables, f'{name}_variable_{when}', title, limit_mg,
                        colour)
+
+
+def _variables_of_step(result: Refinement, step: int) -> list[Variable]:
+    """Return the variables of the effect of a step, with the shape of the refined model."""
+    name = result.steps[step].name
+    values = result.calibration.model.values.get(name)
+    shape = None if values is None else effect_named(name).split(values)[1]
+    return variables_of(name, result.poses_g, result.force, shape)
+
+
+def of_curve(result: Refinement, step: int) -> Drawing:
+    """Draw the empirical curve of a step."""
+    name = result.steps[step].curve
+    carrier, variable, _ = empirical_parts(name)
+    words = carrier_words(carrier)
+    title = f'{words[0].upper()}{words[1:]} over {VARIABLES[variable]}, with 95 % band'
+    figure = draw_curve(title, variable, curve_parts(result, name), f'm{curve_unit(name)}')
+    return Drawing(f'step{step + 1}_curve', title, figure)
 
 
 def of_remainder(result: Refinement) -> Iterator[Drawing]:
@@ -387,6 +342,8 @@ def all_drawings(result: Refinement) -> Iterator[Drawing]:
     yield ladder(result)
     for step in range(len(result.steps)):
         yield from of_step(result, step)
+        if result.steps[step].curve:
+            yield of_curve(result, step)
     yield from of_remainder(result)
 
 

@@ -15,13 +15,14 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .drawings import Drawing, ladder, of_remainder, of_step
+from .drawings import Drawing, ladder, of_curve, of_remainder, of_step
 from .style import inline_svg
 from .. import __version__
 from ..effects import effect_named
 from ..errors import listed
 from ..files.atomic import write_atomically
 from ..html_table import table
+from ..refine.plan_words import percent
 from ..words import base_words, chance, short, values_of, verdict_words
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ section { border-top: 1px solid #ddd; margin-top: 1.8rem; padding-top: 1.2rem; }
 .verdict { font-size: 1.1rem; font-weight: bold; border-left: 6px solid #0072b2;
   background: #eef5fa; padding: .6rem .9rem; max-width: none; }
 .verdict.unexplained { border-color: #d55e00; background: #fdf2ea; }
+.verdict.described { border-color: #e69f00; background: #fdf6e8; }
 .verdict.no_gap { border-color: #009e73; background: #ebf7f3; }
 .numbers { display: flex; flex-wrap: wrap; gap: .6rem 2.2rem; margin: 1rem 0; }
 .numbers dt { color: #666; font-size: .8rem; }
@@ -147,13 +149,14 @@ def _overview(result: Refinement) -> str:
     head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
     rows = [(str(number), step.effect, _fall(step.gap_before_mg, step.gap_after_mg),
              _fall(step.held_out_before_mg, step.held_out_after_mg), chance(step.p_value),
-             ', '.join(step.rivals) or 'none') for number, step in enumerate(result.steps, 1)]
+             ', '.join(step.likely_rivals) or 'none')
+            for number, step in enumerate(result.steps, 1)]
     return _table(head, rows, 'whole')
 
 
 def _steps(result: Refinement) -> Iterator[str]:
     for number, step in enumerate(result.steps, 1):
-        title = escape(effect_named(step.effect).words.capitalize())
+        title = escape(effect_named(step.name).words.capitalize())
         yield f'<section>\n<h2>{number}. {title}</h2>\n'
         yield f'<p>{_story(step)}</p>\n'
         values = values_of(step)
@@ -161,19 +164,27 @@ def _steps(result: Refinement) -> Iterator[str]:
             yield _table([name for name, _ in values], [[value for _, value in values]],
                          'whole')
         yield _figures(of_step(result, number - 1), 'pair')
+        if step.curve:
+            yield _figures([of_curve(result, number - 1)], 'wide')
         yield '</section>\n'
 
 
 def _story(step: Step) -> str:
     """Return a text about the location of the disagreement, and the effect on the residual."""
-    rivals = f' These poses cannot distinguish it from {", ".join(map(_code, step.rivals))}.' if (
+    rivals = f' These poses cannot distinguish it from {_rivals(step)}.' if (
         step.rivals) else ''
-    return (f'{_code(step.effect)} ({escape(effect_named(step.effect).term)}). Found '
+    return (f'{_code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
             f'{escape(step.where)}. With this effect the residual decreases from '
             f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
             f'and the held-out residual from {short(step.held_out_before_mg)} to '
             f'{short(step.held_out_after_mg)} mg; '
             f'<span class="whole">{escape(chance(step.p_value))}</span>.{rivals}')
+
+
+def _rivals(step: Step) -> str:
+    """Return the rivals of a step with their probabilities."""
+    return ', '.join(f'{_code(name)} ({percent(step.probabilities[name])})'
+                     for name in step.rivals)
 
 
 def _remainder(result: Refinement) -> Iterator[str]:

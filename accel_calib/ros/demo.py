@@ -17,6 +17,7 @@ from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+import math
 import os
 from pathlib import Path
 import random
@@ -32,7 +33,7 @@ import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -50,7 +51,7 @@ _CHECKED, _LEAST_SAMPLES = 5, 100
 _PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
 
 
-_Spin = Callable[[Callable[[], bool], str], None]
+Spin = Callable[[Callable[[], bool], str], None]
 """Function that spins until a condition is true; the text names the condition in errors."""
 
 
@@ -84,15 +85,17 @@ class Outcome:
     seconds: float
 
 
-class _User(Node):
+class User(Node):
     """A node that receives the messages of both nodes and calls the calibrator."""
 
     def __init__(self) -> None:
         super().__init__('demo')
         self.poses = 0
+        self.temperature = math.nan
         self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
             'raw': {}, 'corrected': {}, 'truth': {}}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, qos.LATCHED)
+        self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
@@ -100,6 +103,9 @@ class _User(Node):
 
     def _on_poses(self, markers: MarkerArray) -> None:
         self.poses = sum(marker.ns == 'poses' for marker in markers.markers)
+
+    def _on_temperature(self, message: Temperature) -> None:
+        self.temperature = message.temperature
 
     def _keeper(self, name: str) -> Callable[[Any], None]:
         kept = self.messages[name]
@@ -121,7 +127,7 @@ def _has_passed(instant: float) -> bool:
     return time.monotonic() > instant
 
 
-def _at_least(user: _User, count: int) -> bool:
+def _at_least(user: User, count: int) -> bool:
     return user.poses >= count
 
 
@@ -151,28 +157,28 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        _set_environment(Path(folder))
+        set_environment(Path(folder))
         report('starting a simulated Imu, turned by hand, and the calibrator node')
         processes = [
-            stack.enter_context(_process('node', {'sensor': 'demo'})),
-            stack.enter_context(_process('simulator', {
+            stack.enter_context(running('node', {'sensor': 'demo'})),
+            stack.enter_context(running('simulator', {
                 'poses': POSES, 'dwell': _DWELL, 'turn': _TURN, 'mounting': _MOUNTING,
                 'effects': _EFFECTS, 'loop': True, 'wait': 10.0}))]
-        user, spin = stack.enter_context(_user(processes))
+        user, spin = stack.enter_context(user_of(processes))
         spin(lambda: user.poses > 0, 'the first pose')
         for count in range(4, POSES + 1, 4):
             spin(partial(_at_least, user, count), f'{count} poses')
             report(f'captured {count} poses')
-        report(f'~/fit: {_call(user, spin, "fit")}')
+        report(f'~/fit: {call(user, spin, "fit")}')
         spin(user.is_flat, 'the flat pose')
         report(f'~/set_level: {_call_patiently(user, spin, "set_level")}')
         for messages in user.messages.values():
             messages.clear()
-        spin(lambda: len(_rests(user)) > _CHECKED, f'{_CHECKED} more rests')
-        return _outcome(_rests(user)[1:], time.monotonic() - began)
+        spin(lambda: len(rests_of(user)) > _CHECKED, f'{_CHECKED} more rests')
+        return _outcome(rests_of(user)[1:], time.monotonic() - began)
 
 
-def _set_environment(folder: Path) -> None:
+def set_environment(folder: Path) -> None:
     """Isolate the demonstration: own domain, local machine only, own files."""
     os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
                       ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
@@ -180,8 +186,8 @@ def _set_environment(folder: Path) -> None:
 
 
 @contextmanager
-def _process(command: str, parameters: dict[str, Any]
-             ) -> Iterator[subprocess.Popen[bytes]]:
+def running(command: str, parameters: dict[str, Any]
+            ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a node in a process, and end it."""
     given = [part for name, value in parameters.items()
              for part in ('-p', f'{name}:={_in_yaml(value)}')]
@@ -204,10 +210,10 @@ def _in_yaml(value: Any) -> str:
 
 
 @contextmanager
-def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User, _Spin]]:
+def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User, Spin]]:
     """Yield the user of the nodes, and a function that spins until a condition is true."""
     rclpy.init(args=[])
-    user = _User()
+    user = User()
     executor = SingleThreadedExecutor()
     executor.add_node(user)
 
@@ -232,7 +238,7 @@ def _user(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[_User,
         rclpy.try_shutdown()
 
 
-def _request(user: _User, spin: _Spin, name: str) -> Trigger.Response:
+def _request(user: User, spin: Spin, name: str) -> Trigger.Response:
     client = user.create_client(Trigger, f'calibrator/{name}')
     spin(client.service_is_ready, f'the service {name}')
     future = client.call_async(Trigger.Request())
@@ -241,7 +247,7 @@ def _request(user: _User, spin: _Spin, name: str) -> Trigger.Response:
     return future.result()
 
 
-def _call(user: _User, spin: _Spin, name: str) -> str:
+def call(user: User, spin: Spin, name: str) -> str:
     """Call a service of the calibrator; raise DemoError if it fails."""
     answer = _request(user, spin, name)
     if not answer.success:
@@ -249,17 +255,17 @@ def _call(user: _User, spin: _Spin, name: str) -> str:
     return str(answer.message)
 
 
-def _call_patiently(user: _User, spin: _Spin, name: str) -> str:
+def _call_patiently(user: User, spin: Spin, name: str) -> str:
     """Call a service repeatedly until the sensor has been still for long enough."""
     while user.is_flat():
         answer = _request(user, spin, name)
         if answer.success:
             return str(answer.message)
         spin(partial(_has_passed, time.monotonic() + _AGAIN), 'a moment')
-    return _call(user, spin, name)
+    return call(user, spin, name)
 
 
-def _rests(user: _User) -> list[dict[str, Floats]]:
+def rests_of(user: User) -> list[dict[str, Floats]]:
     """Return the means of raw, corrected and true acceleration over each complete rest [g]."""
     common = sorted(set.intersection(*(set(kept) for kept in user.messages.values())))
     if len(common) < 2:
@@ -281,11 +287,11 @@ def _outcome(rests: list[dict[str, Floats]], seconds: float) -> Outcome:
         errors[name] = (sizes - 1.0) * MG
         cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
         tilts[name] = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return Outcome(len(rests), _rms(errors['raw']), _rms(errors['corrected']),
+    return Outcome(len(rests), rms(errors['raw']), rms(errors['corrected']),
                    float(np.max(np.abs(errors['raw']))),
-                   float(np.max(np.abs(errors['corrected']))), _rms(tilts['raw']),
-                   _rms(tilts['corrected']), seconds)
+                   float(np.max(np.abs(errors['corrected']))), rms(tilts['raw']),
+                   rms(tilts['corrected']), seconds)
 
 
-def _rms(values: Floats) -> float:
+def rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values ** 2)))

@@ -27,6 +27,7 @@ from std_msgs.msg import Header
 from . import qos
 from .declare import declared
 from ..calibrate.mounting import mounting_of
+from ..model import predict
 from ..session.settings import parameter
 from ..simulate import model_with, parse_effect, simulate_recording
 from ..sphere import spread_directions
@@ -36,6 +37,9 @@ from ..units import STANDARD_GRAVITY
 _FLAT = np.array([[0.0, 0.0, 1.0]])
 _TEMPERATURE_EVERY = 0.1
 """Interval between temperature messages [s]."""
+
+_GOLDEN = 0.618
+"""Stride between poses in mixed order, relative to their number: about the golden ratio."""
 
 _LONGEST_TICK = 0.005
 """Longest interval between checks of the clock [s]."""
@@ -49,6 +53,9 @@ class SimulatorSettings:
     rate: float = parameter(200.0, 'Messages per second [Hz]', limits=(1.0, 10000.0))
     poses: int = parameter(12, 'Number of poses, spread evenly over the sphere', limits=(1, 1000))
     dwell: float = parameter(3.0, 'Duration of each pose [s]', limits=(0.01, 3600.0))
+    mixed: bool = parameter(
+        False, 'Take the poses in mixed order, so that direction is not correlated with time or '
+        'temperature')
     turn: float = parameter(1.0, 'Duration of each turn between poses [s]', limits=(0.01, 3600.0))
     wait: float = parameter(
         0.0, 'Longest time to wait for subscribers before the first pose [s]. 0: start at once',
@@ -70,6 +77,9 @@ class SimulatorSettings:
     gravity: float = parameter(STANDARD_GRAVITY, 'Local gravity [m/s²]', limits=(1.0, 30.0))
     temperature: list[float] = parameter(
         [25.0, 25.0], 'Temperature of the first and of the last sample [°C]')
+    temperature_period: float = parameter(
+        0.0, 'Period in which the temperature swings between both values of temperature [s]. 0: '
+        'it changes evenly from the first to the last', limits=(0.0, 86400.0))
     seed: int = parameter(1, 'Seed of the noise', limits=(0, 2 ** 31 - 1))
 
 
@@ -155,14 +165,36 @@ def recording_of(settings: SimulatorSettings) -> Recording:
     """
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of([math.radians(angle) for angle in settings.mounting])
-    effects = dict(parse_effect(text) for text in settings.effects if text)
+    model = model_with(dict(parse_effect(text) for text in settings.effects if text), rotation)
     flat = [_FLAT] * settings.flat_first, [_FLAT] * settings.flat_last
-    directions = np.concatenate([*flat[0], spread_directions(settings.poses), *flat[1]])
-    return simulate_recording(
-        model_with(effects, rotation), directions,
-        np.random.default_rng(settings.seed), noise_g=settings.noise / settings.gravity,
-        rate_hz=settings.rate, dwell=settings.dwell, turn=settings.turn,
-        gyro_noise=settings.gyro_noise, temperatures=settings.temperature)
+    spread = spread_directions(settings.poses)
+    directions = np.concatenate([*flat[0], _mixed(spread) if settings.mixed else spread, *flat[1]])
+    ideal = simulate_recording(
+        model_with({}, rotation), directions, np.random.default_rng(settings.seed),
+        noise_g=settings.noise / settings.gravity, rate_hz=settings.rate, dwell=settings.dwell,
+        turn=settings.turn, gyro_noise=settings.gyro_noise)
+    noise = ideal.reading - ideal['reference'] @ rotation.T
+    known = {**ideal.columns, 'temperature': _temperatures(settings, ideal['time']),
+             'std': np.full_like(noise, settings.noise / settings.gravity)}
+    reading = predict(model, ideal['reference'], known) + noise
+    return ideal.with_columns(reading=reading, temperature=known['temperature'])
+
+
+def _mixed(directions: Floats) -> Floats:
+    """Return directions in an order of which every part is spread over the sphere."""
+    count = len(directions)
+    stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
+                  if math.gcd(step, count) == 1)
+    return directions[np.arange(count) * stride % count]
+
+
+def _temperatures(settings: SimulatorSettings, time: Floats) -> Floats:
+    """Return the temperature at each sample, which starts at the first value."""
+    first, last = settings.temperature
+    if not settings.temperature_period:
+        return np.linspace(first, last, len(time))
+    return first + (last - first) * (0.5 - 0.5 * np.cos(
+        2.0 * np.pi * time / settings.temperature_period))
 
 
 def _empty_message(settings: SimulatorSettings) -> Imu:

@@ -87,7 +87,8 @@ class Output:
             frame_id = output_frame(calibration, layout.frame_id, settings.output_frame_id)
             self.rewriter = Rewriter(
                 layout, calibration, output_scale(calibration, settings.gravity),
-                settings.gravity, frame_id, active.noise if fills else None)
+                settings.gravity, frame_id, active.noise if fills else None,
+                active.temperatures.stream(calibration.model))
 
 
 class Stream:

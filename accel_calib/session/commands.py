@@ -164,6 +164,9 @@ class Commands:
                 raise RefusedFitError(f'{story(refinement)}; not used: {refinement.refusal[0]}',
                                       refinement.refusal[1])
             words = [story(refinement), change_words(before, refinement.calibration)]
+            session.guide.follow(refinement.plan.poses)
+            if refinement.plan.poses:
+                session.fitted_poses = 0  # more poses are asked for
             return self._use(refinement.calibration, not_stored, words, offered=offered)
 
         return Job(run, finish)

@@ -11,8 +11,8 @@ therefore stays the same, although the average of its pose still changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
@@ -20,8 +20,12 @@ import numpy as np
 
 from ..calibrate import NextPose
 from ..errors import InputError
+from ..refine import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
+
+_TAKEN = math.cos(math.radians(17.0))
+"""A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
 
 class _Figure(NamedTuple):
@@ -147,30 +151,53 @@ class Plan:
 
 
 class Guide:
-    """
-    The next pose, and the lines about captured poses.
-
-    Attributes
-    ----------
-    plan : Plan or None
-        The next pose; None before the first choice.
-
-    """
+    """The next pose, and the lines about captured poses."""
 
     def __init__(self) -> None:
-        self.plan: Plan | None = None
+        self._plan: Plan | None = None
+        self._planned: tuple[PlannedPose, ...] = ()
+        self._all_taken = False
+        self._begun = 0
         self._count = 0
         self._rest = -math.inf
 
     @property
+    def plan(self) -> Plan | None:
+        """
+        Return the next pose; None before the first choice.
+
+        While poses of a refinement are followed, it is the next of them.
+
+        """
+        if self._plan is None or not self._planned:
+            return self._plan
+        return replace(self._plan, asked=_as_asked(self._planned, self._plan))
+
+    @plan.setter
+    def plan(self, plan: Plan | None) -> None:
+        self._plan = plan
+        if plan is None or plan.poses < self._begun:
+            self.follow(())
+        elif self._planned:
+            new = plan.up[self._begun:]
+            left = tuple(each for each in self._planned if not np.any(new @ each.up >= _TAKEN))
+            self._planned, self._all_taken = left, not left
+
+    def follow(self, planned: Sequence[PlannedPose]) -> None:
+        """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
+        self._planned, self._all_taken, self._begun = tuple(planned), False, self.poses
+
+    @property
     def advice(self) -> str:
         """Return what to do next; empty before the first choice."""
+        if self._all_taken:
+            return 'all poses of the plan are taken; call ~/refine'
         return '' if self.plan is None else next_action(self.plan.asked)
 
     @property
     def poses(self) -> int:
         """Return the number of poses for which the next pose was chosen."""
-        return 0 if self.plan is None else self.plan.poses
+        return 0 if self._plan is None else self._plan.poses
 
     def added(self, count: int) -> int:
         """Note this number of poses, and return by how many it has changed."""
@@ -210,6 +237,14 @@ class Guide:
         if done and len(poses) > asked.total:
             return f'pose {len(poses)}{noise}'
         return f'pose {len(poses)} of about {asked.total}{noise}, next: {self.advice}'
+
+
+def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
+    """Return the first of some planned poses as the next pose."""
+    first = planned[0]
+    where = f' {first.conditions}' if first.conditions else ''
+    return NextPose(np.array(first.up), f'hold {first.words}{where}, {first.purpose}',
+                    plan.asked.error, plan.poses + len(planned), fits=False)
 
 
 def next_action(asked: NextPose) -> str:

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from .stream_statistics import SILENT, StreamStatistics
-from ..calibrate import GyroBias, SampleNoise
+from ..calibrate import GyroBias, SampleNoise, USES_LIMIT
 from ..errors import counted
 from ..monitor import Drift, status
 from ..table import Floats
@@ -202,8 +202,8 @@ def _calibration(health: Health) -> Finding:
         return Finding('calibration', Level.WARN, 'no calibration yet, captured '
                        f'{counted(health.poses, "pose")}: {health.next_pose or "turn the sensor"}')
     if health.outside:
-        return Finding('calibration', Level.WARN, f'{health.outside}: the correction uses the '
-                       'limit of the range; capture poses there and call ~/refine')
+        return Finding('calibration', Level.WARN, f'{health.outside}: {USES_LIMIT}; '
+                       'capture poses there and call ~/refine')
     return Finding('calibration', Level.OK, health.calibration)
 
 

@@ -31,7 +31,7 @@ from .settings import CalibratorSettings, capture_settings
 from .store import load, Loaded, writing_advice
 from .stream_statistics import SILENT, StreamStatistics
 from .work import is_partial, plan_for, title
-from ..calibrate import Calibration, with_given_mounting
+from ..calibrate import Calibration, Outside, outside, USES_LIMIT, with_given_mounting
 from ..calibrate.mounting import mounting_of, mounting_words
 from ..effects import Context
 from ..errors import AccelCalibError, counted, InputError
@@ -102,6 +102,7 @@ class Session:
         self._still_since = math.nan
         self._reported, self._reported_at = '', -math.inf
         self._auto_fit_at = -math.inf
+        self._left: frozenset[str] = frozenset()
         self._events: list[Event] = []
         if settings.sensor or settings.calibration_file:
             store = self.files.take(settings.sensor)
@@ -334,7 +335,28 @@ class Session:
         if store is not None:
             self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
         self._report_stream()
+        self._report_outside()
         self._auto_fit()
+
+    def _outside(self) -> dict[str, Outside]:
+        """Return the quantities that are outside of the range of the calibration now."""
+        calibration = self.active.calibration
+        if calibration is None:
+            return {}
+        now = {**self.present_context(), 'std': np.zeros((1, 3)), **{
+            key: np.array([value]) for key, value in self.active.temperatures.columns.items()}}
+        return {key: each for key, each in outside(calibration, now).items() if each.count}
+
+    def _report_outside(self) -> None:
+        """Log once when a quantity leaves the range of the calibration."""
+        found = self._outside()
+        for key, each in found.items():
+            if key not in self._left:
+                self._log('warning', f'{each.name} has left the range of the calibration, '
+                          f'{each.range_words(each.low, each.high)}: it is '
+                          f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
+                          once_in=_FAULT_AGAIN)
+        self._left = frozenset(found)
 
     def _report_stream(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""
@@ -456,9 +478,8 @@ class Session:
             sensor=self.sensor, state=self._state(), problem=self.problem, topic=self.topic,
             publishers=self.publishers,
             calibration='' if active.calibration is None else title(active.calibration),
-            outside='' if active.calibration is None else _outside(
-                active.calibration, {'temperature': self.statistics.temperature,
-                                     'time': self.statistics.stamp}),
+            outside='; '.join(each.words for key, each in self._outside().items()
+                              if key != 'std'),
             file='' if store is None else str(store.calibration),
             writable=store is None or store.is_writable(),
             statistics=self.statistics, length=self.length_g(), rest_ago=rest_ago,
@@ -489,16 +510,6 @@ class Session:
 
 def _doubtful(poses: Poses) -> int:
     return int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0
-
-
-def _outside(calibration: Calibration, now: dict[str, float]) -> str:
-    """Return a text about context outside of the ranges of the calibration; empty if none."""
-    found = []
-    for key, (low, high) in calibration.ranges.items():
-        if key in now and not low <= now[key] <= high and math.isfinite(now[key]):
-            found.append(f'{key} is {now[key]:.4g}, but the range of the calibration is {low:.4g} '
-                         f'to {high:.4g}')
-    return '; '.join(found)
 
 
 def _check_frames(settings: CalibratorSettings) -> None:

@@ -12,6 +12,7 @@ the lag that the sensor has, and not in equilibrium.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from itertools import islice
 
 import numpy as np
@@ -68,6 +69,11 @@ class TemperatureHistory:
             self._points.append((now, float(temperature[-1])))
             if self._stream is not None:
                 self._columns.append((now, self._stream.value))
+
+    @property
+    def columns(self) -> Mapping[str, float]:
+        """Return the present columns of the followed model; empty if it needs none."""
+        return {} if self._stream is None else self._stream.value
 
     def stream(self, model: Model) -> ThermalStream | None:
         """Return the lag and rate for a model after this history; None if it needs none."""

@@ -220,7 +220,7 @@ def story(refinement: Refinement) -> str:
     """Return the result of a refinement as one line."""
     lines = [f'{verdict_words(refinement).rstrip(".")}; {residual_words(refinement)}']
     for step in refinement.steps:
-        rivals = f' (or {", ".join(step.rivals)})' if step.rivals else ''
+        rivals = f' (or {", ".join(step.likely_rivals)})' if step.rivals else ''
         lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '
                      f'{step.gap_after_mg:.3f} mg, {step.where}')
     if refinement.disturbed_poses:

@@ -1,0 +1,237 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Empirical curves: their names, their form, the search for them, and their storage."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from accel_calib.effects import (
+    CARRIERS,
+    effect_named,
+    empirical_name,
+    empirical_parts,
+    is_effect,
+    MODES,
+    VARIABLES,
+)
+from accel_calib.errors import StoredCalibrationError
+from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
+from accel_calib.model import correct, Model, parameter_basis, parameter_names, predict
+from accel_calib.refine import refine
+from accel_calib.refine.curves import best_curve, is_curve
+from accel_calib.refine.state import beginning, fitted_state
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import sensor
+
+COUNT = 100
+G = units_of('g')
+OLD = Path(__file__).parent / 'data' / 'calibration_1_refined.yaml'
+CURVES = {
+    'empirical-offset.x-temperature-2-3': [4e-3, -2e-3, 15.0, 35.0],
+    'empirical-gain-time-1-4': [*np.linspace(-4e-3, 5e-3, 6), 0.0, 3000.0],
+    'empirical-cross_axis.yz-supply_voltage-5': [3e-3, 3.0, 3.6],
+    'empirical-force-std-1': [5e-3, 1e-3, 5e-3],
+    'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6),
+    'empirical-offset.z-temperature_rate-1': [2e-3, -0.01, 0.01]}
+
+
+def context_of(count, rng):
+    return {'time': np.arange(count) * 30.0, 'temperature': rng.uniform(10.0, 40.0, count),
+            'supply_voltage': rng.uniform(2.9, 3.7, count),
+            'std': rng.uniform(1e-3, 6e-3, (count, 3)),
+            'temperature_rate': rng.uniform(-0.02, 0.02, count)}
+
+
+def with_curve(added_g, seed=1):
+    """Return poses with an addition to the x axis over the temperature, and their sensor."""
+    rng = np.random.default_rng(seed)
+    context = {'time': np.arange(COUNT) * 30.0, 'temperature': rng.uniform(10.0, 40.0, COUNT)}
+    model = sensor(rng)
+    poses = simulate_poses(model, random_directions(COUNT, rng), rng, context=context)
+    along = np.outer(added_g(context['temperature']), [1.0, 0.0, 0.0])
+    return poses.with_columns(reading=poses.reading + along), model
+
+
+def hump(temperature):
+    """Return a hump of 8 mg at 28 °C, which no effect of the catalogue has."""
+    return 8e-3 * np.exp(-0.5 * ((temperature - 28.0) / 4.0) ** 2)
+
+
+def base_of(poses):
+    return beginning(poses, Model({name: np.zeros(3)
+                                   for name in ('offset', 'axis_gain', 'cross_axis')}))
+
+
+@pytest.mark.parametrize('variable', VARIABLES)
+@pytest.mark.parametrize('carrier', [*CARRIERS, 'gain.z', 'cross_axis.yz'])
+def test_the_name_of_a_curve_is_read_back(carrier, variable):
+    name = empirical_name(carrier, variable, (1, 5, MODES))
+    if variable == 'force' and carrier != 'offset':
+        assert not is_effect(name)
+        return
+    assert is_curve(name)
+    assert empirical_parts(name) == (carrier, variable, (1, 5, MODES))
+    effect = effect_named(name)
+    parts = 1 if '.' in carrier else len(CARRIERS[carrier])
+    assert len(effect.parameters) == 3 * parts
+    assert len(set(effect.parameters)) == len(effect.parameters)
+    assert effect.needs == (() if variable == 'force' else (variable,))
+
+
+@pytest.mark.parametrize('name', [
+    'empirical', 'empirical-', 'empirical-offset', 'empirical-offset-temperature',
+    'empirical-offset-temperature-', 'empirical-offset-temperature-0',
+    f'empirical-offset-temperature-{MODES + 1}', 'empirical-offset-temperature-one',
+    'empirical-offset-temperature--1', 'empirical-offset-temperature-1.5',
+    'empirical-offset-temperature-\u00b2', 'empirical-offset-temperature-1-1',
+    'empirical-offset-weather-1', 'empirical-mood-temperature-1', 'empirical-offset.q-time-1',
+    'empirical-offset.-time-1', 'empirical-offset.x.y-time-1', 'empirical-gain-force-1',
+    'curve-offset-time-1', 'offset-time-1'])
+def test_a_name_that_is_no_curve_is_refused(name):
+    assert not is_effect(name)
+    with pytest.raises(ValueError, match='expected one of'):
+        Model({name: np.zeros(3)})
+
+
+@pytest.mark.parametrize('name', CURVES)
+def test_predict_and_correct_undo_each_other_with_a_curve(name):
+    rng = np.random.default_rng(2)
+    model = Model({**sensor(rng).values, name: np.array(CURVES[name])})
+    force, context = random_directions(40, rng), context_of(40, rng)
+    reading = predict(model, force, context)
+    np.testing.assert_allclose(correct(model, reading, context), force, atol=1e-12)
+    plain = Model({key: values for key, values in model.values.items() if key != name})
+    moved = np.linalg.norm(reading - predict(plain, force, context), axis=1)
+    assert np.max(moved) > 1e-3
+
+
+@pytest.mark.parametrize('name', [name for name in CURVES if '-force-' not in name])
+def test_a_curve_is_constant_outside_of_its_range(name):
+    model = Model({name: np.array(CURVES[name])})
+    variable = empirical_parts(name)[1]
+    low, high = CURVES[name][-2:]
+    force = np.tile([0.6, -0.48, 0.64], (5, 1))
+    at = np.array([low - 1.0, low, (low + high) / 2.0, high, high + 1e3 * abs(high)])
+    at = np.maximum(at, 0.0) if variable == 'std' else at
+    reading = predict(model, force, {variable: np.column_stack([at] * 3) if variable == 'std'
+                                     else at})
+    np.testing.assert_array_equal(reading[0], reading[1])
+    np.testing.assert_array_equal(reading[4], reading[3])
+    if not name.endswith(('-2-3', '-5')):
+        assert np.max(np.abs(reading[3] - reading[1])) > 1e-3
+
+
+def test_a_curve_over_the_force_is_constant_beyond_1_g():
+    model = Model({'empirical-offset-force-1-3': CURVES['empirical-offset-force-1-3']})
+    force = np.array([[1.0, -1.0, 0.2], [1.7, -3.0, 0.2]])
+    added = predict(model, force, {}) - force
+    np.testing.assert_allclose(added[1], added[0], atol=1e-15)
+
+
+def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
+    name = 'empirical-offset.x-temperature-2-3'
+    temperature = np.linspace(15.0, 35.0, 9)
+    added = predict(Model({name: np.array(CURVES[name])}), np.zeros((9, 3)),
+                    {'temperature': temperature})
+    share = (temperature - 15.0) / 20.0
+    np.testing.assert_allclose(added[:, 0], 4e-3 * np.cos(2.0 * np.pi * share)
+                               - 2e-3 * np.cos(3.0 * np.pi * share), atol=1e-15)
+    np.testing.assert_array_equal(added[:, 1:], 0.0)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_curve_is_recovered_within_its_uncertainty(seed):
+    def form(temperature):
+        share = (temperature - low) / (high - low)
+        return 5e-3 * np.cos(2.0 * np.pi * share) - 4e-3 * np.cos(5.0 * np.pi * share)
+
+    warm = with_curve(np.zeros_like, seed)[0]['temperature']
+    low, high = np.min(warm), np.max(warm)
+    poses, truth = with_curve(form, seed)
+    state = base_of(poses)
+    curve = best_curve(state, poses, ())
+    carrier, variable, modes = empirical_parts(curve.name)
+    assert carrier in ('offset', 'offset.x')
+    assert (variable, {2, 5} <= set(modes), curve.out) == ('temperature', True, ())
+    fit = fitted_state(Model({**state.model.values, curve.name: curve.values}), poses).fit
+    at = {'temperature': np.linspace(low, high, 21)}
+    nothing = np.zeros((21, 3))
+    error = predict(fit.model, nothing, at)[:, 0] - predict(truth, nothing, at)[:, 0] - form(
+        at['temperature'])
+    basis = parameter_basis(fit.model, nothing, at)[:, 0]
+    deviation = np.sqrt(np.einsum('np,pq,nq->n', basis, fit.covariance, basis))
+    assert np.max(np.abs(error) / deviation) < 4.0
+    assert np.max(deviation) < 5e-4
+
+
+def test_a_hump_over_the_temperature_is_located_and_described():
+    poses, _ = with_curve(hump)
+    found = refine(poses, G, base='10')
+    assert found.verdict == 'described'
+    assert [step.effect for step in found.steps] == ['empirical']
+    step = found.steps[0]
+    assert 'offset' in step.where
+    assert 'temperature' in step.where
+    assert 'no known effect has this form' in step.where
+    assert step.p_value < 1e-6
+    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
+
+
+def test_noise_alone_has_no_curve():
+    for seed in range(5):
+        poses, _ = with_curve(np.zeros_like, seed)
+        assert best_curve(base_of(poses), poses, ()) is None
+
+
+def test_poses_that_repeat_badly_have_no_curve():
+    for seed in range(5):
+        poses, _ = with_curve(np.zeros_like, seed)
+        scatter = 2e-3 * np.random.default_rng(seed).normal(size=(COUNT, 3))
+        poses = poses.with_columns(reading=poses.reading + scatter)
+        assert best_curve(base_of(poses), poses, ()) is None
+
+
+def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits():
+    poses, _ = with_curve(hump)
+    calibration = refine(poses, G, base='10').calibration
+    name = next(name for name in calibration.model.values if is_curve(name))
+    text = format_calibration(calibration)
+    found = parse_calibration(text, 'calibration.yaml')
+    assert f'  {name}: ' in text
+    assert format_calibration(found) == text
+    np.testing.assert_array_equal(found.model.vector, calibration.model.vector)
+    at = {'temperature': np.array([5.0, 20.0, 28.0, 60.0])}
+    reading = np.tile([0.1, 0.2, 0.97], (4, 1))
+    np.testing.assert_array_equal(found.correct(reading, at), calibration.correct(reading, at))
+
+
+def test_a_stored_curve_with_an_impossible_name_is_refused():
+    poses, _ = with_curve(hump)
+    calibration = refine(poses, G, base='10').calibration
+    name = next(name for name in calibration.model.values if is_curve(name))
+    text = format_calibration(calibration).replace(name, name.replace('temperature', 'weather'))
+    with pytest.raises(StoredCalibrationError, match='is damaged .* expected a whole calibration'):
+        parse_calibration(text, 'calibration.yaml')
+
+
+def test_parameters_of_a_curve_belong_to_it():
+    names = parameter_names(('offset', 'empirical-gain.z-time-1-2'))
+    assert names[3:] == tuple(f'empirical-gain.z-time-1-2.{part}'
+                              for part in ('z_1', 'z_2', 'low', 'high'))
+
+
+def test_a_calibration_of_earlier_releases_is_read_as_before():
+    text = OLD.read_text(encoding='utf-8')
+    calibration = parse_calibration(text, OLD.name)
+    assert not any(is_curve(name) for name in calibration.model.values)
+    assert calibration.model.lags == {}
+    again = parse_calibration(format_calibration(calibration), 'again.yaml')
+    np.testing.assert_array_equal(again.model.vector, calibration.model.vector)
+    np.testing.assert_array_equal(again.covariance, calibration.covariance)
+    assert format_calibration(replace(again, date=calibration.date)) == format_calibration(
+        calibration)

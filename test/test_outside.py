@@ -1,0 +1,143 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Samples outside of the range of a calibration are reported, by `apply` and by the session."""
+
+from dataclasses import replace
+
+from accel_calib.calibrate import fit_poses, joined_ranges, outside
+from accel_calib.cli.main import main
+from accel_calib.effects import empirical_name
+from accel_calib.files import write_calibration, write_table
+from accel_calib.model import Model
+from accel_calib.session import CalibratorSettings, Log, Session
+from accel_calib.simulate import model_with, simulate_poses, simulate_recording
+from accel_calib.sphere import spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import sensor
+from test_bag import write_bag
+
+UNITS = units_of('m/s2')
+LOW, HIGH = 20.0, 30.0
+
+
+def calibrated(values, **context):
+    """Return a calibration of poses at 20 to 30 °C, with these further effects."""
+    rng = np.random.default_rng(3)
+    known = {'temperature': np.linspace(LOW, HIGH, 20), 'time': 100.0 + 30.0 * np.arange(20),
+             **context}
+    poses = simulate_poses(sensor(rng), spread_directions(20), rng, context=known)
+    poses = poses.with_columns(reading=UNITS.from_g(poses.reading), std=UNITS.from_g(poses['std']))
+    found = fit_poses(poses, UNITS, model='10')
+    model = Model({**found.model.values, **values})
+    covariance = np.zeros((len(model.vector),) * 2)
+    size = len(found.covariance)
+    covariance[:size, :size] = found.covariance
+    covariance[size:, size:] = 1e-12 * np.eye(len(model.vector) - size)
+    return replace(found, model=model, covariance=covariance)
+
+
+TCO = {'offset_temperature': np.array([1e-3, 0.0, 0.0])}
+
+
+@pytest.fixture
+def recording():
+    """Return samples in g whose temperature rises from 25 to 41 °C."""
+    return simulate_recording(
+        model_with({'offset': np.array([0.03, -0.02, 0.04])}), spread_directions(8),
+        np.random.default_rng(7), rate_hz=50.0, dwell=2.0, temperatures=(25.0, 41.0))
+
+
+def in_si(recording):
+    return replace(recording.with_columns(**{key: UNITS.from_g(recording[key])
+                                             for key in ('reading', 'reference')}), units='m/s2')
+
+
+def test_quantities_are_counted_over_blocks():
+    calibration = calibrated(TCO)
+    warm = np.array([25.0, 29.0, 35.0, np.nan, 41.0])
+    whole = outside(calibration, {'temperature': warm})
+    parts = joined_ranges(outside(calibration, {'temperature': warm[:2]}),
+                          outside(calibration, {'temperature': warm[2:]}))
+    assert parts == whole
+    found = whole['temperature']
+    assert (found.count, found.samples) == (2, 4)
+    assert (found.least, found.most) == (25.0, 41.0)
+    assert joined_ranges({}, whole) == joined_ranges(whole, {}) == whole
+
+
+def test_quantities_inside_are_not_counted():
+    calibration = calibrated(TCO)
+    assert outside(calibration, {'temperature': np.array([LOW, HIGH])})['temperature'].count == 0
+    assert not outside(calibration, {'temperature': np.array([np.nan])})
+    assert not outside(calibrated({}), {'temperature': np.array([80.0])})
+
+
+@pytest.mark.parametrize(('name', 'values', 'known', 'words'), [
+    ('temperature_rate', [0.02, 0.0, 0.0], {'temperature_rate': np.array([0.5])},
+     'rate of temperature is 30 °C/min'),
+    ('offset_drift', [1e-3, 0.0, 0.0, 100.0], {'time': np.array([100.0 + 7200.0])},
+     'time since the start of the calibration is 2 h, but the range of the calibration is '
+     '0 to 0.1583 h'),
+    (empirical_name('offset.x', 'std', [1]), [1e-3, 0.001, 0.02], {'std': np.zeros((1, 3))},
+     'vibration is 0 mg, but the range of the calibration is 1 to 20 mg')])
+def test_each_quantity_is_described_in_its_unit(name, values, known, words):
+    calibration = calibrated({name: np.array(values)})
+    found = [each.words for each in outside(calibration, known).values() if each.count]
+    assert len(found) == 1
+    assert words in found[0]
+
+
+@pytest.mark.parametrize('kind', ['table', 'mcap'])
+def test_apply_says_once_how_many_samples_leave_the_range(kind, recording, tmp_path, capsys):
+    calibration, out = tmp_path / 'calibration.yaml', tmp_path / 'out'
+    write_calibration(calibration, calibrated(TCO))
+    if kind == 'table':
+        path, out = tmp_path / 'recording.csv', tmp_path / 'out.csv'
+        write_table(path, in_si(recording))
+    else:
+        path = write_bag(tmp_path / kind, kind, recording)
+    assert main(['apply', str(path), '-c', str(calibration), '-o', str(out)]) == 0
+    printed = ' '.join(capsys.readouterr().out.split())
+    count = int(np.sum(recording['temperature'] > HIGH))
+    notes = printed.split('note: ')[1:]
+    assert len(notes) == 1
+    stated, of, total, rest = notes[0].split(' ', 3)
+    assert (of, int(total)) == ('of', len(recording))
+    assert int(stated) == pytest.approx(count, abs=0 if kind == 'table' else 60)
+    assert rest.startswith('samples are outside of the range of the calibration: temperature is '
+                           '25 to ')
+    assert 'but the range of the calibration is 20 to 30 °C; the correction uses the limit' in rest
+
+
+def test_apply_says_nothing_inside_of_the_range(recording, tmp_path, capsys):
+    calibration, path = tmp_path / 'calibration.yaml', tmp_path / 'recording.csv'
+    write_calibration(calibration, calibrated(TCO))
+    inside = recording.take(recording['temperature'] < HIGH)
+    write_table(path, in_si(inside))
+    assert main(['apply', str(path), '-c', str(calibration), '-o', str(tmp_path / 'o.csv')]) == 0
+    assert 'note:' not in capsys.readouterr().out
+
+
+def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    path = tmp_path / 'calibration.yaml'
+    write_calibration(path, calibrated({**TCO, 'temperature_rate': np.array([0.0, 0.02, 0.0])}))
+    session = Session(CalibratorSettings(calibration_file=str(path)), '/imu/data_raw', lambda: 0.0)
+    assert session.accepts('imu')
+    rows = np.full((1, 9), np.nan)
+    rows[:, 1:4] = 0.0, 0.0, 9.81
+    told = []
+    for k, warm in enumerate([25.0, 35.0, 36.0, 37.0, 29.0, 29.0, 36.0]):
+        rows[:, 0], rows[:, 7] = 1000.0 + 3000.0 * k, warm
+        session.set_temperature(warm)
+        session.push(rows, 0.0)
+        session.events()
+        session.tick()
+        told.append([event.words for event in session.events() if isinstance(event, Log)
+                     and event.words.startswith('temperature has left')])
+    assert [len(each) for each in told] == [0, 1, 0, 0, 0, 0, 1]
+    assert told[1][0] == ('temperature has left the range of the calibration, 20 to 30 °C: it is '
+                          '35 °C, and the correction uses the limit of the range')

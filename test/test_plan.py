@@ -1,0 +1,229 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plans of poses that separate a named effect from its rivals."""
+
+from dataclasses import replace
+import json
+
+from accel_calib.calibrate import NextPose
+from accel_calib.cli.main import main
+from accel_calib.errors import InputError
+from accel_calib.files.plan_table import read_plan, write_plan
+from accel_calib.refine import PlannedPose, PosePlan, refine
+from accel_calib.refine.plan import _Predictions
+from accel_calib.refine.plan_words import attitude_words, NOTHING, percent
+from accel_calib.session.guidance import Guide, Plan
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import random_directions, unit
+from accel_calib.units import units_of
+from generator import Setup, simulate, write_csv
+import numpy as np
+import pytest
+
+G = units_of('g')
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def table(path, hidden, *, size, seed, temperature='wandering'):
+    made = simulate(np.random.default_rng(seed), {hidden: size},
+                    Setup(poses=24, rates='small', temperature=temperature))
+    write_csv(path, made.columns)
+    return path
+
+
+@pytest.fixture
+def twins(tmp_path):
+    """Return a table in which cubic and odd_quadratic are rivals."""
+    return table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
+
+
+@pytest.fixture
+def trends(tmp_path):
+    """Return a table in which offset_temperature and offset_drift are rivals."""
+    return table(tmp_path / 'trends.csv', 'offset_temperature', size=2, seed=[0, 2],
+                 temperature='rising')
+
+
+def refined(path, capsys, *more):
+    capsys.readouterr()
+    assert run('refine', path, '--json', '-', *more) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_plan_is_written_and_read_back(twins, tmp_path, capsys):
+    path = tmp_path / 'plan.csv'
+    result = refined(twins, capsys, '--plan', path)
+    poses = read_plan(path)
+    assert 1 <= len(poses) <= 6
+    step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
+    for pose in poses:
+        assert set(pose.separates) == {'cubic', 'odd_quadratic'}
+        assert np.linalg.norm(pose.up) == pytest.approx(1.0, abs=1e-5)
+        assert pose.words == attitude_words(np.array(pose.up))
+    expected = [pose.expected for pose in poses]
+    assert expected == sorted(expected)
+    assert expected[-1] > step['probabilities'][step['effect']]
+    comments = [line[2:] for line in path.read_text().splitlines() if line.startswith('# ')]
+    assert comments == result['plan']
+
+
+def test_the_terminal_shows_the_plan_and_the_probabilities(twins, tmp_path, capsys):
+    assert run('refine', twins, '--plan', tmp_path / 'plan.csv') == 0
+    printed = ' '.join(capsys.readouterr().out.split())
+    for words in ('plan: to separate', 'take these poses:', 'plan: hold the ', ' up (',
+                  'the expected probability of the right one is then', '%)',
+                  'advice: next pose to separate', f'stored in {tmp_path}'):
+        assert words in printed
+
+
+def test_probabilities_of_a_step_sum_to_one(twins, capsys):
+    for step in refined(twins, capsys)['steps']:
+        assert sum(step['probabilities'].values()) == pytest.approx(1.0)
+        assert set(step['rivals']) < set(step['probabilities'])
+
+
+def test_without_rivals_nothing_is_written(tmp_path, capsys):
+    made = simulate(np.random.default_rng([5, 6]), {'cubic': 30.0}, Setup(poses=60))
+    write_csv(tmp_path / 'clear.csv', made.columns)
+    result = refined(tmp_path / 'clear.csv', capsys, '--plan', tmp_path / 'plan.csv')
+    assert result['plan'] == [NOTHING]
+    assert not (tmp_path / 'plan.csv').exists()
+
+
+def test_temperature_and_drift_are_separated_at_other_temperatures(trends, tmp_path, capsys):
+    path = tmp_path / 'plan.csv'
+    result = refined(trends, capsys, '--plan', path)
+    poses = read_plan(path)
+    pair = {'offset_temperature', 'offset_drift'}
+    assert all(pair <= set(pose.separates) for pose in poses)
+    assert all({'temperature', 'time'} <= set(pose.context) for pose in poses)
+    assert all(-20.0 <= pose.context['temperature'] <= 70.0 for pose in poses)
+    assert poses[-1].expected > 0.9
+    assert ' °C' in ' '.join(result['plan'])
+    waits = [pose.context['time'] for pose in poses]
+    assert waits == sorted(waits)
+
+
+def predictions(rng):
+    """Return predictions of two linear models near each other, for 40 candidates."""
+    design = rng.normal(size=(40, 1, 4))
+    rows = (design[:, :, :3], design[:, :, 1:])
+    spreads = (np.diag([0.3, 0.2, 0.4]), np.diag([0.2, 0.3, 0.3]))
+    means = np.array([rows[0] @ [0.5, 0.2, 0.1], rows[1] @ [0.2, 0.1, 0.4]])
+    return _Predictions(means, rows, spreads, np.array([0.7, 0.3]))
+
+
+def test_the_expected_probability_is_the_mean_of_simulated_ones():
+    rng = np.random.default_rng(3)
+    made = predictions(rng)
+    taken = [int(np.argmax(made.gains(())))]
+    taken.append(int(np.argmax(made.gains(taken))))
+    found = []
+    values = [np.array([0.5, 0.2, 0.1]), np.array([0.2, 0.1, 0.4])]
+    for _ in range(4000):
+        right = int(rng.uniform() > 0.7)
+        truth = values[right] + rng.normal(size=3) * np.sqrt(np.diag(made.spreads[right]))
+        reading = made.rows[right][taken, 0] @ truth + rng.normal(size=2)
+        logs = []
+        for k in range(2):
+            rows = made.rows[k][taken, 0]
+            whole = np.vstack([rows, np.diag(np.diag(made.spreads[k]) ** -0.5)])
+            known = np.concatenate([reading, values[k] / np.sqrt(np.diag(made.spreads[k]))])
+            left = known - whole @ np.linalg.lstsq(whole, known, rcond=None)[0]
+            logs.append(np.log(made.weights[k]) - left @ left / 2.0)
+        parts = np.exp(logs - np.max(logs))
+        found.append(parts[right] / np.sum(parts))
+    error = np.std(found) / np.sqrt(len(found))
+    assert abs(np.mean(found) - made.expected(taken)) < 4.0 * np.hypot(error, 0.01)
+    assert made.expected(taken) > made.expected(taken[:1]) > made.expected(())
+
+
+def test_a_pose_that_is_taken_gains_less_when_it_is_repeated():
+    made = predictions(np.random.default_rng(4))
+    first = int(np.argmax(made.gains(())))
+    assert made.gains([first])[first] < made.gains(())[first]
+
+
+def test_the_poses_of_the_plan_name_the_hidden_effect():
+    rng = np.random.default_rng(11)
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        'cubic': np.array([0.004, -0.003, 0.004])})
+    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.004, samples=100)
+    before = refine(poses, G, base='10')
+    planned = np.array([pose.up for pose in before.plan.poses])
+    assert len(planned)
+    more = simulate_poses(model, np.repeat(planned, 40, axis=0), rng, noise_g=0.004, samples=100)
+    joined = replace(poses, columns={key: np.concatenate([poses[key], more[key]])
+                                     for key in poses.columns},
+                     row=np.arange(1, len(poses) + len(more) + 1))
+    after = refine(joined, G, base='10')
+    assert after.steps[-1].probabilities['cubic'] > 0.95
+
+
+@pytest.mark.parametrize(('up', 'words'), [
+    ((0, 0, 1), 'the top side up (+z)'),
+    ((1, -1, 0), 'the front right edge up (+x -y)'),
+    ((0.05, 0, -1), 'the bottom side up (-z)'),
+    ((np.sin(np.radians(20.0)), 0, np.cos(np.radians(20.0))),
+     'the top side up (+z), tilted by 20° so that the front side (+x) rises'),
+])
+def test_a_direction_is_named_by_a_side_and_a_tilt(up, words):
+    assert attitude_words(unit(np.array([up], float))[0]) == words
+
+
+@pytest.mark.parametrize(('probability', 'words'), [
+    (0.0, '0 %'), (0.001, '< 1 %'), (0.893, '89 %'), (0.999, '> 99 %'), (1.0, '100 %')])
+def test_a_probability_is_certain_only_if_it_is(probability, words):
+    assert percent(probability) == words
+
+
+def planned(up, **context):
+    return PlannedPose(up, attitude_words(np.array(up)), context, ('cubic', 'odd_quadratic'), 0.9)
+
+
+def test_conditions_with_the_same_directions_share_a_line(tmp_path):
+    pose = planned((0.0, 0.0, 1.0), temperature=15.0, time=0.0)
+    assert pose.conditions == 'at 15 °C'
+    later = replace(pose, context={'temperature': 40.0, 'time': 1800.0})
+    assert later.conditions == 'at 40 °C 30 min after the last pose'
+    path = tmp_path / 'plan.csv'
+    write_plan(path, PosePlan((pose, later), ('two poses',)))
+    assert read_plan(path) == (pose, later)
+
+
+def test_a_table_that_is_no_plan_is_refused(tmp_path):
+    path = tmp_path / 'other.csv'
+    path.write_text('ax,ay,az\n0,0,1\n')
+    with pytest.raises(InputError, match='lacks the columns pose, .*expected a plan'):
+        read_plan(path)
+
+
+def test_a_damaged_plan_is_refused(tmp_path):
+    path = tmp_path / 'plan.csv'
+    write_plan(path, PosePlan((planned((0.0, 0.0, 1.0)),), ('one pose',)))
+    path.write_text(path.read_text().replace('1.000000', 'up'))
+    with pytest.raises(InputError, match="pose 1 has up_z 'up', expected a finite number"):
+        read_plan(path)
+
+
+def guide_at(guide, up):
+    asked = NextPose(np.array([1.0, 0.0, 0.0]), 'turn the sensor', 0.5, 12, True)
+    guide.plan = Plan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5)
+
+
+def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
+    guide = Guide()
+    guide_at(guide, [(0, 0, -1)])
+    guide.follow([planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
+    assert guide.advice == ('hold the top side up (+z), to separate cubic from odd_quadratic')
+    guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
+    assert guide.advice.startswith('hold the left side up (+y) at 40 °C')
+    assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
+    guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
+    assert guide.advice == 'all poses of the plan are taken; call ~/refine'
+    guide_at(guide, [])
+    assert guide.advice == 'turn the sensor, or call ~/fit'

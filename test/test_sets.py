@@ -1,0 +1,341 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The linear problem, the search over sets of effects and outliers, and the random walk."""
+
+import math
+
+from accel_calib.effects import EFFECTS
+from accel_calib.model import Model
+from accel_calib.refine.linear import (
+    _MOST_UNUSUAL,
+    _RARE,
+    _USUAL,
+    Block,
+    LEVEL,
+    Linear,
+    linearised,
+    WORTH,
+)
+from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
+from accel_calib.refine.state import beginning, fitted_state
+from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import random_directions
+import numpy as np
+import pytest
+from shared import sensor
+
+COUNT = 60
+BASE = ('offset', 'axis_gain', 'cross_axis')
+
+
+def poses_of(hidden, seed=1, count=COUNT, knocked=(), **context):
+    """Return poses of a random sensor with hidden effects, and some knocked by 20 mg."""
+    rng = np.random.default_rng(seed)
+    directions = random_directions(count, rng)
+    known = {'time': np.arange(count) * 30.0, 'temperature': rng.uniform(10.0, 40.0, count),
+             **context}
+    if context.get('reference') is True:
+        known['reference'] = directions
+    model = Model({**sensor(rng).values,
+                   **{name: np.array(values, float) for name, values in hidden.items()}})
+    poses = simulate_poses(model, directions, rng, context=known)
+    moved = np.zeros((count, 1))
+    moved[list(knocked)] = 0.02
+    return poses.with_columns(reading=poses.reading + moved * directions)
+
+
+def problem_of(poses, *names):
+    """Return the fitted base and the linear problem with these candidates."""
+    state = beginning(poses, Model({name: np.zeros(3) for name in BASE}))
+    return state, linearised(state.fit, BASE, names)
+
+
+def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1e6):
+    """Return a linear problem with one column for each effect, and no base."""
+    count = len(residual)
+    blocks = tuple(Block(name, np.zeros(0), slice(k, k + 1), 0, tried)
+                   for k, name in enumerate(names))
+    return Linear(np.zeros((count, 0)), residual, np.arange(count), blocks, columns,
+                  np.full(len(names), size), worth, count, float(residual @ residual),
+                  np.zeros((count, 3)), choice)
+
+
+@pytest.mark.parametrize(('name', 'values'), [
+    ('quadratic', [2e-3, -1e-3, 1e-3]), ('cross_coupling', [1e-3, 0, -1e-3, 0, 1e-3, 2e-3]),
+    ('offset_temperature', [2e-4, 1e-4, -2e-4]), ('gain_temperature', [1e-4, -1e-4, 1e-4]),
+    ('offset_step', [3e-3, -2e-3, 2e-3, 900.0])])
+def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
+    state, linear = problem_of(poses_of({name: values}), name)
+    gain, _ = linear.gains(linear.made())
+    best = int(np.argmax(gain))
+    shape = linear.blocks[best].shape
+    if name.endswith('temperature'):  # a fit would change the lag, too
+        best = next(k for k, block in enumerate(linear.blocks) if not block.searched)
+        shape = linear.blocks[best].shape
+    effect = EFFECTS[name]
+    start = np.concatenate([np.zeros(len(effect.parameters)), shape])
+    after = fitted_state(Model({**state.model.values, name: start}), state.poses_g)
+    assert gain[best] > 50.0
+    assert gain[best] == pytest.approx(state.fit.chi2 - after.fit.chi2, rel=0.01)
+    chosen = linear.made((best,))
+    assert linear.base_rss - chosen.rss == pytest.approx(gain[best], rel=1e-9)
+    np.testing.assert_allclose(linear.values_of(chosen)[best],
+                               after.model.values[name][:len(effect.parameters)],
+                               atol=0.02 * np.max(np.abs(values[:3])))
+
+
+def test_the_gain_beside_a_set_is_the_fall_that_the_larger_set_brings():
+    _, linear = problem_of(poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(5,)),
+                           'quadratic', 'cubic', 'gain_asymmetry', 'offset_drift')
+    beside = linear.made((0,), (5,))
+    gain, rank = linear.gains(beside)
+    for block in range(1, len(linear.blocks)):
+        larger = linear.made((0, block), (5,))
+        assert beside.rss - larger.rss == pytest.approx(gain[block], rel=1e-6)
+        assert larger.ranks[-1] == rank[block]
+    assert (gain[0], rank[0]) == (pytest.approx(0.0, abs=1e-9), 0.0)
+
+
+@pytest.mark.parametrize('known', [False, True])
+@pytest.mark.parametrize('out', [(7,), (3, 20, 41)])
+def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
+    context = {'reference': True} if known else {}
+    poses = poses_of({}, knocked=out, **context)
+    state, linear = problem_of(poses, 'quadratic')
+    chosen = linear.made((), out)
+    others = np.delete(np.arange(COUNT), out)
+    after = fitted_state(state.model, state.poses_g.take(others))
+    assert chosen.parameters == len(out) * (3 if known else 1)
+    assert chosen.rss == pytest.approx(after.fit.chi2, rel=1e-3)
+    kept = ~np.isin(linear.pose, out)
+    np.testing.assert_allclose(chosen.residual[kept], after.fit.residual, atol=0.02)
+    np.testing.assert_allclose(chosen.residual[~kept], 0.0, atol=1e-9)
+    assert linear.base_rss > 10.0 * chosen.rss
+
+
+def test_an_effect_in_a_set_without_a_pose_is_fitted_without_it():
+    poses = poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(7, 30))
+    state, linear = problem_of(poses, 'quadratic')
+    chosen = linear.made((0,), (7, 30))
+    others = np.delete(np.arange(COUNT), (7, 30))
+    after = fitted_state(Model({**state.model.values, 'quadratic': np.zeros(3)}),
+                         state.poses_g.take(others))
+    assert chosen.rss == pytest.approx(after.fit.chi2, rel=1e-2)
+    np.testing.assert_allclose(linear.values_of(chosen)[0], after.model.values['quadratic'],
+                               atol=2e-5)
+
+
+def test_the_score_counts_values_shapes_choice_and_size():
+    residual = np.zeros(40)
+    residual[:3] = 6.0, 8.0, 2.0
+    columns = np.eye(40)[:, :2]
+    linear = by_hand(residual, columns, ['supply_ratio', 'supply_ratio'], choice=3.0, tried=5.0)
+    one, both = linear.made((0,)), linear.made((0, 1))
+
+    def expected(rss, values, charge):
+        whole = WORTH + 40.0
+        return (whole * math.log((WORTH + 104.0) / (WORTH + rss))
+                - values * math.log(40.0) * whole / (whole - values - 1.0) - charge)
+
+    assert linear.made().score == 0.0
+    assert one.score == pytest.approx(expected(68.0, 1.0, 3.0 + 2.0 * math.log(5.0)))
+    assert both.score == pytest.approx(expected(4.0, 2.0, 2.0 * (3.0 + 2.0 * math.log(5.0))))
+    gain, rank = linear.gains(one)
+    assert linear.score_with(one, 1, gain[1], rank[1]) == pytest.approx(both.score)
+    left_out = linear.made((), (0, 1))
+    assert left_out.score == pytest.approx(
+        expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + _RARE)))
+
+
+@pytest.mark.parametrize(('times', 'penalty'), [
+    (0.5, 0.0), (3.0, (math.log(3.0) / _USUAL) ** 2), (1e6, _MOST_UNUSUAL)])
+def test_an_effect_of_unusual_size_costs_more(times, penalty):
+    residual = np.zeros(40)
+    residual[0] = 5.0
+    size = 5.0 / (times * EFFECTS['quadratic'].typical)
+    linear = by_hand(residual, np.eye(40)[:, :1], ['quadratic'], size=size)
+    assert linear.made((0,)).charge == pytest.approx(penalty)
+
+
+def test_without_known_noise_the_score_does_not_depend_on_the_scale():
+    residual = np.random.default_rng(1).normal(size=40)
+    residual[0] = 6.0
+
+    def score(scale, worth):
+        linear = by_hand(scale * residual, np.eye(40)[:, :1], ['supply_ratio'], worth=worth)
+        return linear.made((0,)).score
+
+    assert score(0.1, 0.0) == pytest.approx(score(0.3, 0.0))
+    assert score(0.1, WORTH) < score(0.3, WORTH) - 1.0
+
+
+def test_measured_noise_restrains_effects_in_residuals_that_are_too_small():
+    residual = 0.05 * np.random.default_rng(2).normal(size=12)
+    residual[0] = 0.5
+    free, moderated = (by_hand(residual, np.eye(12)[:, :1], ['supply_ratio'], worth=worth)
+                       for worth in (0.0, WORTH))
+    assert free.probability(free.made((0,)), 0) < 1e-4
+    assert moderated.probability(moderated.made((0,)), 0) > 0.1
+
+
+def test_noise_alone_is_significant_as_often_as_stated():
+    names = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift')
+    best = []
+    for seed in range(1000):
+        residual = np.random.default_rng(seed).normal(size=30)
+        linear = by_hand(residual, np.eye(30)[:, :4], names)
+        best.append(min(linear.probability(linear.made((k,)), k) for k in range(4)))
+    assert np.mean(np.array(best) < 0.1) == pytest.approx(0.1, abs=0.03)
+    assert np.mean(np.array(best) < LEVEL) == pytest.approx(LEVEL, abs=0.009)
+
+
+def test_two_effects_are_found_where_neither_alone_is_significant():
+    time = np.arange(COUNT) * 60.0
+    warm = 20.0 + 15.0 * (1.0 - np.exp(-time / 2500.0))
+    slope = np.polyfit(time / 3600.0, warm, 1)[0]  # the drift hides the effect of temperature
+    size = 0.002 * np.array([1.0, -1.0, 1.0])
+    hidden = {'offset_temperature': size, 'offset_drift': [*(-slope * size), 0.0]}
+    _, linear = problem_of(poses_of(hidden, time=time, temperature=warm), *EFFECTS)
+    for block, each in enumerate(linear.blocks):
+        if each.effect in hidden:
+            assert linear.probability(linear.made((block,)), block) > LEVEL
+    best = next(accepted(linear, explored(linear)))
+    assert set(names_of(linear, best)) == set(hidden)
+    assert is_significant(linear, best)
+
+
+def test_an_effect_and_knocked_poses_are_found_together():
+    hidden, knocked = {'offset_temperature': [3e-4, -2e-4, 2e-4]}, (4, 17, 33, 51)
+    _, linear = problem_of(poses_of(hidden, knocked=knocked), *EFFECTS)
+    best = next(accepted(linear, explored(linear)))
+    assert names_of(linear, best) == ('offset_temperature',)
+    assert best.out == knocked
+    values = next(iter(linear.values_of(best).values()))
+    np.testing.assert_allclose(values, hidden['offset_temperature'], atol=3e-5)
+
+
+def test_a_pose_that_an_effect_explains_is_not_left_out():
+    poses = poses_of({'offset_step': [4e-3, -4e-3, 4e-3, 180.0]})  # before it: 6 poses of 60
+    _, linear = problem_of(poses, 'offset_step', 'quadratic', 'offset_drift')
+    best = next(accepted(linear, explored(linear)))
+    assert names_of(linear, best) == ('offset_step',)
+    assert best.out == ()
+
+
+def test_noise_alone_has_no_effects_and_no_outliers():
+    _, linear = problem_of(poses_of({}), *EFFECTS)
+    best = next(accepted(linear, explored(linear)))
+    assert (best.blocks, best.out, best.score) == ((), (), 0.0)
+    assert [each.out for each in with_outliers(linear, linear.made())] == [()]
+
+
+def random_process(count, modes, rng):
+    """Return random orthonormal modes with decreasing variances."""
+    axes = np.linalg.qr(rng.normal(size=(count, modes)))[0]
+    return Process(axes, 1.0 / np.arange(1, modes + 1) ** 2)
+
+
+def test_whitened_equations_are_those_of_generalised_least_squares():
+    rng = np.random.default_rng(3)
+    residual, columns = rng.normal(size=20), rng.normal(size=(20, 2))
+    linear = by_hand(residual, columns, ['supply_ratio', 'offset_drift'], size=1.0)
+    process = random_process(20, 4, rng)
+    variance = np.eye(20) + 50.0 * (process.axes * process.values) @ process.axes.T
+    white = Walk(process, 50.0, 0.0, 0.0).whitened(linear)
+    inverse = np.linalg.inv(variance)
+    assert white.residual @ white.residual == pytest.approx(residual @ inverse @ residual)
+    np.testing.assert_allclose(white.columns.T @ white.columns, columns.T @ inverse @ columns)
+    np.testing.assert_allclose(white.columns.T @ white.residual, columns.T @ inverse @ residual)
+    values = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ residual)
+    found = white.values_of(white.made((0, 1)))
+    np.testing.assert_allclose([found[0][0], found[1][0]], values)
+    flat = Walk(process, 0.0, 0.0, 0.0).whitened(linear)
+    assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
+
+
+def test_the_score_of_a_walk_is_that_of_the_whitened_equations():
+    rng = np.random.default_rng(4)
+    process = random_process(40, 6, rng)
+    residual = rng.normal(size=40) + process.axes @ (30.0 * process.values * rng.normal(size=6))
+    linear = by_hand(residual, 1e-3 * np.eye(40)[:, :1], ['supply_ratio'], choice=2.0)
+    for chosen in (linear.made(), linear.made((), (3,))):
+        walk = walk_beside(linear, chosen, process)
+        again = walk.whitened(linear).made(chosen.blocks, chosen.out)
+        assert walk.likelihood_ratio > SIGNIFICANT
+        if not chosen.out:
+            assert again.score == pytest.approx(walk.score)
+
+
+def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
+    rng = np.random.default_rng(5)
+    process = random_process(30, 6, rng)
+    residual = rng.normal(size=30)
+    variance = np.eye(30) + 50.0 * (process.axes * process.values) @ process.axes.T
+    others = np.delete(np.arange(30), 7)
+    inverse = np.linalg.inv(variance[np.ix_(others, others)])
+    expected = residual[others] @ inverse @ residual[others]
+    for knock in (0.0, 30.0):
+        moved = residual.copy()
+        moved[7] += knock
+        linear = by_hand(moved, np.eye(30)[:, :1], ['supply_ratio'])
+        white = Walk(process, 50.0, 0.0, 0.0).whitened(linear)
+        assert white.made((), (7,)).rss == pytest.approx(expected)
+
+
+def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses():
+    rng = np.random.default_rng(6)
+    process = random_process(15, 4, rng)
+    residual, ratio = rng.normal(size=15), 30.0
+    variance = np.eye(15) + ratio * (process.axes * process.values) @ process.axes.T
+    linear = by_hand(residual, np.eye(15)[:, :1], ['supply_ratio'])
+    walk = Walk(process, ratio, 0.0, 0.0)
+    left, held_out = walk.residuals(linear, linear.made())
+    for k in range(15):
+        others = np.delete(np.arange(15), k)
+        weights = np.linalg.solve(variance[np.ix_(others, others)], variance[others, k])
+        assert held_out[k] == pytest.approx(residual[k] - weights @ residual[others])
+    np.testing.assert_allclose(left, np.linalg.solve(variance, residual))
+
+
+def wandering(size_g, seed=3):
+    """Return the residual problem of poses whose offset is a random walk, and the poses."""
+    poses = poses_of({}, seed=seed)
+    steps = np.random.default_rng(seed).normal(size=(COUNT, 3)) * size_g
+    moved = poses.with_columns(reading=poses.reading + np.cumsum(steps, axis=0))
+    return problem_of(moved, 'offset_drift')[1], moved
+
+
+def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
+    likely = []
+    for size_g in (1e-3, 0.0):
+        linear, poses = wandering(size_g)
+        walk = walk_beside(linear, linear.made(), process_of(linear, poses))
+        likely.append(walk.likelihood_ratio)
+    assert likely[0] > 3.0 * SIGNIFICANT
+    assert likely[1] < 0.5 * SIGNIFICANT
+
+
+def test_a_walk_leaves_the_noise_of_the_poses():
+    linear, poses = wandering(1e-3)
+    walk = walk_beside(linear, linear.made(), process_of(linear, poses))
+    white = walk.whitened(linear)
+    assert linear.base_rss > 5.0 * linear.dof
+    assert white.residual @ white.residual == pytest.approx(linear.dof, rel=0.5)
+
+
+def test_poses_that_scatter_are_no_walk():
+    poses = poses_of({}, seed=3)
+    scatter = np.random.default_rng(3).normal(size=(COUNT, 3)) * 3e-3
+    linear, poses = problem_of(poses.with_columns(reading=poses.reading + scatter),
+                               'offset_drift')[1], poses
+    assert linear.base_rss > 5.0 * linear.dof
+    walk = walk_beside(linear, linear.made(), process_of(linear, poses))
+    assert walk.likelihood_ratio < SIGNIFICANT
+
+
+def test_without_different_times_there_is_no_walk():
+    linear, poses = wandering(1e-3)
+    assert process_of(linear, poses.with_columns(time=np.zeros(COUNT))) is None
+    assert process_of(linear, poses.with_columns(time=np.full(COUNT, np.nan))) is None
