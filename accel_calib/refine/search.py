@@ -12,6 +12,8 @@ The search for missing effects.
    model. Steps 2 and 3 are repeated until the set remains the same.
 4. If the named effects explain only a small part of the residual above the noise, they are
    removed: the residual then has a cause outside of the catalogue.
+5. If a gap remains, or a walk, `.curves` looks for an empirical curve; a walk is added if it is
+   the better description.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
@@ -29,7 +31,7 @@ from .curves import best_curve, Curve
 from .linear import LEVEL, Linear, linearised, Set
 from .output import Clipped, off_grid, unclipped
 from .sets import accepted, explored, names_of, simpler
-from .state import beginning, changes_beside, fitted_state, State
+from .state import beginning, changes_beside, fitted_state, is_noise, State
 from .wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
 from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, WANDER
 from ..estimate.equations import kinds
@@ -194,7 +196,9 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     if after is None or after.fit.at_bound or not _explains(found.final, after):
         return found
     out = np.array(curve.out, np.intp)
-    near = replace(found.near, walk=None)
+    near = found.near
+    near = replace(near, linear=near.plain, walk=None,
+                   chosen=near.plain.made(near.chosen.blocks, near.chosen.out))
     return replace(found, base=_without(start, poses_g, out), final=after, near=near,
                    walk=None, outliers=out, curve=curve,
                    added=(*(name for name in found.added if name != WANDER), curve.name))
@@ -322,8 +326,6 @@ def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -
 
 
 def _is_all_noise(linear: Linear, chosen: Set) -> bool:
-    from .state import is_noise
-
     return is_noise(chosen.rss, linear.dof - chosen.parameters)
 
 
