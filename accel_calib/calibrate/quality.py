@@ -56,13 +56,14 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
         poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
-    return poses_g if 'previous' in poses_g else _with_previous(poses_g, model)
-
-
-def _with_previous(poses_g: Poses, model: Model) -> Poses:
-    """Return poses with the unit vector towards the previous pose."""
+    if 'previous' in poses_g:
+        return poses_g
     mat_w, vec_v = model.linear_part
-    force = unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T)
+    return with_previous(poses_g, unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T))
+
+
+def with_previous(poses_g: Poses, force: Floats) -> Poses:
+    """Return poses with the unit vector towards the previous pose, given (n, 3) unit forces."""
     order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
              else np.arange(len(poses_g)))
     previous = np.zeros_like(force)

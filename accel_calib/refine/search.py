@@ -33,10 +33,12 @@ from .output import Clipped, off_grid, unclipped
 from .sets import accepted, explored, names_of, simpler
 from .state import beginning, changes_beside, fitted_state, is_noise, State
 from .wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from ..calibrate.quality import with_previous
 from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, WANDER
 from ..estimate.equations import kinds
 from ..estimate.fit import judge
 from ..model import Model
+from ..sphere import unit
 from ..table import Poses
 
 _ROUNDS = 4
@@ -175,6 +177,10 @@ def _search(poses_g: Poses, base: Model) -> Found:
     names = (*_ladder_effects(begun), *(name for name in EFFECTS if name not in LADDER),
              *changes_beside(begun.model))
     state, near = _settled(begun, poses_g, fixed, names)
+    if 'hysteresis' in near.names:  # a large one has distorted the directions
+        force = judge(state.model, poses_g).equations.force
+        poses_g = with_previous(poses_g, unit(force))
+        state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
     begun = _without(begun, poses_g, np.array(near.chosen.out, np.intp))
     state, near, back = _judged(begun, state, near)
     walks = (WANDER,) if near.walk is not None else ()

@@ -1,0 +1,87 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Time and memory that `refine` needs for many poses.
+
+Each case runs in a process of its own, so that its largest memory is its own::
+
+    python benchmarks/refine_cost.py --markdown docs/figures/refine_cost.md
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+import multiprocessing
+from pathlib import Path
+import resource
+import sys
+import time
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
+
+from accel_calib.refine import refine  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
+from generator import Setup, simulate  # noqa: E402
+import numpy as np  # noqa: E402
+from refine_case import poses_of  # noqa: E402
+
+CASES = ('', 'offset_temperature', 'offset_wander', 'quadratic', 'ripple')
+LIMITS = {5_000: 10.0, 50_000: 100.0}
+"""Asked: the longest time by the number of poses [s]."""
+
+SIZE = 3.0
+SAMPLES = 20
+
+
+def measured(hidden: str, poses: int, seed: int) -> tuple[float, float, float, str]:
+    """Return seconds, memory before and during the refinement [MB], and the result."""
+    made = simulate(np.random.default_rng(seed), {hidden: SIZE} if hidden else {},
+                    Setup(poses=poses, samples=SAMPLES))
+    taken = poses_of(made)
+    del made
+    before = _memory_mb()
+    started = time.perf_counter()
+    found = refine(taken, units_of('m/s2'), base='10')
+    seconds = time.perf_counter() - started
+    names = ' + '.join(step.effect for step in found.steps) or 'nothing'
+    return seconds, before, _memory_mb(), f'{names}, {found.verdict}'
+
+
+def _memory_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--poses', type=int, action='append', choices=list(LIMITS),
+                        help='number of poses; repeatable')
+    parser.add_argument('--seed', type=int, default=2028)
+    parser.add_argument('--markdown', type=Path, help='write the table to this file')
+    given = parser.parse_args(arguments)
+    lines = []
+    for poses in given.poses or LIMITS:
+        for hidden in CASES:
+            alone = ProcessPoolExecutor(1, multiprocessing.get_context('spawn'))
+            with alone:
+                seconds, before, memory, result = alone.submit(
+                    measured, hidden, poses, given.seed).result()
+            lines.append(Line(f'{poses:,} poses, {hidden or "nothing"} hidden: seconds '
+                              f'({result}; memory {before:.0f} → {memory:.0f} MB)',
+                              f'{seconds:.1f}', f'≤ {LIMITS[poses]:g}', 1,
+                              seconds <= LIMITS[poses]))
+            print(lines[-1].what, lines[-1].measured, file=sys.stderr, flush=True)
+    only = ''.join(f' --poses {poses}' for poses in given.poses or ())
+    publish(f'# Cost of refine with many poses\n\nMade by `python benchmarks/refine_cost.py{only} '
+            f'--markdown FILE` on {processor()}.\n\n{table(lines)}\n', given.markdown)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
