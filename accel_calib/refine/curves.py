@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .linear import Block, LEVEL, Linear, linearised, Set
+from .linear import Block, held_out, LEVEL, Linear, linearised, Set
 from .sets import with_outliers
 from .state import State
 from ..effects import (
@@ -183,16 +183,11 @@ def _grown(problem: Linear) -> Set:
 
 def _accepted(score: float, problem: Linear, chosen: Set, tried: int) -> Curve | None:
     """Return a curve, or None if it is not significant or poses held out do not agree."""
-    from scipy.special import fdtrc
-
     # The outliers are found again: without the curve, good poses may have looked like outliers.
     chosen = max(with_outliers(problem, chosen), key=lambda each: each.score)
     nothing = problem.made((), chosen.out)
-    added = chosen.parameters - nothing.parameters
-    left = problem.worth + problem.dof - chosen.parameters
-    ratio = (nothing.rss - chosen.rss) / added / ((problem.worth + chosen.rss + 1e-300) / left)
     choices = tried * math.prod(problem.blocks[block].tried for block in chosen.blocks)
-    p_value = min(1.0, float(fdtrc(added, left, ratio)) * choices)
+    p_value = min(1.0, problem.chance(nothing, chosen) * choices)
     if p_value > LEVEL or score < _CLEARLY:
         return None
     before, after = _held_out(problem, nothing), _held_out(problem, chosen)
@@ -211,7 +206,7 @@ def _held_out(problem: Linear, chosen: Set) -> float:
     """Return the sum of squares of the residuals, each predicted from the other equations."""
     own = 1.0 - np.sum(problem.onto ** 2, axis=1) - np.sum(chosen.onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
-    return float(np.sum((chosen.residual[kept] / np.maximum(own[kept], 0.02)) ** 2))
+    return float(np.sum(held_out(chosen.residual[kept], own[kept]) ** 2))
 
 
 def is_curve(name: str) -> bool:

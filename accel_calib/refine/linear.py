@@ -59,6 +59,9 @@ LEVEL = 0.01
 _SEEN = 0.02
 """Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
 
+_LEAST_OWN = 0.02
+"""Smallest 1 - leverage; below it, an equation alone determines a value."""
+
 _USUAL = 1.6
 """Standard deviation of the logarithm of the size of an effect relative to its typical size."""
 
@@ -302,17 +305,19 @@ class Linear:
 
     def probability(self, chosen: Set, block: int) -> float:
         """Return the probability that noise alone makes a block this good beside the others."""
+        chance = self.chance(self.without(chosen, block), chosen)
+        return min(1.0, chance * len(self.names) * self.blocks[block].tried)
+
+    def chance(self, fewer: Set, more: Set) -> float:
+        """Return the probability that noise alone makes a set this good beside a smaller one."""
         from scipy.special import fdtrc
 
-        others = self.without(chosen, block)
-        gain = others.rss - chosen.rss
-        entry = self.blocks[block]
-        added = chosen.parameters - others.parameters
-        left = self.worth + self.dof - chosen.parameters
+        added = more.parameters - fewer.parameters
+        left = self.worth + self.dof - more.parameters
         if added < 1 or left < 1:
             return 1.0
-        p = float(fdtrc(added, left, gain / added / ((self.worth + chosen.rss + 1e-300) / left)))
-        return min(1.0, p * len(self.names) * entry.tried)
+        variance = (self.worth + more.rss + 1e-300) / left
+        return float(fdtrc(added, left, (fewer.rss - more.rss) / added / variance))
 
 
 @dataclass(frozen=True)
@@ -359,6 +364,22 @@ def outside(columns: Floats, onto: Floats) -> Floats:
     left = columns - onto @ (onto.T @ columns)
     vectors, scales, _ = np.linalg.svd(left, full_matrices=False)
     return vectors[:, (scales > _SEEN) & (scales > _SEEN * scales[:1])]
+
+
+def held_out(residual: Floats, own: Floats) -> Floats:
+    """
+    Return (m,) residuals, each predicted without its own equation (PRESS).
+
+    Parameters
+    ----------
+    residual : (m,) array
+        Residuals of a fit to all equations.
+    own : (m,) array
+        1 minus the leverage of each equation.
+
+    """
+    found: Floats = residual / np.maximum(own, _LEAST_OWN)
+    return found
 
 
 def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str], worth: float = WORTH

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .linear import Linear, linearised, Set
+from .linear import held_out, Linear, linearised, Set
 from ..calibrate.quality import with_history
 from ..effects import CHANGES
 from ..estimate.fit import estimate, Fit, NotConvergedError
@@ -22,9 +22,6 @@ from ..units import MG
 _CHI2_LEVEL = 1e-3
 _CHI2_RATIO = 1.3
 """chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
-
-_LARGEST_GAIN = 50.0
-"""Largest factor from a residual to its held-out residual."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +71,7 @@ class State:
     @property
     def held_out(self) -> Floats:
         """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
-        own = 1.0 - np.sum(self.linear.onto ** 2, axis=1)
-        return self.residual / np.maximum(own, 1.0 / _LARGEST_GAIN)
+        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
 
     @property
     def dof(self) -> int:

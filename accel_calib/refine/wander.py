@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .linear import Linear, Set
+from .linear import held_out, Linear, Set
 from ..table import Floats, Poses
 
 _MODES = 60
@@ -34,9 +34,6 @@ _LEAST_WHITE = 0.5
 
 SIGNIFICANT = 10.0
 """Twice the logarithm of the likelihood ratio above which a walk is named."""
-
-_LARGEST_GAIN = 50.0
-"""Largest factor from a residual to its held-out residual."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class Walk:
         # Without its own equation each residual is P z over the diagonal of P.
         own = (1.0 - np.sum(linear.onto ** 2, axis=1) - np.sum(chosen.onto ** 2, axis=1)
                - np.sum(left * smooth.T, axis=1))
-        return residual, residual / np.maximum(own, 1.0 / _LARGEST_GAIN)
+        return residual, held_out(residual, own)
 
 
 def process_of(linear: Linear, poses: Poses) -> Process | None:

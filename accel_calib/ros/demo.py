@@ -127,7 +127,8 @@ def _has_passed(instant: float) -> bool:
     return time.monotonic() > instant
 
 
-def _at_least(user: User, count: int) -> bool:
+def at_least(user: User, count: int) -> bool:
+    """Return whether the node has captured this number of poses."""
     return user.poses >= count
 
 
@@ -167,7 +168,7 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
         user, spin = stack.enter_context(user_of(processes))
         spin(lambda: user.poses > 0, 'the first pose')
         for count in range(4, POSES + 1, 4):
-            spin(partial(_at_least, user, count), f'{count} poses')
+            spin(partial(at_least, user, count), f'{count} poses')
             report(f'captured {count} poses')
         report(f'~/fit: {call(user, spin, "fit")}')
         spin(user.is_flat, 'the flat pose')

@@ -22,7 +22,7 @@ import time
 
 import numpy as np
 
-from .demo import call, rests_of, rms, running, set_environment, Spin, User, user_of
+from .demo import at_least, call, rests_of, rms, running, set_environment, Spin, User, user_of
 from ..files import read_calibration
 from ..table import Floats
 from ..units import MG
@@ -115,7 +115,7 @@ def demonstrate_hidden(hidden: str, report: Callable[[str], None]) -> HiddenOutc
         user, spin = stack.enter_context(user_of(processes))
         spin(lambda: user.poses > 0, 'the first pose')
         for count in range(4, _FITTED + 1, 4):
-            spin(partial(_has, user, count), f'{count} poses')
+            spin(partial(at_least, user, count), f'{count} poses')
             report(f'captured {count} poses')
         report(f'~/fit: {call(user, spin, "fit")}')
         stored = Path(folder) / 'accel_calib' / 'demo.yaml'
@@ -131,10 +131,6 @@ def demonstrate_hidden(hidden: str, report: Callable[[str], None]) -> HiddenOutc
             time.monotonic() - began)
 
 
-def _has(user: User, count: int) -> bool:
-    return user.poses >= count
-
-
 def _has_rested(user: User, count: int) -> bool:
     return len(rests_of(user)) > count
 
@@ -143,11 +139,11 @@ def _errors(user: User, spin: Spin, report: Callable[[str], None]) -> Floats:
     """Return the error of the corrected topic at the next rests [mg], and report each."""
     for messages in user.messages.values():
         messages.clear()
+    errors = []
     for count in range(_CHECKED):
         spin(partial(_has_rested, user, count + 2), 'the next rest')
         rest = rests_of(user)[count + 1]
-        error = float(np.linalg.norm(rest['corrected'] - rest['truth'])) * MG
+        errors.append(float(np.linalg.norm(rest['corrected'] - rest['truth'])) * MG)
         report(f'  rest {count + 1:2d} of {_CHECKED}, now {user.temperature:.1f} °C: '
-               f'imu/data_calibrated is {error:5.2f} mg from the truth')
-    rests = rests_of(user)[1:_CHECKED + 1]
-    return np.array([np.linalg.norm(rest['corrected'] - rest['truth']) for rest in rests]) * MG
+               f'imu/data_calibrated is {errors[-1]:5.2f} mg from the truth')
+    return np.array(errors)
