@@ -34,7 +34,7 @@ from ..effects import (
     MODES,
     VARIABLES,
 )
-from ..estimate.fit import judge
+from ..estimate.fit import Fit, judge
 from ..model import Model
 from ..table import Floats, Poses
 
@@ -95,22 +95,21 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
         Indices of the outliers.
 
     """
-    plain = linearised(judge(state.model, poses_g), state.model.effects, ())
+    fit = judge(state.model, poses_g)
+    plain = linearised(fit, state.model.effects, ())
     if plain.dof < _LEAST_DOF:
         return None
-    tried = [problem for carrier, variable in _pairs(poses_g)
-             for problem in _problems(plain, state, poses_g, carrier, variable)]
-    charge = 2.0 * math.log(max(len(tried), 1))
-    best = None
-    for problem in tried:
-        chosen = _grown(_compressed(problem, out))
-        score = chosen.score - charge
-        if chosen.blocks and (best is None or score > best[0]):
-            best = score, problem, chosen
+    best, tried = None, 0
+    for carrier, variable in _pairs(poses_g):
+        for problem in _problems(plain, fit, carrier, variable):
+            chosen, tried = _grown(_compressed(problem, out)), tried + 1
+            if chosen.blocks and (best is None or chosen.score > best[0]):
+                best = chosen.score, problem, chosen
     if best is None:
         return None
     score, problem, chosen = best
-    return _accepted(score, problem, problem.made(chosen.blocks, out), len(tried))
+    return _accepted(score - 2.0 * math.log(tried), problem, problem.made(chosen.blocks, out),
+                     tried)
 
 
 def _pairs(poses_g: Poses) -> Iterator[tuple[str, str]]:
@@ -122,18 +121,16 @@ def _pairs(poses_g: Poses) -> Iterator[tuple[str, str]]:
                 yield carrier, variable
 
 
-def _problems(plain: Linear, state: State, poses_g: Poses, carrier: str, variable: str
-              ) -> Iterator[Linear]:
+def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
     """Yield the problem with the cosines of a carrier as candidates, and of each of its parts."""
     name = empirical_name(carrier, variable, range(1, MODES + 1))
     effect = effect_named(name)
-    shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(poses_g.columns))
+    shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(fit.poses_g.columns))
     if not shapes:
         return
-    near = judge(state.model, poses_g).equations
     count = len(effect.parameters)
     model = Model({name: np.concatenate([np.zeros(count), shapes[0]])})
-    columns = near.columns(model)[:, :count]
+    columns = fit.equations.columns(model)[:, :count]
     sizes = np.linalg.norm(columns, axis=0)
     sizes[sizes == 0.0] = 1.0
     columns = columns / sizes
