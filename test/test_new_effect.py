@@ -4,7 +4,7 @@
 """One entry in the catalogue is all that a new effect takes."""
 
 import accel_calib as ac
-from accel_calib.effects import _by_axis, AXES, Effect, EFFECTS, ONE
+from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.messages.correction import Rewriter
 from accel_calib.messages.layout import layout_of
 from accel_calib.report.page import page
@@ -14,7 +14,7 @@ import pytest
 from rosbags.typesys import get_typestore, Stores
 
 NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
-             0.005, 0.5, _by_axis(ONE),
+             0.005, 0.5, by_axis(ONE),
              lambda context, shape: ((context['temperature'] - 25.0) / 20.0) ** 3,
              ('temperature',))
 SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],

@@ -1,0 +1,287 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The catalogue: one entry for each effect with a known cause.
+
+Factors are functions of the context and of the shape of the effect. Shape searches yield the
+shapes that the search tries.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from .form import (
+    ALL_AXES,
+    AXES,
+    by_axis,
+    Context,
+    CROSS,
+    CUBE,
+    Effect,
+    Factor,
+    FORCE,
+    matrix_terms,
+    ODD_SQUARE,
+    ONE,
+    PRODUCTS,
+    SIZE,
+    SQUARE,
+    Term,
+)
+from ..table import Floats
+from ..thermal import acting_temperature, rate_at
+from ..units import STANDARD_GRAVITY
+
+REFERENCE_TEMPERATURE = 25.0
+"""Temperature at which the temperature effects are zero [°C], as in data sheets."""
+
+NOMINAL_SUPPLY = 3.3
+"""Supply voltage at which `supply_ratio` is zero [V]."""
+
+HOUR = 3600.0
+
+_ROTATION = matrix_terms((0, 2, 1, 1.0), (0, 1, 2, -1.0), (1, 0, 2, 1.0), (1, 2, 0, -1.0),
+                         (2, 1, 0, 1.0), (2, 0, 1, -1.0))
+_COUPLED = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+_SUPPLY = (*ALL_AXES, *(Term(1 + axis, axis, ONE) for axis in range(3)))
+_LEVER = tuple(Term(parameter, axis, ONE) for axis in range(3) for parameter in range(3))
+
+_TAUS = 40
+"""Number of time constants to try; a coarser grid leads to spurious second effects."""
+
+_LEAST_SIDE = 5
+"""Smallest number of poses on each side of a step; with 3, a step absorbs any single outlier."""
+
+
+def _times(context: Context) -> Floats:
+    """Return the known times of the poses, sorted; unknown times are NaN."""
+    time: Floats = np.sort(context['time'])
+    return time[np.isfinite(time)]
+
+
+def _from_start(context: Context) -> Iterator[Floats]:
+    """Yield the time of the first pose."""
+    time = _times(context)
+    if len(time) and time[-1] > time[0]:
+        yield time[:1]
+
+
+def _taus(context: Context) -> Iterator[Floats]:
+    """Yield start and time constant; the constants are 1/60 to 3/2 of the time span."""
+    time = _times(context)
+    span = time[-1] - time[0] if len(time) else 0.0
+    if span > 0.0:
+        for tau in np.geomspace(span / 60.0, span * 1.5, _TAUS):
+            yield np.array([time[0], tau])
+
+
+def _instants(context: Context) -> Iterator[Floats]:
+    """Yield the instants between successive poses, with enough poses on each side."""
+    time = _times(context)
+    middles = (time[1:] + time[:-1]) / 2.0
+    for instant in np.unique(middles[_LEAST_SIDE - 1:len(middles) - _LEAST_SIDE + 1]):
+        yield np.array([instant])
+
+
+_LAGS = 20
+"""Number of lags to try for each kind of lag."""
+
+_LEAST_LAG = 10.0
+"""Smallest lag to try [s]; over a shorter time the temperature of a sensor hardly changes."""
+
+
+def _lags(context: Context) -> Iterator[Floats]:
+    """Yield no lag, then lags of the die and of the sensor, up to a third of the time span."""
+    yield np.zeros(2)
+    if 'time' not in context or 'temperature' not in context:
+        return
+    time = np.unique(_times(context))
+    if len(time) < _LEAST_SIDE or np.ptp(context['temperature']) == 0.0:
+        return
+    least = max(float(np.median(np.diff(time))) / 3.0, _LEAST_LAG)
+    most = (time[-1] - time[0]) / 3.0
+    if most > least:
+        for of_sensor in (0.0, 1.0):
+            for lag in np.geomspace(least, most, _LAGS):
+                yield np.array([lag, of_sensor])
+
+
+def _forms(context: Context) -> Iterator[Floats]:
+    """Yield both forms of the hysteresis."""
+    yield from (np.array([0.0]), np.array([1.0]))
+
+
+def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
+    return context['temperature'] - REFERENCE_TEMPERATURE
+
+
+def _warming_squared(context: Mapping[str, Any], shape: Floats) -> Any:
+    return _warming(context, shape) ** 2
+
+
+def _lagged_warming(key: str) -> Factor:
+    """Return the factor of an effect whose acting temperature is the column `key`."""
+    def factor(context: Mapping[str, Any], shape: Floats) -> Any:
+        lag, of_sensor = shape
+        if lag == 0.0:
+            return _warming(context, shape)
+        return acting_temperature(context, key, lag, bool(of_sensor)) - REFERENCE_TEMPERATURE
+
+    return factor
+
+
+def _warming_rate(context: Mapping[str, Any], shape: Floats) -> Any:
+    return rate_at(context)
+
+
+def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
+    """Return the unit vector towards the previous pose, or in form 1 its sign by axis."""
+    towards: Floats = np.asarray(context['previous'], float).T
+    return np.sign(towards) if shape[0] else towards
+
+
+def _supply_change(context: Mapping[str, Any], shape: Floats) -> Any:
+    return context['supply_voltage'] / NOMINAL_SUPPLY - 1.0
+
+
+def _since(context: Mapping[str, Any], shape: Floats) -> Any:
+    return (context['time'] - shape[0]) / HOUR
+
+
+def _settling(context: Mapping[str, Any], shape: Floats) -> Any:
+    """Return exp(-(t - start) / tau)."""
+    start, tau = shape
+    return np.exp(-np.maximum(context['time'] - start, 0.0) / max(tau, 1e-9))
+
+
+def _after(context: Mapping[str, Any], shape: Floats) -> Any:
+    return np.asarray(context['time'] >= shape[0], float)
+
+
+def _columns_of(key: str, power: int = 1) -> Factor:
+    """Return the factor for a vector of the context, one component per axis."""
+    return lambda context, shape: np.asarray(context[key], float).T ** power
+
+
+def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
+    """Return the (9, n) entries of ω×(ω×·) per metre [g], row by row."""
+    rate = np.asarray(context['rate'], float).T
+    squared = np.sum(rate ** 2, axis=0)
+    entries = [rate[i] * rate[j] - (squared if i == j else 0.0)
+               for i in range(3) for j in range(3)]
+    return np.array(entries) / STANDARD_GRAVITY
+
+
+def _clipped(reading: Floats, values: Floats) -> Floats:
+    return np.clip(reading, -values[0], values[0])
+
+
+def _on_grid(reading: Floats, values: Floats) -> Floats:
+    return np.round(reading / values[0]) * values[0]
+
+
+_bending = partial(Effect, plausible_g=0.5, family='force')
+_in_time = partial(Effect, plausible_g=0.5, family='time')
+_LAG = ('lag', 'of_sensor')
+
+EFFECTS: dict[str, Effect] = {
+    'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, 1.0,
+                     by_axis(ONE), repeatable_g=0.03),
+    'gain': Effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
+                   0.5, ALL_AXES, repeatable_g=0.015),
+    'axis_gain': Effect('gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
+                        0.5, by_axis(FORCE), repeatable_g=0.015),
+    'cross_axis': Effect('cross-axis gain, symmetric', 'cross-axis sensitivity',
+                         ('xy', 'xz', 'yz'), 'g/g', 0.02, 0.5, CROSS, repeatable_g=0.015),
+    'misalignment': Effect('rotation of the sensing axes', 'input-axis misalignment', AXES, 'g/g',
+                           0.02, np.inf, _ROTATION),
+    'quadratic': _bending('square of the force', 'second-order coefficient K2', AXES, 'g/g²',
+                          0.001, terms=by_axis(SQUARE)),
+    'cubic': _bending('cube of the force', 'third-order coefficient K3', AXES, 'g/g³', 0.001,
+                      terms=by_axis(CUBE)),
+    'odd_quadratic': _bending('force times its magnitude', 'odd quadratic coefficient Koq', AXES,
+                              'g/g²', 0.001, terms=by_axis(ODD_SQUARE)),
+    'gain_asymmetry': _bending('gain that differs between + and -', 'scale-factor asymmetry', AXES,
+                               'g/g', 0.002, terms=by_axis(SIZE)),
+    'cross_coupling': _bending(
+        'product of two axes', 'cross-coupling coefficients Kip, Kio',
+        tuple(f'{AXES[i]}_{AXES[i]}{AXES[j]}' for i, j in _COUPLED), 'g/g²', 0.001,
+        terms=tuple(Term(k, i, PRODUCTS[min(i, j), max(i, j)])
+                    for k, (i, j) in enumerate(_COUPLED))),
+    'offset_temperature': _in_time(
+        'offset that changes with temperature', 'zero-g offset temperature coefficient TCO', AXES,
+        'g/°C', 0.001, terms=by_axis(ONE), factor=_lagged_warming('temperature_of_offset'),
+        needs=('temperature',), shape=_LAG, shapes=_lags, usual=(0.0, 0.0),
+        lagged='temperature_of_offset'),
+    'offset_temperature_quadratic': _in_time(
+        'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
+        1e-5, terms=by_axis(ONE), factor=_warming_squared, needs=('temperature',)),
+    'gain_temperature': _in_time(
+        'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
+        '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
+        needs=('temperature',), shape=_LAG, shapes=_lags, usual=(0.0, 0.0),
+        lagged='temperature_of_gain'),
+    'temperature_rate': _in_time(
+        'offset in proportion to the rate of the temperature', 'thermal gradient sensitivity',
+        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=_warming_rate,
+        needs=('time', 'temperature'), over=('temperature_rate',)),
+    'supply_ratio': Effect(
+        'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
+        'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',)),
+    'offset_drift': _in_time(
+        'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=by_axis(ONE),
+        factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
+    'warm_up': _in_time(
+        'offset that settles after power-on', 'turn-on transient', AXES, 'g', 0.005,
+        terms=by_axis(ONE), factor=_settling, needs=('time',), shape=('start', 'tau'),
+        shapes=_taus),
+    'offset_step': _in_time(
+        'offset that jumps at an instant', 'bias shift after shock', AXES, 'g', 0.005,
+        terms=by_axis(ONE), factor=_after, needs=('time',), shape=('instant',),
+        shapes=_instants),
+    'gain_drift': _in_time(
+        'gain that drifts with time', 'scale-factor drift', AXES, '1/h', 0.0005,
+        terms=by_axis(FORCE), factor=_since, needs=('time',), shape=('start',),
+        shapes=_from_start),
+    'gain_step': _in_time(
+        'gain that jumps at an instant', 'scale-factor shift after shock', AXES, 'g/g', 0.005,
+        terms=by_axis(FORCE), factor=_after, needs=('time',), shape=('instant',),
+        shapes=_instants),
+    'vibration_rectification': Effect(
+        'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
+        'g/g²', 0.002, 0.5, by_axis(ONE), _columns_of('std', 2), ('std',)),
+    'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
+                         0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',), _forms,
+                         usual=(0.0,)),
+    'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
+                        'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
+    'saturation': Effect('readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0,
+                         np.inf, (), output=_clipped),
+    'quantisation': Effect('readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
+                           output=_on_grid),
+}
+"""All effects that are functions of the force and the context."""
+
+WANDER = 'offset_wander'
+PROCESSES: dict[str, Effect] = {
+    WANDER: _in_time('offset that changes slowly without a known form', 'bias random walk', (),
+                     'g', 0.001, terms=(), needs=('time',))}
+"""Random processes. `accel_calib.refine` names them; a model cannot contain them."""
+
+CHANGES: dict[str, Effect] = {
+    f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
+                              factor=lambda context, shape: context['new'], needs=('new',))
+    for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
+"""Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
+is 1 for poses taken since then and 0 for the poses of the calibration."""
+
+LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
+"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""

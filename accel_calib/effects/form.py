@@ -1,0 +1,263 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The form of an effect: terms, each the product of a factor of the context and a monomial.
+
+Monomials are functions of the components of the force. A term adds parameter · factor · weight ·
+monomial to one axis of the reading.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..table import Floats
+
+Context = Mapping[str, NDArray[Any]]
+"""Context of readings by column: arrays with n rows, or one row without the first axis."""
+
+AXES = ('x', 'y', 'z')
+
+Family = Literal['', 'force', 'time']
+"""Effects of one family can be confused: nonlinearities on the 1 g sphere, trends in time."""
+
+TO_SEPARATE: dict[Family, str] = {
+    'force': 'on the 1 g sphere they overlap by up to 98 %; to separate them, take more poses '
+             'between the faces, or apply forces other than 1 g (a centrifuge)',
+    'time': 'let the temperature both rise and fall, and repeat the same orientations at other '
+            'times',
+    '': 'vary one while the other stays the same',
+}
+"""Advice on how to separate effects of one family, or of different families."""
+
+
+class Monomial(NamedTuple):
+    """
+    A function of the components of the force, for floats and for arrays.
+
+    Parameters
+    ----------
+    value : callable
+        x, y, z -> value.
+    gradient : callable
+        x, y, z -> derivatives by x, y and z.
+
+    """
+
+    value: Callable[[Any, Any, Any], Any]
+    gradient: Callable[[Any, Any, Any], tuple[Any, Any, Any]]
+
+
+def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
+    """Return the monomial that is a function of one component of the force."""
+    return (Monomial(lambda x, y, z: value(x), lambda x, y, z: (slope(x), 0.0, 0.0)),
+            Monomial(lambda x, y, z: value(y), lambda x, y, z: (0.0, slope(y), 0.0)),
+            Monomial(lambda x, y, z: value(z), lambda x, y, z: (0.0, 0.0, slope(z))))[axis]
+
+
+def _each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list[Monomial]:
+    return [_of_axis(axis, value, slope) for axis in range(3)]
+
+
+MODES = 24
+"""Number of cosines that an empirical curve can have."""
+
+
+def _wave(mode: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Return the cosine of a mode over -1 to 1 g, and its slope."""
+    turn = mode * np.pi / 2.0
+    return (lambda u: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
+            lambda u: -turn * np.sin(turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))
+
+
+MONOMIALS: tuple[Monomial, ...] = (
+    Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
+    *_each_axis(lambda u: u, lambda u: 1.0),
+    *_each_axis(lambda u: u * u, lambda u: 2.0 * u),
+    *_each_axis(lambda u: u * u * u, lambda u: 3.0 * u * u),
+    *_each_axis(lambda u: u * abs(u), lambda u: 2.0 * abs(u)),
+    *_each_axis(abs, np.sign),
+    Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
+    Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
+    Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
+    *(monomial for mode in range(1, MODES + 1) for monomial in _each_axis(*_wave(mode))),
+)
+"""1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
+k, constant beyond ±1 g. The first four are affine."""
+
+ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT, WAVE = 0, 1, 4, 7, 10, 13, 16, 19
+"""First index of each kind in `MONOMIALS`; a kind by axis has three entries."""
+
+AFFINE = 4
+"""Monomials below this index are 1, u_x, u_y, u_z."""
+
+PRODUCTS = {(0, 1): PRODUCT, (0, 2): PRODUCT + 1, (1, 2): PRODUCT + 2}
+
+
+class Term(NamedTuple):
+    """
+    One term of an effect.
+
+    Parameters
+    ----------
+    parameter : int
+        Index of the parameter that the term is proportional to.
+    axis : int
+        Axis of the reading that the term is added to.
+    monomial : int
+        Index in `MONOMIALS`.
+    weight : float
+        Constant factor.
+
+    """
+
+    parameter: int
+    axis: int
+    monomial: int
+    weight: float = 1.0
+
+
+Factor = Callable[[Mapping[str, Any], Floats], Any]
+"""
+Context, shape -> factor of all terms, (n,), or of each term, (t, n).
+
+For one row of context the axis n is missing.
+
+"""
+
+Shapes = Callable[[Context], Iterator[Floats]]
+"""Context of the poses -> shapes to try."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """
+    One named physical cause of a difference between reading and specific force.
+
+    Parameters
+    ----------
+    words : str
+        Short description.
+    term : str
+        Name in IEEE 1293 or in data sheets.
+    parameters : tuple of str
+        Names of the p parameters.
+    unit : str
+        Unit of each parameter.
+    typical : float
+        Typical size in common parts, in `unit`.
+    plausible_g : float
+        Largest contribution to the reading of a working accelerometer [g]; infinite: no limit.
+    terms : tuple of Term
+        What the effect adds to the reading.
+    factor : callable or None
+        Factor of the terms; None: 1.
+    needs : tuple of str
+        Keys of the context that the factor uses.
+    shape : tuple of str
+        Names of the s constants in which the effect is not linear.
+    shapes : callable or None
+        Shapes that the search tries; None for an effect without shape.
+    usual : tuple of float
+        Shape where a file or a command does not state it; empty: the shape must be stated. The
+        effect is then the plain one, and the search tries this shape first.
+    over : tuple of str
+        Columns that the factor is a function of; empty: those in `needs`.
+    lagged : str
+        Column of the temperature that acts, for an effect with the shape ``lag``, ``of_sensor``;
+        empty for other effects.
+    family : {'', 'force', 'time'}
+        Group of effects that can be confused with this one.
+    repeatable_g : float
+        Largest change between calibrations of one sensor [g]. A larger change indicates another
+        sensor.
+    output : callable or None
+        (n, 3) readings, (p,) values -> (n, 3) readings, for an effect on the whole reading. Such
+        an effect cannot be corrected.
+
+    """
+
+    words: str
+    term: str
+    parameters: tuple[str, ...]
+    unit: str
+    typical: float
+    plausible_g: float
+    terms: tuple[Term, ...]
+    factor: Factor | None = None
+    needs: tuple[str, ...] = ()
+    shape: tuple[str, ...] = ()
+    shapes: Shapes | None = None
+    usual: tuple[float, ...] = ()
+    over: tuple[str, ...] = ()
+    lagged: str = ''
+    family: Family = ''
+    repeatable_g: float = np.inf
+    output: Callable[[Floats, Floats], Floats] | None = None
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of all values: parameters, then shape."""
+        return self.parameters + self.shape
+
+    @property
+    def linear(self) -> bool:
+        """Whether the effect is part of V and W in every context."""
+        return self.factor is None and self.output is None and not self.bends
+
+    @property
+    def bends(self) -> bool:
+        """Whether the effect is not affine in the force."""
+        return any(term.monomial >= AFFINE for term in self.terms)
+
+    def split(self, values: Floats) -> tuple[Floats, Floats]:
+        """Split (p + s,) values into parameters and shape."""
+        return values[:len(self.parameters)], values[len(self.parameters):]
+
+    def filled(self, values: Floats) -> Floats:
+        """Return (p,) or (p + s,) values as (p + s,), with the usual shape where none is given."""
+        if self.usual and np.shape(values) == (len(self.parameters),):
+            return np.concatenate([values, self.usual])
+        return values
+
+    def shown(self, values: Floats) -> dict[str, float]:
+        """Return (p + s,) values by name, without the shape constants at their usual value."""
+        usual = dict(zip(self.shape, self.usual))
+        return {name: value for name, value in zip(self.values, values.tolist(), strict=True)
+                if usual.get(name) != value}
+
+    def is_lagged(self, shape: Floats) -> bool:
+        """Return whether the temperature of this effect lags behind, or runs ahead."""
+        return bool(self.lagged) and bool(shape[0] != 0.0)
+
+    def needs_of(self, shape: Floats) -> tuple[str, ...]:
+        """Return the columns that the effect needs with this shape; a lag needs the time."""
+        return (*self.needs, 'time') if self.is_lagged(shape) else self.needs
+
+    def over_of(self, shape: Floats) -> tuple[str, ...]:
+        """Return the columns that the factor is a function of with this shape."""
+        return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
+
+
+def by_axis(first: int) -> tuple[Term, ...]:
+    """Return terms with one parameter and one monomial per axis."""
+    step = 0 if first == ONE else 1
+    return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
+
+
+def matrix_terms(*entries: tuple[int, int, int, float]) -> tuple[Term, ...]:
+    """Return the terms of a matrix times the force, from (parameter, row, column, weight)."""
+    return tuple(Term(parameter, row, FORCE + column, weight)
+                 for parameter, row, column, weight in entries)
+
+
+CROSS = matrix_terms((0, 0, 1, 1.0), (0, 1, 0, 1.0), (1, 0, 2, 1.0), (1, 2, 0, 1.0),
+                     (2, 1, 2, 1.0), (2, 2, 1, 1.0))
+ALL_AXES = tuple(Term(0, axis, FORCE + axis) for axis in range(3))
