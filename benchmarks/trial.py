@@ -26,10 +26,10 @@ from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
 from accel_calib.files import (  # noqa: E402
     correct_bag,
-    open_recording,
+    open_log,
     read_calibration,
     read_poses,
-    read_samples,
+    read_recording,
 )
 from accel_calib.units import units_of  # noqa: E402
 
@@ -96,7 +96,7 @@ def deserialize(bag: Path) -> int:
 
 def poses(bag: Path) -> int:
     """Find the poses of a bag."""
-    with open_recording(bag) as stream:
+    with open_log(bag) as stream:
         found = capture(stream.blocks, MS2)
     if len(found.poses) == 0:
         raise RuntimeError('no poses')
@@ -105,7 +105,7 @@ def poses(bag: Path) -> int:
 
 def read(bag: Path) -> int:
     """Read the samples of a bag, and nothing else."""
-    with open_recording(bag) as stream:
+    with open_log(bag) as stream:
         return sum(len(block) for block in stream.blocks)
 
 
@@ -119,7 +119,7 @@ def table(csv: Path) -> dict[str, list[float]]:
     units = units_of('native')
     spent: dict[str, list[float]] = {'read': [], 'poses': [], 'fit': []}
     for _ in range(11):
-        recording = timed(spent['read'], lambda: read_samples(csv))
+        recording = timed(spent['read'], lambda: read_recording(csv))
         found = timed(spent['poses'], lambda recording=recording: capture(recording, units))
         timed(spent['fit'], lambda found=found: fit_poses(found.poses, units, model='10'))
     return spent

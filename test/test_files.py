@@ -11,7 +11,7 @@ from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.files import (
     read_calibration,
     read_poses,
-    read_samples,
+    read_recording,
     write_calibration,
     write_table,
 )
@@ -86,8 +86,8 @@ def test_a_bad_pose_table_is_refused_in_one_line(text, message, tmp_path):
 
 
 def test_a_recording_needs_times(tmp_path):
-    with pytest.raises(InputError, match='lacks time'):
-        read_samples(write(tmp_path, GOOD))
+    with pytest.raises(InputError, match='no column time'):
+        read_recording(write(tmp_path, GOOD))
 
 
 def test_a_missing_file_raises_the_error_of_the_system(tmp_path):

@@ -10,7 +10,7 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
-from accel_calib.files.tables import read_recording
+from accel_calib.files import read_recording
 from accel_calib.model import Model, predict
 from accel_calib.monitor import compared, Drift, monitor, rests_of, status
 from accel_calib.monitor.change_detection import MEMORY

@@ -6,7 +6,7 @@
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture, CaptureSettings
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.files import read_poses, read_samples
+from accel_calib.files import read_poses, read_recording
 from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
 from accel_calib.refine import refine
 from accel_calib.simulate import model_with, simulate_poses
@@ -198,14 +198,14 @@ def test_base_may_be_a_stored_calibration(taken):
 
 @pytest.mark.parametrize('name', ['mpu9150_imu0', 'mpu9150_imu1'])
 def test_mpu9150_has_no_hidden_effect(name):
-    poses = capture(read_samples(data(f'{name}.csv')), MPS2).poses
+    poses = capture(read_recording(data(f'{name}.csv')), MPS2).poses
     assert names(refine(poses, MPS2, base='10')) == []
     climbed = refine(poses, MPS2, base='ideal')
     assert sorted(step.effect for step in climbed.steps) == ['axis_gain', 'cross_axis', 'offset']
 
 
 def test_xsens_lacks_cross_axis_most():
-    poses = capture(read_samples(data('xsens_mti_counts.csv')), units_of('native')).poses
+    poses = capture(read_recording(data('xsens_mti_counts.csv')), units_of('native')).poses
     found = refine(poses, units_of('native'), base='7')
     assert found.steps[0].effect == 'cross_axis'
     assert found.steps[0].gap_before_mg > 2.5
@@ -223,7 +223,7 @@ def test_report_data_show_a_quadratic_part_in_the_first_phone_alone():
 
 
 def test_sensehat_moves_with_temperature():
-    recording = read_samples(data('sensehat_lsm9ds1_temperature.csv'))
+    recording = read_recording(data('sensehat_lsm9ds1_temperature.csv'))
     poses = capture(recording, G, CaptureSettings(max_dwell=3600.0)).poses
     found = refine(poses, G)
     step = next(step for step in found.steps if step.effect == 'offset_temperature')

@@ -19,7 +19,7 @@ from accel_calib.calibrate import (
 from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from, select
 from accel_calib.cli.main import main
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import read_poses, read_samples, write_table
+from accel_calib.files import read_poses, read_recording, write_table
 from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
 from accel_calib.model import Model
 from accel_calib.refine import refine
@@ -261,7 +261,7 @@ def test_a_negative_noise_of_the_rate_is_refused(tmp_path):
 
 @pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
 def test_a_real_gyro_has_the_bias_of_its_quietest_seconds(name):
-    samples = read_samples(data(name))
+    samples = read_recording(data(name))
     gyro = found(capture(samples, units_of('m/s2')).poses)
     seconds = samples['rate'][:len(samples) // 100 * 100].reshape(-1, 100, 3)
     spread = seconds.std(axis=1).max(axis=1)
@@ -272,7 +272,7 @@ def test_a_real_gyro_has_the_bias_of_its_quietest_seconds(name):
 
 
 def test_a_real_rest_that_turned_is_left_out():
-    poses = capture(read_samples(data('mpu9150_imu0.csv')), units_of('m/s2')).poses
+    poses = capture(read_recording(data('mpu9150_imu0.csv')), units_of('m/s2')).poses
     gyro = found(poses)
     away = np.linalg.norm(poses['rate'] - gyro.bias, axis=1)
     assert away.max() > np.radians(3.0)
@@ -282,7 +282,7 @@ def test_a_real_rest_that_turned_is_left_out():
 
 
 def test_a_real_gyro_in_counts_has_no_bias_in_radians():
-    poses = capture(read_samples(data('xsens_mti_counts.csv')), units_of('native')).poses
+    poses = capture(read_recording(data('xsens_mti_counts.csv')), units_of('native')).poses
     noise = sample_noise_of(poses)
     assert gyro_bias_of(poses) is None
     assert noise is not None

@@ -7,15 +7,9 @@ from .atomic import copy_atomically, remove_leftovers
 from .bag import is_bag
 from .bag_correction import correct_bag, Progress
 from .calibration_yaml import read_calibration, write_calibration
-from .tables import (
-           open_recording,
-           OpenRecording,
-           read_poses,
-           read_recording,
-           read_samples,
-           write_table,
-)
+from .logs import Log, LogOptions, open_log, OpenLog, read_log, read_recording
+from .tables import read_poses, write_table
 
-__all__ = ['OpenRecording', 'Progress', 'copy_atomically', 'correct_bag', 'is_bag',
-           'open_recording', 'read_calibration', 'read_poses', 'read_recording', 'read_samples',
+__all__ = ['Log', 'LogOptions', 'OpenLog', 'Progress', 'copy_atomically', 'correct_bag', 'is_bag',
+           'open_log', 'read_calibration', 'read_log', 'read_poses', 'read_recording',
            'remove_leftovers', 'write_calibration', 'write_table']

@@ -1,0 +1,238 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Opening of logs of all kinds, and of tables with our own names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .ardupilot import is_dataflash, read_dataflash
+from .columns import Source
+from .dialect import Layout
+from .flight import FlightLog
+from .names import OURS, READING
+from .px4 import is_ulg, read_ulg
+from .quantities import decided, Quantities
+from .records import are_samples, Log, LogOptions, OpenLog
+from .selection import chosen, is_log_header, with_indices
+from .text import Cells, open_text, TextTable
+from ..bag import is_bag, open_samples, together
+from ...calibrate import check_units
+from ...errors import InputError
+from ...table import check_values, COLUMNS, Poses, present, Recording
+from ...units import UnitName, Units, units_of
+
+_Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
+_SHOWN = 12
+_MANY_POSES = 200
+"""A table with more rows than these may well be one of samples."""
+
+
+def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
+    """
+    Read a log of any kind; parameters and errors as in `open_log`.
+
+    Returns
+    -------
+    Log
+        The poses of a pose table, or the samples of a recording.
+
+    """
+    with open_log(path, options) as log:
+        table = log.poses if log.poses is not None else together(list(log.blocks))
+        return Log(table, log.units, log.read_as, log.notes)
+
+
+def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
+    """Return all samples of a recording; `topic`, `sensor` and errors as in `open_log`."""
+    with open_log(path, LogOptions(topic=topic, sensor=sensor)) as log:
+        return together(list(log.blocks))
+
+
+@contextmanager
+def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
+    """
+    Open a log of any kind: text, a bag, or a flight log of PX4 or ArduPilot.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or the folder of a rosbag2.
+    options : LogOptions
+        How to read it; by default it is recognised.
+
+    Raises
+    ------
+    InputError
+        If the log cannot be read, has no accelerometer or several, contradicts the options, or
+        holds no gravity; also while it is read.
+    OSError
+        If the file cannot be read.
+
+    """
+    if is_bag(path):
+        with open_samples(path, options.topic, options.sensor,
+                          temperature_topic=options.temperature_topic,
+                          supply_topic=options.supply_topic) as bag:
+            units = _units(path, 'm/s2', options)
+            yield OpenLog(bag.blocks, bag.samples, units, bag.sensor, noted=lambda: bag.notes)
+    elif is_ulg(path):
+        yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
+    elif is_dataflash(path):
+        yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
+    else:
+        with open_text(path, lambda cells: is_log_header(cells, options)) as text:
+            yield _text(path, text, options)
+
+
+def _units(path: Path, name: UnitName, options: LogOptions) -> Units:
+    """Return the unit that a log states; refuse another one."""
+    if options.units and options.units != name:
+        raise InputError(f'{path} is in {name}, but --units is {options.units}',
+                         'remove --units')
+    return units_of(name, options.gravity)
+
+
+def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
+    """Return a flight log that is read."""
+    recording = log.recording(str(path))
+    return OpenLog(iter((recording,)), len(recording), _units(path, log.units, options),
+                   log.sensor, log.read_as, noted=lambda: log.notes)
+
+
+def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
+    """Return an open text log."""
+    columns = chosen(text.layout, options)
+    cells = text.blocks(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
+    first = next(cells)
+    quantities = decided(columns, first, options)
+    blocks = _converted(path, chain((first,), cells), quantities)
+    sensor = str(text.layout.about.get('sensor', ''))
+
+    def noted() -> Sequence[str]:
+        return (*text.notes, *quantities.all_notes)
+
+    head, name = next(blocks), quantities.units.name
+    if options.units or text.layout.about.get('units'):
+        check_units(Poses(*head), quantities.units)
+    if are_samples(head[0]):
+        recordings = (Recording(*block, name, sensor) for block in chain((head,), blocks))
+        return OpenLog(recordings, _samples(path, text, head), quantities.units, sensor,
+                       quantities.read_as, noted=noted)
+    poses = Poses(*_whole([head, *blocks]), name, sensor)
+    if 'time' not in poses and len(poses) > _MANY_POSES:
+        quantities.notes.append(f'each of the {len(poses)} rows is taken for a pose, because '
+                                'there are no times: samples need --columns time=NAME')
+    return OpenLog(_as_samples(path, poses), len(poses), quantities.units, sensor,
+                   quantities.read_as, poses, noted)
+
+
+def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[_Block]:
+    """Yield blocks in our units."""
+    for each in cells:
+        columns, row = quantities.columns(each)
+        check_values(columns, str(path))
+        yield columns, row
+
+
+def _whole(blocks: Sequence[_Block]) -> _Block:
+    """Return blocks as one."""
+    if len(blocks) == 1:
+        return blocks[0]
+    return ({key: np.concatenate([columns[key] for columns, _ in blocks])
+             for key in blocks[0][0]}, np.concatenate([row for _, row in blocks]))
+
+
+def _samples(path: Path, text: TextTable, head: _Block) -> int:
+    """Return the number of samples, from the size of the file and of the first block."""
+    if not text.more:
+        return len(head[1])
+    width = 2 if text.layout.encoding.startswith('utf-16') else 1
+    return max(len(head[1]), int(path.stat().st_size / width / max(text.characters, 1)
+                                 * len(head[1])))
+
+
+def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
+    """Yield the rows of a table as samples, for a command that needs samples."""
+    if 'time' not in poses:
+        raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
+                         'the samples, or name their column with --columns time=NAME')
+    yield Recording(poses.columns, poses.row, poses.units, poses.sensor)
+
+
+# -------------------------------------------------------------------------- our own tables
+
+@dataclass(frozen=True)
+class OwnTable:
+    """
+    An open table with our own names and units; `open_own` makes it.
+
+    Parameters
+    ----------
+    blocks : iterator of (dict, array)
+        Columns under the keys of `COLUMNS`, and row numbers.
+    about : mapping
+        Units and sensor, if the table states them.
+    samples : int
+        Number of rows; of a long table, an estimate from the size of the file.
+
+    """
+
+    blocks: Iterator[_Block]
+    about: dict[str, Any]
+    samples: int
+
+
+@contextmanager
+def open_own(path: Path, needed: Sequence[str]) -> Iterator[OwnTable]:
+    """
+    Open a table with our own names, in any dialect.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    needed : sequence of str
+        Required keys of `COLUMNS`.
+
+    Raises
+    ------
+    InputError
+        If the table is empty, lacks columns, or contains a value that is not a finite number;
+        also while it is read.
+    OSError
+        If the file cannot be read.
+
+    """
+    expected = ','.join(name for key in needed for name in COLUMNS[key].names)
+    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
+                   expected=expected) as text:
+        index = {name: k for k, name in enumerate(text.layout.header)}
+        columns = with_indices(text.layout, {
+            name: Source(index[name], name)
+            for key in _own_keys(text.layout, needed) for name in COLUMNS[key].names})
+        quantities = Quantities(columns, units_of('g'))
+        blocks = _converted(path, text.blocks(columns.numeric, columns.text), quantities)
+        head = next(blocks)
+        yield OwnTable(chain((head,), blocks), dict(text.layout.about),
+                       _samples(path, text, head))
+
+
+def _own_keys(layout: Layout, needed: Sequence[str]) -> list[str]:
+    """Return the keys of the columns of a table; refuse duplicate and incomplete columns."""
+    header = [name for name in layout.header if name in OURS]
+    for name in header[:2 * len(OURS)]:
+        if header.count(name) > 1:
+            raise InputError(f'{layout.path} has {header.count(name)} columns {name}, expected '
+                             'one', 'remove or rename the others')
+    others = [name for name in layout.header[:_SHOWN] if name not in OURS]
+    return present([*header, *others], needed, str(layout.path))

@@ -1,0 +1,409 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Samples of the makers' layouts: each is read, captured and fitted, and the truth is found."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from pathlib import Path
+import sys
+from typing import Any
+
+from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
+from accel_calib.capture import capture
+from accel_calib.errors import InputError
+from accel_calib.files.logs import LogOptions, read_log
+from accel_calib.files.logs.ardupilot import is_dataflash, read_dataflash
+from accel_calib.files.logs.formats import FORMATS, named, NAMES, recognise, record_instead
+from accel_calib.files.logs.px4 import is_ulg, read_ulg
+from accel_calib.table import Recording
+import numpy as np
+import pytest
+
+LOGS = Path(__file__).parent / 'data' / 'logs'
+_spec = importlib.util.spec_from_file_location('make_logs', LOGS / 'make.py')
+assert _spec is not None
+assert _spec.loader is not None
+make = importlib.util.module_from_spec(_spec)
+sys.modules['make_logs'] = make
+_spec.loader.exec_module(make)
+
+TEXTS = [name for name in make.TRUTHS if name.endswith('.csv')]
+WITHIN_SD = 5.0
+
+
+def needed(name: str) -> None:
+    """Skip the test if the library for this file is not installed."""
+    if name.endswith('.ulg'):
+        pytest.importorskip('pyulog')
+    if name.endswith('.bin'):
+        pytest.importorskip('pymavlink')
+
+
+def header_of(name: str) -> list[str]:
+    with (LOGS / name).open(encoding='utf-8', newline='') as file:
+        first = file.readline()
+    delimiter = next(each for each in ';\t,' if each in first)
+    return next(csv.reader([first], delimiter=delimiter, skipinitialspace=True))
+
+
+def check(recording: Recording, units: Any, name: str) -> Calibration:
+    """Capture and fit a recording, and compare with the truth of the sample."""
+    truth = make.TRUTHS[name]
+    assert units.name == truth.units
+    poses = capture(recording, units).poses
+    assert len(poses) == make.POSES
+    calibration = fit_poses(poses, units, model='10')
+    assert np.all(np.abs(calibration.offset - truth.offset) < WITHIN_SD * calibration.offset_sd)
+    assert np.all(np.abs(calibration.gain - truth.gain) < WITHIN_SD * calibration.gain_sd)
+    return calibration
+
+
+@pytest.mark.parametrize('name', make.TRUTHS)
+def test_a_sample_is_read_without_any_option_and_its_truth_is_found(name: str) -> None:
+    needed(name)
+    log = read_log(LOGS / name)
+    assert isinstance(log.table, Recording)
+    check(log.table, log.units, name)
+    assert ('temperature' in log.table) == make.TRUTHS[name].temperature
+    if make.TRUTHS[name].rate:
+        assert np.ptp(log.table['rate'], axis=0).max() > 1.0  # rad/s, in the turns
+        assert np.abs(np.median(log.table['rate'], axis=0)).max() < 0.01
+    if make.TRUTHS[name].temperature:
+        assert np.ptp(log.table['temperature']) == pytest.approx(np.ptp(make.WARM), rel=0.05)
+    assert log.table['time'][-1] - log.table['time'][0] == pytest.approx(44.75, abs=0.01)
+
+
+@pytest.mark.parametrize('name', make.TRUTHS)
+def test_a_sample_is_read_the_same_when_the_user_names_its_format(name: str) -> None:
+    needed(name)
+    log = read_log(LOGS / name, LogOptions(format=name.split('/')[0]))
+    plain = read_log(LOGS / name)
+    assert log.units == plain.units
+    np.testing.assert_allclose(log.table.reading, plain.table.reading, rtol=1e-12)
+    np.testing.assert_allclose(log.table['time'], plain.table['time'], rtol=1e-12)
+
+
+@pytest.mark.parametrize('name', make.WITHOUT_GRAVITY)
+def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(name: str) -> None:
+    with pytest.raises(InputError, match='gravity') as caught:
+        read_log(LOGS / name)
+    assert record_instead(header_of(name), LOGS / name) in caught.value.advice
+    assert 'native' not in str(caught.value)
+
+
+@pytest.mark.parametrize('name', make.OTHER_SENSORS)
+def test_a_log_of_another_sensor_with_the_same_columns_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match='another sensor'):
+        read_log(LOGS / name)
+
+
+def test_another_format_than_that_of_the_file_is_refused_with_what_is_lacking() -> None:
+    with pytest.raises(InputError, match='lacks .*accSmooth'):
+        read_log(LOGS / 'phyphox/comma_point.csv', LogOptions(format='betaflight'))
+
+
+def test_an_unknown_format_is_refused_with_the_one_that_is_meant() -> None:
+    with pytest.raises(InputError, match='use phyphox'):
+        named('phypox', ['Time (s)'], 'log.csv')
+
+
+# ------------------------------------------------------------------------------ the formats
+
+def test_all_formats_of_the_command_line_are_there() -> None:
+    assert NAMES == ('phyphox', 'sensor-logger', 'matlab', 'px4', 'ardupilot', 'betaflight',
+                     'esp32')
+
+
+@pytest.mark.parametrize('layout', FORMATS, ids=lambda each: each.name)
+def test_a_format_states_its_source_and_uses_our_names(layout: Any) -> None:
+    assert layout.source.startswith('https://')
+    ours = {'time', 'ax', 'ay', 'az', 'gx', 'gy', 'gz', 'temperature'}
+    assert set(layout.columns) <= ours
+    assert set(layout.scales) | set(layout.divisors) <= set(layout.columns)
+    assert not layout.columns or {'time', 'ax', 'ay', 'az'} <= set(layout.columns)
+    assert not layout.without_gravity or layout.record
+
+
+@pytest.mark.parametrize('name', [each for each in TEXTS if not each.startswith(('esp32', 'mat'))
+                                  and 'explorer' not in each])
+def test_the_layout_of_a_sample_is_plain_from_its_names(name: str) -> None:
+    layout = recognise(header_of(name))
+    assert layout is not None
+    assert layout.name == name.split('/')[0]
+    assert {'time', 'ax', 'ay', 'az'} <= set(layout.present(header_of(name)))
+
+
+@pytest.mark.parametrize('header', ['time,ax,ay,az', 'timestamp,x,y,z', 'time,x,y,z',
+                                    'millis,accX,accY,accZ'])
+def test_names_that_many_tools_use_are_not_taken_for_a_maker_s(header: str) -> None:
+    assert recognise(header.split(',')) is None
+
+
+def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path: Path) -> None:
+    lines = (LOGS / 'ardupilot/two_imus.csv').read_text(encoding='utf-8').splitlines()
+    rows = [line.split(',') for line in lines]
+    kept = [row[:2] + row[3:] for row in rows if row[2] in ('I', '0')]
+    path = tmp_path / 'log.csv'
+    path.write_text('\n'.join(map(','.join, kept)) + '\n', encoding='utf-8')
+    log = read_log(path)
+    assert isinstance(log.table, Recording)
+    check(log.table, log.units, 'ardupilot/two_imus.csv')
+
+
+def test_the_frame_of_a_format_makes_a_level_vehicle_read_up() -> None:
+    name = 'px4/log_sensor_accel_0.csv'
+    log, layout = read_log(LOGS / name), recognise(header_of(name))
+    assert layout is not None
+    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
+    fitted = fit_poses(poses, log.units, model='10')
+    calibration = level_by_rows(fitted, poses, layout.frame, 1, None)
+    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
+    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
+    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)
+
+
+# ------------------------------------------------------------------------------- the samples
+
+def test_the_samples_are_small() -> None:
+    sizes = [path.stat().st_size for path in LOGS.rglob('*') if path.is_file()]
+    assert max(sizes) < 300_000
+    assert sum(sizes) < 2_000_000
+
+
+def test_the_script_writes_the_stored_samples(tmp_path: Path) -> None:
+    for write in make.MAKERS.values():
+        write(tmp_path)
+    written = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob('*') if path.is_file())
+    assert written == sorted(Path(name) for name in (*make.TRUTHS, *make.WITHOUT_GRAVITY,
+                                                     *make.OTHER_SENSORS))
+    for name in written:
+        stored, new = (LOGS / name).read_bytes(), (tmp_path / name).read_bytes()
+        assert new[:150] == stored[:150], f'{name}: run test/data/logs/make.py'
+        assert len(new) == pytest.approx(len(stored), rel=1e-3)
+
+
+def test_the_csv_of_px4_has_the_columns_that_ulog2csv_writes(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    from pyulog.ulog2csv import convert_ulog2csv
+
+    convert_ulog2csv(str(LOGS / 'px4/default.ulg'), '', str(tmp_path), ',', 0, 0)
+    for topic in ('sensor_combined', 'vehicle_imu', 'sensor_accel'):
+        made = (tmp_path / f'default_{topic}_0.csv').read_text().splitlines()
+        stored = (LOGS / f'px4/log_{topic}_0.csv').read_text().splitlines()
+        assert made[0] == stored[0]
+
+
+def test_pymavlink_reads_the_sample_of_ardupilot_as_it_was_simulated() -> None:
+    pytest.importorskip('pymavlink')
+    from pymavlink.DFReader import DFReader_binary
+
+    log = DFReader_binary(str(LOGS / 'ardupilot/two_imus.bin'))
+    first = log.recv_match(type='IMU')
+    name, values = next(row for row in make.dataflash_rows() if row[0] == 'IMU')
+    fields = dict(zip(make.DATAFLASH[name][2].split(','), values))
+    log.close()
+    assert first.to_dict() == {'mavpackettype': 'IMU', **{
+        key: pytest.approx(value, rel=1e-6) for key, value in fields.items()}}
+
+
+# ---------------------------------------------------------------------------------- PX4 logs
+
+def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
+    pytest.importorskip('pyulog')
+    log = read_ulg(LOGS / 'px4/default.ulg')
+    assert log.sensor == 'sensor_combined 0'
+    samples = make.recording(40, down=True)
+    np.testing.assert_allclose(log.columns['temperature'], samples['temperature'], atol=0.08)
+    np.testing.assert_allclose(np.diff(log.columns['time']), 1.0 / make.RATE_HZ, atol=1e-6)
+    assert any('CAL_ACC' in note for note in log.notes)
+
+
+def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
+    pytest.importorskip('pyulog')
+    log = read_ulg(LOGS / 'px4/default.ulg', 'sensor_accel', '1')
+    assert log.sensor == 'sensor_accel 1'
+    samples = make.recording(40, down=True)
+    np.testing.assert_allclose(log.columns['ax'], samples.reading[::20, 0] * make.G, rtol=1e-6)
+
+
+def test_a_message_that_a_px4_log_lacks_is_refused_with_those_that_it_has() -> None:
+    pytest.importorskip('pyulog')
+    with pytest.raises(InputError, match='has sensor_accel 0, expected vehicle_imu'):
+        read_ulg(LOGS / 'px4/thermal.ulg', 'vehicle_imu')
+
+
+def test_a_name_of_the_sensor_names_it_and_does_not_choose() -> None:
+    pytest.importorskip('pyulog')
+    log = read_ulg(LOGS / 'px4/thermal.ulg', sensor='left imu')
+    assert log.sensor == 'left imu'
+    assert 'sensor_accel 0' in log.read_as
+    with pytest.raises(InputError, match='expected a message 3'):
+        read_ulg(LOGS / 'px4/thermal.ulg', sensor='3')
+
+
+def test_a_message_of_another_version_of_px4_is_not_read(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    samples = make.recording(1)
+    older = {name: field for name, field in make.imu_fields(samples, 1).items()
+             if name != 'delta_velocity_dt'}
+    path = tmp_path / 'log.ulg'
+    path.write_bytes(make.ulog_bytes([('vehicle_imu', 0, older)]))
+    with pytest.raises(InputError, match='none of the messages'):
+        read_ulg(path)
+
+
+def test_vehicle_imu_is_divided_by_its_interval() -> None:
+    pytest.importorskip('pyulog')
+    log = read_ulg(LOGS / 'px4/default.ulg', 'vehicle_imu')
+    samples = make.recording(40, down=True)
+    np.testing.assert_allclose(log.columns['az'], samples.reading[::10, 2] * make.G, rtol=1e-6)
+    np.testing.assert_allclose(log.columns['gy'], samples['rate'][::10, 1], atol=1e-6)
+
+
+def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    fields = make.combined_fields(make.recording(1))
+    kind, relative = fields['accelerometer_timestamp_relative']
+    fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
+    path = tmp_path / 'log.ulg'
+    path.write_bytes(make.ulog_bytes([('sensor_combined', 0, fields)]))
+    log = read_ulg(path)
+    assert len(log.columns['time']) == len(relative) - 3
+    assert '3 rows of sensor_combined 0 left out' in log.notes[0]
+
+
+def test_a_px4_log_that_is_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    path = tmp_path / 'log.ulg'
+    path.write_bytes((LOGS / 'px4/thermal.ulg').read_bytes()[:40_001])
+    assert 300 < len(read_ulg(path).columns['time']) < 600
+
+
+@pytest.mark.parametrize('content', [b'', b'ULog\x01\x12\x35\x01', b'time,ax,ay,az\n0,1,2,3\n',
+                                     b'ULog\x01\x12\x35\x01' + b'\xff' * 500])
+def test_what_is_no_px4_log_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    pytest.importorskip('pyulog')
+    path = tmp_path / 'log.ulg'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r'log\.ulg') as caught:
+        read_ulg(path)
+    assert '\n' not in str(caught.value)
+
+
+def test_without_pyulog_a_px4_log_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'pyulog', None)
+    with pytest.raises(InputError, match='pip install pyulog'):
+        read_ulg(LOGS / 'px4/default.ulg')
+
+
+# ----------------------------------------------------------------------------- ArduPilot logs
+
+def test_the_lowest_sensor_of_an_ardupilot_log_is_read_and_the_others_are_named() -> None:
+    pytest.importorskip('pymavlink')
+    log = read_dataflash(LOGS / 'ardupilot/two_imus.bin')
+    assert log.sensor == 'IMU 0'
+    assert any('IMU 1' in note for note in log.notes)
+    other = read_dataflash(LOGS / 'ardupilot/two_imus.bin', sensor='1')
+    samples = make.recording(51, down=True, poses=6)
+    np.testing.assert_allclose(other.columns['ay'], samples.reading[:, 1] * make.G, rtol=1e-6)
+
+
+def test_the_csv_of_two_sensors_gives_the_lowest_or_the_one_that_is_named() -> None:
+    path = LOGS / 'ardupilot/two_imus.csv'
+    assert len(read_log(path).table) == len(make.recording(50))
+    other = read_log(path, LogOptions(sensor='1')).table
+    samples = make.recording(51, down=True, poses=6)
+    np.testing.assert_allclose(other.reading, samples.reading * make.G, rtol=1e-5, atol=1e-6)
+
+
+def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
+    pytest.importorskip('pymavlink')
+    binary = read_dataflash(LOGS / 'ardupilot/two_imus.bin')
+    text = read_dataflash(LOGS / 'ardupilot/one_imu.log')
+    assert set(binary.columns) == set(text.columns)
+    for key, values in binary.columns.items():
+        np.testing.assert_allclose(text.columns[key], values, rtol=1e-6, atol=1e-9)
+
+
+def test_an_ardupilot_log_that_is_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
+    pytest.importorskip('pymavlink')
+    path = tmp_path / 'log.bin'
+    path.write_bytes((LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003])
+    log = read_dataflash(path)
+    assert 400 < len(log.columns['time']) < 600
+    assert '1 message cut off at the end' in log.notes
+
+
+def test_garbage_within_an_ardupilot_log_is_passed_over(tmp_path: Path) -> None:
+    pytest.importorskip('pymavlink')
+    whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
+    start = whole.index(b'\xa3\x95\x65', 20_000)
+    path = tmp_path / 'log.bin'
+    path.write_bytes(whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
+    stored, read = read_dataflash(LOGS / 'ardupilot/raw_acc.bin'), read_dataflash(path)
+    np.testing.assert_array_equal(read.columns['az'], stored.columns['az'])
+
+
+def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
+    path = tmp_path / 'old.log'
+    path.write_text('FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'
+                    'FMT, 131, 43, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                    'FMT, 135, 43, IMU2, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                    'IMU, 1000, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8\n'
+                    'IMU2, 1000, 0.1, 0.2, 0.3, 1.5, 2.5, -9.5\n'
+                    'IMU, 1020, 0.1, 0.2, 0.3, 1.1, 2.1, -9.9\n'
+                    'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
+                    'IMU, 1040, 0.1\n')
+    log = read_dataflash(path)
+    np.testing.assert_allclose(log.columns['time'], [1.0, 1.02])
+    np.testing.assert_allclose(log.columns['az'], [-9.8, -9.9])
+    assert any('1 line of another length' in note for note in log.notes)
+    np.testing.assert_allclose(read_dataflash(path, sensor='1').columns['ax'], [1.5, 1.6])
+
+
+def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
+    rows = [*make.dataflash_rows()[:len(make.DATAFLASH)],
+            ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)), *make.imu_rows(make.recording(1), 0)]
+    pytest.importorskip('pymavlink')
+    path = tmp_path / 'log.bin'
+    path.write_bytes(make.dataflash_bytes(rows))
+    assert any('INS_ACCOFFS_X 0.25' in note for note in read_dataflash(path).notes)
+
+
+@pytest.mark.parametrize('content', [b'', b'\xa3\x95\x80', b'time,ax\n1,2\n',
+                                     b'\xa3\x95\x80' + b'\xff' * 400])
+def test_what_is_no_ardupilot_log_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    pytest.importorskip('pymavlink')
+    path = tmp_path / 'log.bin'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r'log\.bin') as caught:
+        read_dataflash(path)
+    assert '\n' not in str(caught.value)
+
+
+def test_without_pymavlink_a_binary_log_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch
+                                                               ) -> None:
+    monkeypatch.setitem(sys.modules, 'pymavlink.DFReader', None)
+    with pytest.raises(InputError, match='pip install pymavlink'):
+        read_dataflash(LOGS / 'ardupilot/two_imus.bin')
+
+
+def test_a_flight_log_that_is_missing_is_an_error_of_the_file(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    for read in (read_ulg, read_dataflash):
+        with pytest.raises(FileNotFoundError):
+            read(tmp_path / 'missing')
+    assert not is_ulg(tmp_path / 'missing')
+    assert not is_dataflash(tmp_path)
+
+
+def test_flight_logs_are_told_from_other_files_by_their_content() -> None:
+    assert is_ulg(LOGS / 'px4/default.ulg')
+    assert is_dataflash(LOGS / 'ardupilot/two_imus.bin')
+    assert is_dataflash(LOGS / 'ardupilot/one_imu.log')
+    for name in ('esp32/counts.log', 'ardupilot/two_imus.csv', 'px4/log_sensor_accel_0.csv'):
+        assert not is_ulg(LOGS / name)
+        assert not is_dataflash(LOGS / name)
