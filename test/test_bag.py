@@ -149,7 +149,7 @@ def test_a_file_that_is_not_a_bag_is_refused_in_one_line(file, tmp_path):
 
 
 def test_an_empty_folder_is_not_a_bag(tmp_path):
-    with pytest.raises(InputError, match='is damaged or not a bag'):
+    with pytest.raises(InputError, match='is a folder without a bag'):
         read_recording(tmp_path)
 
 

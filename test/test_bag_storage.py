@@ -10,7 +10,7 @@ import struct
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.files import bag, correct_bag, open_recording, read_recording
+from accel_calib.files import bag, correct_bag, LogOptions, open_log, read_recording
 from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import simulate_poses, simulate_recording
 from accel_calib.sphere import spread_directions
@@ -321,7 +321,7 @@ def test_poses_do_not_depend_on_the_size_of_blocks(tmp_path, monkeypatch):
     whole = capture(read_recording(path, '/imu/a'), UNITS)
     monkeypatch.setattr(bag, '_ROWS', 50)
     monkeypatch.setattr(bag, 'BLOCK', 20)
-    with open_recording(path, '/imu/a') as stream:
+    with open_log(path, LogOptions(topic='/imu/a')) as stream:
         assert stream.samples == len(recording)
         found = capture(stream.blocks, UNITS)
     assert len(whole.poses) == 8

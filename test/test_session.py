@@ -259,10 +259,21 @@ def test_an_empty_store_is_no_problem(tmp_path: Path) -> None:
     assert (loaded.calibration, loaded.poses, loaded.problem, loaded.notes) == (None, None, '', ())
 
 
-def test_calibration_in_another_unit_is_refused(stored: Stored) -> None:
-    store = Store(stored(unit='g'), Identity('', '/imu'), 'm/s2')
-    with pytest.raises(StoredCalibrationError, match='for readings in g'):
+def test_calibration_in_native_units_is_refused_for_other_readings(stored: Stored) -> None:
+    store = Store(stored(unit='native'), Identity('', '/imu'), 'm/s2')
+    with pytest.raises(StoredCalibrationError, match='for readings in native'):
         store.load_calibration()
+
+
+def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
+    path = stored(unit='g')
+    loaded = Store(path, Identity('', '/imu'), 'm/s2').load_calibration()
+    assert loaded is not None
+    assert (loaded.units.name, loaded.units.per_g) == ('m/s2', GRAVITY)
+    reading = np.array([[1.0, -2.0, 9.0]])
+    np.testing.assert_allclose(
+        loaded.correct(reading), read_calibration(path).correct(reading / GRAVITY) * GRAVITY,
+        rtol=1e-14)
 
 
 def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
@@ -504,9 +515,9 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
     path = stored(sensor='imu_link')
     before = path.read_text()
     step = path.with_name(f'{path.name}.before1')
-    step.write_text(before.replace('readings: m/s2', 'readings: g'))
+    step.write_text(before.replace('readings: m/s2', 'readings: native'))
     store = Store(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
-    with pytest.raises(StoredCalibrationError, match='is for readings in g'):
+    with pytest.raises(StoredCalibrationError, match='is for readings in native'):
         store.step_back()
     assert path.read_text() == before
     assert step.exists()

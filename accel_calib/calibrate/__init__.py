@@ -16,6 +16,7 @@ range of a calibration.
 from .calibration import (
     Calibration,
     check_sensor,
+    converted,
     EDITED,
     of_samples,
     Quality,
@@ -43,8 +44,8 @@ from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_M
 __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR',
            'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FrameName', 'GyroBias', 'Method',
            'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'SampleNoise', 'Verification',
-           'carried_words', 'check_sensor', 'check_units', 'directions_of', 'fit_partial',
-           'fit_poses', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
+           'carried_words', 'check_sensor', 'check_units', 'converted', 'directions_of',
+           'fit_partial', 'fit_poses', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
            'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples', 'outlook',
            'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
            'with_given_mounting', 'with_rest_noise']

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import AXES, Context
-from ..errors import StoredCalibrationError
+from ..errors import InputError, StoredCalibrationError
 from ..html_table import table
 from ..model import correct, force_slope, Model, parameter_names, predict
 from ..table import Floats, Poses, Table
 from ..thermal import acting_temperature, rate_at, ThermalStream
-from ..units import Units
+from ..units import STANDARD_GRAVITY, UnitName, Units
 
 EDITED = 'the file was edited by hand since it was stored'
 """Warning of a calibration whose file does not match its checksum."""
@@ -32,6 +32,8 @@ THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 
 HELD = ('time', 'temperature', *THERMAL, 'supply_voltage')
 """Context that is limited to the range of the poses; effects are not extrapolated."""
+
+_IN_READING_UNITS = ('reading', 'std', 'reference')
 
 _Known = TypeVar('_Known', bound=Table)
 
@@ -210,6 +212,59 @@ class Calibration:
         """Return the calibration without the mounting: offset, gain and the other effects."""
         return replace(self, model=Model(self.model.values)) if self.is_levelled else self
 
+    def in_units(self, units: Units | UnitName) -> Calibration:
+        """
+        Return the same calibration for readings in another unit.
+
+        Drivers convert g to m/s² with the standard gravity, not with the local gravity, so only
+        the name of the unit matters here. The effects are in local g, and do not change. The
+        poses and the noise are converted.
+
+        Parameters
+        ----------
+        units : Units, or {'m/s2', 'g', 'native'}
+            Unit of the readings.
+
+        Returns
+        -------
+        Calibration
+            The converted calibration, or this one if it is in that unit.
+
+        Raises
+        ------
+        InputError
+            If one of the two units is native and the other is not.
+
+        """
+        before, name = self.units, units.name if isinstance(units, Units) else units
+        if name == before.name:
+            return self
+        factor = conversion(before.name, name)
+        noise = self.noise and replace(self.noise, force=self.noise.force * factor)
+        return replace(self, units=Units(name, before.per_g * factor), noise=noise,
+                       poses=converted(self.poses, before.name, name))
+
+    def in_units_of(self, table: Table) -> Calibration:
+        """
+        Return the same calibration for the readings of a table.
+
+        If the table states no unit, the median length of the readings decides between g and m/s².
+
+        Raises
+        ------
+        InputError
+            If one of the two units is native and the other is not.
+
+        """
+        own = self.units
+        if table.units or own.name == 'native' or not len(table):
+            return self.in_units(table.units or own.name)
+        other = self.in_units('g' if own.name == 'm/s2' else 'm/s2')
+        with np.errstate(over='ignore'):
+            length = float(np.median(np.linalg.norm(table.reading, axis=1)))
+        border = float(np.sqrt(own.per_g * other.units.per_g))
+        return other if (length > border) is (other.units.per_g > border) else self
+
     @property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
@@ -243,6 +298,12 @@ class Calibration:
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
                 for key in HELD if key in wanted and key in known and np.any(used)}
+
+    def typical_context(self, count: int) -> Context:
+        """Return the middle of `ranges` for `count` samples, without motion and vibration."""
+        none = np.zeros((count, 3))
+        middle = {key: np.full(count, sum(limits) / 2.0) for key, limits in self.ranges.items()}
+        return {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(count), **middle}
 
     def _with_acting(self, known: Context) -> Context:
         """Return a context with rate and lag of the temperature, from its rows as history."""
@@ -346,6 +407,32 @@ class Calibration:
             return context or {}
         known = self._with_acting(context)
         return {**known, **_held(known, self.ranges)}
+
+
+def conversion(before: UnitName, after: UnitName) -> float:
+    """
+    Return the factor from readings in one unit to readings in another unit.
+
+    Raises
+    ------
+    InputError
+        If one of the two units is native and the other is not.
+
+    """
+    if before == after:
+        return 1.0
+    if 'native' in (before, after):
+        raise InputError(f'the calibration is for readings in {before}, but the readings are in '
+                         f'{after}, and the scale of native units is not known',
+                         f'use readings in {before}, or fit a calibration to poses in {after}')
+    return STANDARD_GRAVITY if after == 'm/s2' else 1.0 / STANDARD_GRAVITY
+
+
+def converted(table: _Known, before: UnitName, after: UnitName) -> _Known:
+    """Return a table with its readings in another unit; errors as in `conversion`."""
+    factor = conversion(before, after)
+    known = {key: table[key] * factor for key in _IN_READING_UNITS if key in table}
+    return replace(table.with_columns(**known), units=after)
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

@@ -185,10 +185,7 @@ def deviations_g(calibration: Calibration, up: Floats) -> Floats:
 
     """
     model = calibration.model
-    context = {key: np.full(len(up), sum(limits) / 2.0)
-               for key, limits in calibration.ranges.items()}
-    none = np.zeros((len(up), 3))
-    known = {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(len(up)), **context}
+    known = calibration.typical_context(len(up))
     if any(key not in known for key in model.needs):
         return np.zeros(len(up))
     across = times(model.at(known).inverse_slope(up).swapaxes(-1, -2), up)

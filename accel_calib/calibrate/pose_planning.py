@@ -282,8 +282,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     Parameters
     ----------
     calibration : Calibration
-        A calibration with a linear model, as `accel_calib.calibrate.fit_poses` returns it, or one
-        of a sensor that cannot be turned over (`accel_calib.calibrate.partial`).
+        A calibration of any kind; effects are taken in the middle of their range.
     asked : {'auto', '4', '7', '9', '10', '12'}
         The requested model.
 
@@ -308,8 +307,10 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
 def _uncertainty(calibration: Calibration) -> float:
     """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
     up = OVER_THE_SPHERE
-    per_g = calibration.force_per_g
-    covariance = calibration.force_covariance(up * per_g) / per_g ** 2
+    per_g, known = calibration.force_per_g, calibration.typical_context(len(up))
+    if any(key not in known for key in calibration.model.needs):
+        return np.nan
+    covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
     errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.name == '12'
               else np.einsum('ni,nij,nj->n', up, covariance, up))
     return float(np.sqrt(np.mean(errors)))

@@ -164,7 +164,7 @@ def notes_of(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
 
 def _shared(calibrations: Sequence[Calibration]) -> list[str]:
     """Return notes about runs with common poses."""
-    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(9).tolist()}
+    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
             for run in calibrations]
     notes = []
     for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
@@ -334,7 +334,8 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
     Raises
     ------
     InputError
-        If there are fewer than two, or their sensors or units differ, or one has no uncertainty.
+        If there are fewer than two, their sensors differ, some are in native units and others
+        not, or one has no uncertainty.
 
     """
     refuse_if_unlike(calibrations)

@@ -148,7 +148,7 @@ def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
     units = calibration.units
     if units.name == 'native':
         return units.per_g / per_g, 1.0
-    scale = units.per_g / STANDARD_GRAVITY if units.name == 'm/s2' else 1.0
+    scale = units.per_g / STANDARD_GRAVITY if units.name == 'm/s2' else units.per_g
     return scale, scale
 
 

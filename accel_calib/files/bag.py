@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reader of bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
+Reader of the samples in bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-`rosbags` reads the serialized messages. They are joined to blocks of arrays
-(`accel_calib.messages.layout`), so the memory needed does not depend on the length of the bag.
+Serialized messages are joined to blocks of arrays (`accel_calib.messages.layout`), so the memory
+needed does not depend on the length of the bag.
 
 """
 
@@ -15,171 +15,93 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .bag_context import Context, context_of, ContextTopic, Track
+from .bag_reader import Bag, BLOCK, IMU, is_bag, open_bag, Received, SUFFIXES
 from ..errors import InputError
-from ..messages.layout import (
-    doubles_at,
-    frame_ids,
-    IMU_DOUBLES,
-    joined,
-    Messages,
-    samples_of,
-    stamps_of,
-)
+from ..messages.layout import frame_ids, Messages, samples_of
 from ..table import Floats, Recording
 
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-IMU = 'sensor_msgs/msg/Imu'
-TEMPERATURE = 'sensor_msgs/msg/Temperature'
-SUFFIXES = ('.bag', '.mcap', '.db3')
-BLOCK = 4096
-"""Number of messages per block; a block fits in the cache of the processor."""
+__all__ = ['Bag', 'OpenSamples', 'SUFFIXES', 'first_frame_id', 'imu_samples', 'imu_topic',
+           'is_bag', 'lost', 'of_sensor', 'open_bag', 'open_samples', 'plausible_samples',
+           'together']
 
 _ROWS = 65536
 """Smallest number of samples in a block of a recording."""
 
-_TEMPERATURE_DOUBLES = 2
-"""Number of doubles of a Temperature: temperature and variance."""
+LARGEST = 1e6
+"""Larger accelerations [m/s²] and rates [rad/s] are those of damaged bytes."""
 
 _HELD_BACK = 8
 """Largest number of blocks that wait for a later temperature."""
 
-_AROUND = 10
-"""Number of temperatures that are kept before a block."""
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a path names a bag rather than a table."""
-    return path.is_dir() or path.suffix in SUFFIXES
-
 
 @dataclass(frozen=True)
-class Bag:
+class OpenSamples:
     """
-    An open bag; `open_bag` makes it.
+    The samples of an open bag; `open_samples` makes it.
+
+    Parameters
+    ----------
+    blocks : iterator of Recording
+        The samples, in order. The size of a block does not depend on that of the bag.
+    samples : int
+        Number of samples, according to the index of the bag.
+    topic, sensor : str
+        Imu topic, and frame_id of its messages.
+    found : list of str
+        Notes; the last block can add some.
+
+    """
+
+    blocks: Iterator[Recording]
+    samples: int
+    topic: str
+    sensor: str
+    found: list[str]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes about topics and about lost messages; complete after the last block."""
+        return tuple(self.found)
+
+
+@contextmanager
+def open_samples(path: Path, topic: str = '', sensor: str = '', *, temperature_topic: str = '',
+                 supply_topic: str = '') -> Iterator[OpenSamples]:
+    """
+    Open the samples of a bag.
 
     Parameters
     ----------
     path : Path
-        File or folder.
-    reader : Reader
-        The reader of `rosbags`.
-    ros2 : bool
-        Whether it is a rosbag2; otherwise it is a ROS 1 bag.
-
-    """
-
-    path: Path
-    reader: Reader1 | Reader2
-    ros2: bool
-
-    def topics(self, msgtype: str) -> list[str]:
-        """Return the topics of a type, sorted."""
-        return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
-
-    def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
-        """Return the connections of a topic; a topic can have several."""
-        return [c for c in self.reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
-
-    def count(self, topic: str) -> int:
-        """Return the number of Imu messages of a topic, according to the index of the bag."""
-        return sum(connection.msgcount for connection in self.connections(topic))
-
-    def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
-               ) -> Iterator[list[tuple[Connection, int, bytes]]]:
-        """
-        Yield blocks of messages, in order of receipt.
-
-        Parameters
-        ----------
-        connections : sequence of Connection
-            Connections to read; by default all.
-        size : int
-            Largest number of messages in a block.
-
-        Yields
-        ------
-        list of (Connection, int, bytes)
-            Connection, time of receipt [ns] and serialized message.
-
-        """
-        messages = self.reader.messages(connections)
-        while True:
-            with _rosbags_errors(self.path):
-                block = list(islice(messages, size))
-            if not block:
-                return
-            yield block
-
-    def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
-               ) -> Messages:
-        """
-        Return messages of a topic as arrays; `before` is the number of earlier messages.
-
-        Raises
-        ------
-        InputError
-            If a message is damaged.
-
-        """
-        return joined(raws, doubles, f'{self.path}, {topic}', ros2=self.ros2, before=before)
-
-
-@contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
-    """
-    Open a bag for reading.
+        A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
+    topic : str
+        Imu topic, for a bag with several Imu topics.
+    sensor : str
+        frame_id of the messages to read, for a topic with several sensors.
+    temperature_topic, supply_topic : str
+        As in `accel_calib.files.bag_context.context_of`.
 
     Raises
     ------
     InputError
-        If the bag is damaged; also later, while it is read.
-    FileNotFoundError
-        If the file is missing.
+        If the bag is damaged, or a topic is missing or ambiguous; also while it is read.
+    OSError
+        If the file cannot be read.
 
     """
-    from rosbags import rosbag1, rosbag2
-
-    if not path.exists():
-        raise FileNotFoundError(2, 'No such file or directory', str(path))
-    ros2 = path.suffix != '.bag'
-    with _rosbags_errors(path):
-        reader = (rosbag2.Reader if ros2 else rosbag1.Reader)(path)
-        reader.open()
-    try:
-        yield Bag(path, reader, ros2)
-    finally:
-        reader.close()
-
-
-@contextmanager
-def _rosbags_errors(path: Path) -> Iterator[None]:
-    """Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside."""
-    try:
-        yield
-    except OSError as err:
-        if err.errno is not None:
-            raise
-        raise _not_whole(path, err) from err
-    except Exception as err:  # damaged bytes cause many kinds of errors
-        raise _not_whole(path, err) from err
-
-
-def _not_whole(path: Path, err: Exception) -> InputError:
-    what = ' '.join(str(err).split()) or type(err).__name__
-    return InputError(f'{path} is damaged or not a bag ({what}), expected a rosbag2 folder, '
-                      '.mcap, .db3 or .bag', 'use another file; ros2 bag reindex may repair this '
-                      'one')
+    with open_bag(path) as bag:
+        name = imu_topic(bag, topic)
+        of = sensor or first_frame_id(bag, name)
+        context = context_of(bag, name, of, temperature_topic, supply_topic)
+        found = [*bag.notes, *context.notes]
+        blocks = imu_samples(bag, name, of, chosen=bool(sensor), context=context, notes=found)
+        yield OpenSamples(blocks, bag.count(name), name, of, found)
 
 
 def imu_topic(bag: Bag, topic: str = '') -> str:
@@ -258,9 +180,20 @@ def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str
     return np.broadcast_to(same, len(messages))
 
 
-def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool) -> Iterator[Recording]:
+def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
+                context: Context | None = None, notes: list[str] | None = None
+                ) -> Iterator[Recording]:
     """
-    Yield the samples of an Imu topic in blocks; parameters as in `of_sensor`.
+    Yield the samples of an Imu topic in blocks.
+
+    Parameters
+    ----------
+    bag, topic, sensor, chosen
+        As in `of_sensor`.
+    context : Context, optional
+        Topics of temperature and supply voltage; by default that of `context_of`.
+    notes : list of str, optional
+        List to which a note about lost messages is added at the end.
 
     Raises
     ------
@@ -268,41 +201,57 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool) -> Iterator[
         If a message is damaged, contains NaN, or is from another sensor.
 
     """
+    used = (context or context_of(bag, topic, sensor)).used
+    tracks = {each.quantity.key: Track(np.zeros(0), np.zeros(0)) for each in used}
     waiting: deque[Recording] = deque()
     parts: list[Recording] = []
-    before, track = 0, Track(np.zeros(0), np.zeros(0)) if bag.topics(TEMPERATURE) else None
-    for imus, temperatures in _raw_messages(bag, topic):
-        if track is not None and temperatures:
-            track = track.plus(bag.joined(temperatures, 'temperature', 0, _TEMPERATURE_DOUBLES))
+    before = 0
+    for imus, others in _blocks(bag, topic, used):
+        for each, block in zip(used, others, strict=True):
+            if block:
+                tracks[each.quantity.key] = tracks[each.quantity.key].plus(*each.values(block))
         if imus:
             waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
             before += len(imus)
-        while waiting and (track is None or len(waiting) > _HELD_BACK or track.covers(waiting[0])):
-            parts.append(_with_temperature(waiting.popleft(), track))
-        if track is not None and waiting:
-            track = track.since(waiting[0]['time'][0])
+        parts += _ready(waiting, tracks)
         if sum(map(len, parts)) >= _ROWS:
             yield together(parts)
             parts = []
-    parts += [_with_temperature(part, track) for part in waiting]
+    parts += [_with_context(part, tracks) for part in waiting]
     if parts:
         yield together(parts)
+    if notes is not None:
+        notes += lost(bag, topic, before)
 
 
-def _raw_messages(bag: Bag, topic: str) -> Iterator[tuple[list[bytes], list[bytes]]]:
-    """Yield blocks of serialized Imu and Temperature messages, in one pass over the bag."""
-    warm = [c for name in bag.topics(TEMPERATURE) for c in bag.connections(name, TEMPERATURE)]
-    are_warm = {id(connection) for connection in warm}
-    messages = bag.reader.messages([*bag.connections(topic), *warm])
-    while True:
-        imus: list[bytes] = []
-        temperatures: list[bytes] = []
-        with _rosbags_errors(bag.path):
-            for connection, _, raw in islice(messages, BLOCK):
-                (temperatures if id(connection) in are_warm else imus).append(raw)
-        if not imus and not temperatures:
-            return
-        yield imus, temperatures
+def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
+    """Take the blocks whose context is known, and forget the context long before the others."""
+    parts = []
+    while waiting and (len(waiting) > _HELD_BACK
+                       or all(track.covers(waiting[0]) for track in tracks.values())):
+        parts.append(_with_context(waiting.popleft(), tracks))
+    if waiting:
+        for key, track in tracks.items():
+            tracks[key] = track.since(waiting[0]['time'][0])
+    return parts
+
+
+def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
+            ) -> Iterator[tuple[list[bytes], list[list[Received]]]]:
+    """Yield blocks of serialized Imu messages and of the other topics, in one pass."""
+    own = [{id(connection) for connection in each.connections} for each in used]
+    imu = {id(connection) for connection in bag.connections(topic)}
+    wanted = [each for each in bag.reader.connections if id(each) in imu.union(*own)]
+    for block in bag.blocks(wanted, BLOCK):
+        yield ([raw for connection, _, raw in block if id(connection) in imu],
+               [[each for each in block if id(each[0]) in ids] for ids in own])
+
+
+def lost(bag: Bag, topic: str, found: int) -> list[str]:
+    """Return a note if fewer messages of a topic were found than the bag states."""
+    stated = bag.count(topic)
+    return [f'{stated - found} of {stated} messages on {topic} are lost: the index of {bag.path} '
+            'states them, but they are not in the bag'] if found < stated else []
 
 
 def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
@@ -310,17 +259,15 @@ def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, 
     """Return Imu messages as samples; parameters as in `of_sensor`."""
     messages = bag.joined(raws, topic, before)
     which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
-    columns = samples_of(messages)
-    _check_finite(bag, columns['reading'], before)
+    columns = plausible_samples(bag, messages, before)
     row = np.arange(before, before + len(raws)) + 1
     samples = Recording(columns, row, 'm/s2', sensor)
     return samples if np.all(which) else samples.take(which)
 
 
-def _with_temperature(samples: Recording, track: Track | None) -> Recording:
-    if track is None:
-        return samples
-    return samples.with_columns(temperature=track.at(samples['time']))
+def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
+    columns = {key: track.at(samples['time']) for key, track in tracks.items()}
+    return samples.with_columns(**columns) if columns else samples
 
 
 def together(parts: Sequence[Recording]) -> Recording:
@@ -329,50 +276,28 @@ def together(parts: Sequence[Recording]) -> Recording:
     return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
 
 
-def _check_finite(bag: Bag, reading: Floats, before: int) -> None:
-    """Check that the accelerations are finite."""
-    if not np.isfinite(reading).all():
-        first = int(np.argmin(np.isfinite(reading).all(axis=1)))
-        raise InputError(f'{bag.path}: Imu message {before + first + 1} contains NaN or infinity, '
-                         'expected finite numbers', 'fix the driver, or record again')
+def plausible_samples(bag: Bag, messages: Messages, before: int) -> dict[str, Floats]:
+    """
+    Return Imu messages as columns of `accel_calib.table`; `before` counts the earlier messages.
+
+    Raises
+    ------
+    InputError
+        If an acceleration is not finite, or a number is beyond any sensor.
+
+    """
+    columns = samples_of(messages)
+    _check_plausible(bag, columns['reading'], before, 'acceleration')
+    _check_plausible(bag, np.nan_to_num(columns['rate']), before, 'angular velocity')
+    return columns
 
 
-@dataclass(frozen=True)
-class Track:
-    """Temperatures [°C] at increasing times [s]."""
-
-    time: Floats
-    temperature: Floats
-
-    def at(self, time: Floats) -> Floats:
-        """Return the (n,) interpolated temperature; NaN if the track is empty."""
-        if not len(self.time):
-            return np.full(len(time), np.nan)
-        return np.interp(time, self.time, self.temperature)
-
-    def plus(self, messages: Messages) -> Track:
-        """Return the track with Temperature messages added."""
-        temperature = doubles_at(messages, slice(0, 1))[:, 0]
-        known = np.isfinite(temperature)
-        time = np.concatenate([self.time, stamps_of(messages)[known]])
-        order = np.argsort(time, kind='stable')
-        return Track(time[order], np.concatenate([self.temperature, temperature[known]])[order])
-
-    def covers(self, samples: Recording) -> bool:
-        """Return whether the track reaches the end of these samples."""
-        return bool(len(self.time) and samples['time'][-1] <= self.time[-1])
-
-    def since(self, time: float) -> Track:
-        """Return the track without temperatures long before a time."""
-        first = max(0, int(np.searchsorted(self.time, time)) - _AROUND)
-        return Track(self.time[first:], self.temperature[first:])
-
-
-def temperature_track(bag: Bag) -> Track:
-    """Return all temperatures of a bag."""
-    track = Track(np.zeros(0), np.zeros(0))
-    for topic in bag.topics(TEMPERATURE):
-        for block in bag.blocks(bag.connections(topic, TEMPERATURE)):
-            raws = [raw for _, _, raw in block]
-            track = track.plus(bag.joined(raws, topic, 0, _TEMPERATURE_DOUBLES))
-    return track
+def _check_plausible(bag: Bag, values: Floats, before: int, what: str) -> None:
+    """Check that accelerations or rates are finite, and not those of damaged bytes."""
+    sound = np.all(np.abs(values) < LARGEST, axis=1)
+    if not np.all(sound):
+        first = int(np.argmin(sound))
+        found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
+                 f'has the {what} {np.max(np.abs(values[first])):.3g}')
+        raise InputError(f'{bag.path}: Imu message {before + first + 1} {found}, expected finite '
+                         f'numbers below {LARGEST:g}', 'fix the driver, or record again')

@@ -17,15 +17,11 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from .bag import (
-    Bag,
-    first_frame_id,
-    imu_topic,
-    of_sensor,
-    open_bag,
-    TEMPERATURE,
-    temperature_track,
-)
+import numpy as np
+
+from .bag import first_frame_id, imu_topic, lost, of_sensor, plausible_samples
+from .bag_context import Context, context_of, QUANTITIES
+from .bag_reader import Bag, damage_as_input_error, open_bag
 from ..calibrate import (
     Calibration,
     check_sensor,
@@ -55,13 +51,20 @@ Progress = Callable[[int, int], object]
 Report = Callable[[Outside], object]
 """Function called with a quantity that left the range of the calibration."""
 
+Note = Callable[[str], object]
+"""Function called with a note about the topics of a bag, or about lost messages."""
+
+LEAST_M_S2 = 3.0
+"""A recording with a smaller median length is not in m/s²; it is probably in g."""
+
 _NO_HASH = 'RIHS01_' + 64 * '0'
 """Hash of a type whose definition is neither in the bag nor in Jazzy."""
 
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
                 progress: Progress = lambda done, count: None,
-                report: Report = lambda found: None) -> int:
+                report: Report = lambda found: None, *, note: Note = lambda line: None,
+                temperature_topic: str = '', supply_topic: str = '') -> int:
     """
     Write a corrected copy of a bag.
 
@@ -70,7 +73,7 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     path : Path
         A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
     calibration : Calibration
-        The calibration, in m/s².
+        The calibration. One in g is converted to m/s², the unit of Imu messages.
     out : Path
         The copy; it must not exist. A copy of a rosbag2 is a folder, or a file if `out` has the
         suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
@@ -81,6 +84,10 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     report : callable
         Function that is called at the end for each quantity of the context that left the range of
         the calibration.
+    note : callable
+        Function that is called with each note about the topics and about lost messages.
+    temperature_topic, supply_topic : str
+        As in `accel_calib.files.bag_context.context_of`.
 
     Returns
     -------
@@ -90,7 +97,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     Raises
     ------
     InputError
-        If the bag is damaged, has no Imu messages or those of several sensors, or `out` exists.
+        If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
+        that the calibration needs, or if `out` exists or the calibration is in native units.
     StoredCalibrationError
         If the calibration belongs to another sensor.
     OSError
@@ -99,25 +107,61 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     """
     if out.exists():
         raise InputError(f'{out} exists, expected a new file', 'choose another name')
-    if calibration.units.name != 'm/s2':
-        raise InputError(f'the calibration is for readings in {calibration.units.name}, expected '
-                         'm/s2 for Imu messages', 'fit it to poses in m/s2')
     with open_bag(path) as bag:
-        if (out.suffix == '.bag') is bag.ros2:
-            raise InputError(f'{path} is a ROS {2 if bag.ros2 else 1} bag, but {out} is not the '
-                             'name of one', 'choose a name that ends in .mcap or .db3, or the '
-                             'name of a folder' if bag.ros2 else
-                             'choose a name that ends in .bag')
+        _check_kind(bag, out)
         name = imu_topic(bag, topic)
         sensor = first_frame_id(bag, name)
         check_sensor(calibration, sensor)
+        calibration = _in_units_of(bag, name, calibration)
+        context = _needed(bag, calibration, context_of(bag, name, sensor, temperature_topic,
+                                                       supply_topic))
         with _new(out) as folder:
-            correction = _Correction(calibration, bag, name, sensor)
+            correction = _Correction(calibration, bag, name, sensor, context)
             count = _copy(bag, folder, out, correction, progress)
         for each in correction.outside.values():
             if each.count:
                 report(each)
+        for line in (*bag.notes, *context.notes, *lost(bag, name, count)):
+            note(line)
         return count
+
+
+def _check_kind(bag: Bag, out: Path) -> None:
+    """Check that the name of the copy is that of a bag of the same kind."""
+    if (out.suffix == '.bag') is bag.ros2:
+        raise InputError(f'{bag.path} is a ROS {2 if bag.ros2 else 1} bag, but {out} is not the '
+                         'name of one', 'choose a name that ends in .mcap or .db3, or the '
+                         'name of a folder' if bag.ros2 else
+                         'choose a name that ends in .bag')
+
+
+def _in_units_of(bag: Bag, topic: str, calibration: Calibration) -> Calibration:
+    """Return a calibration in m/s²; refuse one in g if the messages are in g, too."""
+    found = calibration.in_units('m/s2')
+    if found is not calibration:
+        block = next(bag.blocks(bag.connections(topic)))
+        messages = bag.joined([raw for _, _, raw in block], topic, 0)
+        length = float(np.median(np.linalg.norm(samples_of(messages)['reading'], axis=1)))
+        if length < LEAST_M_S2:
+            raise InputError(f'{bag.path}, {topic}: the median length of the accelerations is '
+                             f'{length:.3g}, expected about 9.8 at rest, because Imu messages are '
+                             'in m/s²', 'correct the driver, and record again')
+    return found
+
+
+def _needed(bag: Bag, calibration: Calibration, context: Context) -> Context:
+    """Return the topics that a calibration needs, without notes if it needs none."""
+    needs = {each.key: each for each in QUANTITIES if each.key in calibration.model.needs}
+    used = {each.quantity.key: each for each in context.used}
+    for key, quantity in needs.items():
+        if key not in used:
+            notes = ''.join(f'; {line}' for line in context.notes)
+            raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used{notes}, '
+                             f'but the calibration depends on the {quantity.words}',
+                             f'name the topic with {quantity.option}, or use a calibration '
+                             'without it')
+    return Context(tuple(each for key, each in used.items() if key in needs),
+                   context.notes if needs else ())
 
 
 @contextmanager
@@ -136,11 +180,11 @@ def _new(out: Path) -> Iterator[Path]:
 class _Correction:
     """The correction of the messages of one topic."""
 
-    def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str) -> None:
+    def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str,
+                 context: Context) -> None:
         self._calibration, self._bag, self._sensor = calibration, bag, sensor
         self._frame_id = output_frame(calibration, sensor)
-        needed = 'temperature' in calibration.model.needs and bag.topics(TEMPERATURE)
-        self._track = temperature_track(bag) if needed else None
+        self._tracks = context.tracks()
         self._thermal = thermal_stream(calibration.model)
         self.topic, self.done = topic, 0
         self.outside: dict[str, Outside] = {}
@@ -149,13 +193,14 @@ class _Correction:
         """Return corrected messages in a new buffer."""
         messages = self._bag.joined(raws, self.topic, self.done)
         of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
-        context = samples_of(messages)
-        if self._track is not None:
-            context['temperature'] = self._track.at(context['time'])
+        context = plausible_samples(self._bag, messages, self.done)
+        for key, track in self._tracks.items():
+            context[key] = track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
         self.outside = joined_ranges(self.outside, outside(self._calibration, known))
-        put_doubles(messages, corrected(self._calibration, doubles, known))
+        with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
+            put_doubles(messages, corrected(self._calibration, doubles, known))
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 
@@ -167,15 +212,15 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
     imu = {id(connection) for connection in bag.connections(correction.topic)}
     writer = _writer(bag, target, out.suffix)
     with writer:
-        outputs = _added(bag, writer)
+        with damage_as_input_error(bag.path):
+            outputs = _added(bag, writer)
         for block in bag.blocks():
             which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-            changed: dict[int, memoryview] = {}
-            if which:
-                new = correction([block[k][2] for k in which])
-                changed = dict(zip(which, new.each(), strict=True))
-            for k, (connection, stamp, raw) in enumerate(block):
-                writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
+            new = correction([block[k][2] for k in which]).each() if which else ()
+            changed = dict(zip(which, new, strict=True))
+            with damage_as_input_error(bag.path):  # a stamp can be out of range
+                for k, (connection, stamp, raw) in enumerate(block):
+                    writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
             progress(correction.done, count)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
     return correction.done

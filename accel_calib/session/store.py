@@ -118,7 +118,8 @@ class Store:
         Raises
         ------
         StoredCalibrationError
-            If it is damaged, newer than this package, or for another sensor or unit.
+            If it is damaged, newer than this package, or for another sensor, or if its unit
+            cannot be converted.
         OSError
             If the file cannot be read.
 
@@ -126,14 +127,16 @@ class Store:
         return self._read(self.calibration) if self.calibration.exists() else None
 
     def _read(self, path: Path) -> Calibration:
-        """Read a calibration, and check that it is for this sensor and unit."""
+        """Read a calibration for this sensor, and convert it to the unit of the readings."""
         calibration = read_calibration(path)
         check_sensor(calibration, self.identity.sensor)
-        if calibration.units.name != self.units:
+        try:
+            return calibration.in_units(self.units)
+        except InputError as err:
             raise StoredCalibrationError(f'{path} is for readings in {calibration.units.name}, '
                                          f'but the parameter units is {self.units}',
-                                         'restart the node with units of the calibration')
-        return calibration
+                                         'restart the node with units of the calibration'
+                                         ) from err
 
     def load_poses(self) -> Poses | None:
         """

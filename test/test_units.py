@@ -1,0 +1,208 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A calibration in g applies to readings in m/s² and the other way round."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import accel_calib as ac
+from accel_calib.calibrate import fit_poses
+from accel_calib.calibrate.calibration import converted
+from accel_calib.errors import InputError
+from accel_calib.files import read_calibration, read_recording, write_calibration, write_table
+from accel_calib.table import Poses, Table
+from accel_calib.units import Units, units_of
+import numpy as np
+import pytest
+
+GRAVITY = 9.80665
+SENSOR = {'offset': (0.05, -0.03, 0.08), 'axis_gain': (0.02, -0.03, 0.01),
+          'cross_axis': (0.004, -0.003, 0.002)}
+METRIC = ('g', 'm/s2')
+
+
+def other(name: str) -> str:
+    return 'm/s2' if name == 'g' else 'g'
+
+
+def poses(units: str, seed: int = 1, **more: object) -> Poses:
+    return ac.simulate(SENSOR, units=units, seed=seed, noise=0.001, **more)
+
+
+def unstated(table: Table) -> Table:
+    return replace(table, units='')
+
+
+@pytest.mark.parametrize('units', METRIC)
+def test_a_converted_calibration_equals_a_fit_in_that_unit(units: str) -> None:
+    here, there = (ac.fit(poses(each), model='10') for each in (units, other(units)))
+    found = here.in_units(other(units))
+    assert found.units == there.units
+    for name in ('offset', 'gain', 'matrix', 'offset_sd', 'gain_sd'):
+        np.testing.assert_allclose(getattr(found, name), getattr(there, name), rtol=1e-6,
+                                   atol=1e-9, err_msg=name)
+    for key in ('reading', 'std'):
+        np.testing.assert_allclose(found.poses[key], there.poses[key], rtol=1e-12)
+    np.testing.assert_allclose(found.noise.force, there.noise.force, rtol=1e-9)
+    assert isinstance(found, ac.Calibration)
+
+
+@pytest.mark.parametrize('units', METRIC)
+def test_conversion_is_exact_and_goes_back(units: str) -> None:
+    calibration = ac.fit(poses(units), model='10')
+    there = calibration.in_units(other(units))
+    factor = there.units.per_g / calibration.units.per_g
+    reading = np.random.default_rng(2).normal(size=(20, 3)) * calibration.units.per_g
+    np.testing.assert_allclose(there.correct(reading * factor),
+                               calibration.correct(reading) * factor, rtol=1e-13)
+    back = there.in_units(units)
+    assert back.units == calibration.units
+    np.testing.assert_allclose(back.poses.reading, calibration.poses.reading, rtol=1e-15)
+    assert calibration.in_units(units) is calibration
+    assert calibration.in_units(Units(other(units), 9.7)).units == there.units
+
+
+def test_the_local_gravity_of_a_calibration_is_kept() -> None:
+    calibration = ac.fit(poses('m/s2', gravity=9.78), gravity=9.78)
+    found = calibration.in_units('g')
+    assert found.units.per_g == pytest.approx(9.78 / GRAVITY, rel=1e-15)
+    reading = calibration.poses.reading[:1]
+    np.testing.assert_allclose(found.correct(reading / GRAVITY) * GRAVITY,
+                               calibration.correct(reading), rtol=1e-13)
+    assert found.in_units('m/s2').units.per_g == pytest.approx(9.78, rel=1e-15)
+
+
+def test_a_stored_calibration_can_be_converted_and_stored_again(tmp_path: Path) -> None:
+    found = ac.fit(poses('g')).in_units('m/s2')
+    write_calibration(tmp_path / 'c.yaml', found)
+    stored = read_calibration(tmp_path / 'c.yaml')
+    assert stored.units == found.units
+    np.testing.assert_array_equal(stored.poses.reading, found.poses.reading)
+
+
+@pytest.mark.parametrize(('before', 'after'), [
+    ('native', 'g'), ('native', 'm/s2'), ('g', 'native'), ('m/s2', 'native')])
+def test_native_units_stay_native(before: str, after: str) -> None:
+    calibration = ac.fit(poses(before))
+    with pytest.raises(InputError, match=f'is for readings in {before}, but the readings are in '
+                       f'{after}, and the scale of native units is not known; use readings in '
+                       f'{before}, or fit a calibration to poses in {after}'):
+        calibration.in_units(after)
+    assert calibration.in_units(before) is calibration
+    assert calibration.in_units_of(unstated(poses(before))) is calibration
+    with pytest.raises(InputError, match='scale of native units is not known'):
+        ac.verify(poses(after), calibration)
+
+
+@pytest.mark.parametrize('units', METRIC)
+def test_an_unstated_unit_is_that_of_the_length_of_the_readings(units: str) -> None:
+    calibration = ac.fit(poses(units))
+    assert calibration.in_units_of(unstated(poses(units))) is calibration
+    found = calibration.in_units_of(unstated(poses(other(units))))
+    assert found.units.name == other(units)
+    # A stated unit wins over the length.
+    lying = replace(poses(other(units)), units=units)
+    assert calibration.in_units_of(lying) is calibration
+
+
+@pytest.mark.parametrize('stated', [True, False])
+@pytest.mark.parametrize('units', METRIC)
+def test_verify_takes_poses_in_the_other_unit(units: str, stated: bool) -> None:
+    calibration = ac.fit(poses(units))
+    same, table = (poses(each, seed=2) for each in (units, other(units)))
+    found = ac.verify(table if stated else unstated(table), calibration)
+    expected = ac.verify(same, calibration)
+    for name in ('rms_before_mg', 'rms_after_mg', 'max_after_percent', 'noise_floor_mg'):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+    assert found.rms_after_mg < 1.0 < found.rms_before_mg
+
+
+def test_verify_takes_the_unit_that_the_caller_states() -> None:
+    calibration, table = ac.fit(poses('g')), unstated(poses('m/s2', seed=2))
+    assert ac.verify(table, calibration, units='m/s2').rms_after_mg < 1.0
+    with pytest.raises(InputError, match='set the units of the readings to m/s2'):
+        ac.verify(table, calibration, units='g')
+    with pytest.raises(InputError, match="is in m/s2, expected g; set units='m/s2'"):
+        ac.verify(poses('m/s2'), calibration, units='g')
+
+
+@pytest.mark.parametrize('units', METRIC)
+def test_refine_starts_from_a_calibration_in_the_other_unit(units: str) -> None:
+    rng = np.random.default_rng(5)
+    hidden = {**SENSOR, 'offset_temperature': (0.002, -0.001, 0.0015)}
+    base = ac.fit(poses(units))
+    warm = rng.uniform(10.0, 50.0, 40)
+    found = [ac.refine(ac.simulate(hidden, poses=40, units=each, seed=6, noise=0.001,
+                                   temperature=warm), base=base) for each in METRIC]
+    assert [each.calibration.units.name for each in found] == list(METRIC)
+    assert [[step.effect for step in each.steps] for each in found] == [['offset_temperature']] * 2
+    np.testing.assert_allclose(found[0].gap_mg, found[1].gap_mg, rtol=1e-6)
+    np.testing.assert_allclose(found[0].calibration.model.vector,
+                               found[1].calibration.model.vector, rtol=1e-4, atol=1e-7)
+
+
+def test_compare_takes_calibrations_in_g_and_in_m_s2() -> None:
+    first, second = (ac.fit(poses('g', seed=seed), model='10') for seed in (1, 2))
+    expected = ac.compare([first, second])
+    found = ac.compare([first, second.in_units('m/s2')])
+    assert expected.agree
+    assert found.agree
+    assert found.p_value == pytest.approx(expected.p_value, rel=1e-6)
+    for one, two in zip(found.runs, expected.runs, strict=True):
+        assert one.rms_mg == pytest.approx(two.rms_mg, rel=1e-6)
+    changed = ac.fit(ac.simulate({**SENSOR, 'offset': (0.06, -0.03, 0.08)}, units='m/s2', seed=3,
+                                 noise=0.001), model='10')
+    assert not ac.compare([first, changed]).agree
+    again = ac.compare([first, first.in_units('m/s2')])
+    assert 'share all their poses' in again.notes[0]
+
+
+def test_poses_are_converted_with_their_noise_and_known_forces() -> None:
+    table = poses('g', reference=True, temperature=(20.0, 30.0))
+    found = converted(table, 'g', 'm/s2')
+    assert found.units == 'm/s2'
+    for key in ('reading', 'std', 'reference'):
+        np.testing.assert_allclose(found[key], table[key] * GRAVITY)
+    for key in ('count', 'temperature'):
+        np.testing.assert_array_equal(found[key], table[key])
+    calibration = fit_poses(table, units_of('g'))
+    assert calibration.name == '12'
+    assert ac.verify(found, calibration).rms_after_mg == pytest.approx(
+        ac.verify(table, calibration).rms_after_mg, rel=1e-9)
+
+
+@pytest.mark.parametrize('stated', [True, False])
+@pytest.mark.parametrize('units', METRIC)
+def test_apply_corrects_a_table_in_the_other_unit(units: str, stated: bool, tmp_path: Path
+                                                  ) -> None:
+    from accel_calib.cli.main import main
+
+    recording = ac.simulate(SENSOR, recording=True, poses=6, units=other(units), seed=3)
+    write_table(tmp_path / 'r.csv', recording if stated else replace(recording, units=''))
+    calibration = ac.fit(poses(units))
+    calibration.save(tmp_path / 'c.yaml')
+    assert main(['apply', str(tmp_path / 'r.csv'), '-c', str(tmp_path / 'c.yaml'),
+                 '-o', str(tmp_path / 'out.csv')]) == 0
+    found = read_recording(tmp_path / 'out.csv')
+    assert found.units == other(units)
+    factor = GRAVITY if units == 'm/s2' else 1.0 / GRAVITY
+    np.testing.assert_allclose(found.reading, calibration.correct(recording.reading * factor)
+                               / factor, rtol=1e-9, atol=1e-9)
+
+
+def test_apply_takes_the_unit_that_the_user_states(tmp_path: Path,
+                                                   capsys: pytest.CaptureFixture[str]) -> None:
+    from accel_calib.cli.main import main
+
+    recording = ac.simulate(SENSOR, recording=True, poses=6, units='m/s2', seed=3)
+    write_table(tmp_path / 'r.csv', recording)
+    ac.fit(poses('native')).save(tmp_path / 'c.yaml')
+    given = ['apply', str(tmp_path / 'r.csv'), '-c', str(tmp_path / 'c.yaml'),
+             '-o', str(tmp_path / 'out.csv')]
+    assert main(given) == 2
+    assert 'is for readings in native, but the readings are in m/s2' in capsys.readouterr().err
+    assert main([*given, '--units', 'native']) == 2
+    assert 'is in m/s2, but --units is native' in capsys.readouterr().err
