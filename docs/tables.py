@@ -20,6 +20,8 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 from accel_calib.effects import EFFECTS  # noqa: E402
+from accel_calib.files.logs.names import UNITS, WORDS  # noqa: E402
+from accel_calib.rating import LIMITS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 import api_page  # noqa: E402
 
@@ -46,7 +48,28 @@ def effects() -> Iterator[str]:
                f'{effect.typical:g} | {needs} |')
 
 
-TABLES = {'columns': columns, 'effects': effects}
+def rating() -> Iterator[str]:
+    """Yield the limits of the rating."""
+    yield '| limit | value | meaning |'
+    yield '|---|---|---|'
+    for limit in LIMITS:
+        yield f'| {limit.name} | {limit.value:g} {limit.unit} | {limit.meaning} |'
+
+
+def names() -> Iterator[str]:
+    """Yield the words and units of the names of columns in logs."""
+    yield '| quantity | words in a name | units in a name |'
+    yield '|---|---|---|'
+    for key, words in WORDS.items():
+        ours = ', '.join(f'`{name}`' for name in COLUMNS[key].names)
+        units: dict[tuple[str, float], list[str]] = {}
+        for text, unit in UNITS[key].items():
+            units.setdefault(unit, []).append(text)
+        texts = '; '.join(' '.join(each) for each in units.values())
+        yield f'| {ours} | {" ".join(words)} | {texts} |'
+
+
+TABLES = {'columns': columns, 'effects': effects, 'rating': rating, 'names': names}
 REFERENCE = 'api.md'
 
 

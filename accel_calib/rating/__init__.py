@@ -1,0 +1,31 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The rating of a result: GOOD, USABLE or BAD, with the reason and what to do next.
+
+The rating is about the error of |corrected reading| - 1 g in orientations that were not measured,
+RMS over the sphere, without the noise of the new readings. `Expected` estimates it from the parts
+that a calibration states:
+
+- the uncertainty of its values, times 1.5 for a bound that holds in 95 % of the cases. A model 4
+  or 7 omits values that every sensor has: those that the poses are too noisy to show, or those
+  that the poses do not determine, with the size that they have in a common sensor;
+- the residual beyond the noise: what the poses show that the model does not contain. Without known
+  noise, the whole residual counts;
+- the effects of the model that the correction of a single sample cannot use: of time after the
+  poses, of the previous pose, and of vibration.
+
+GOOD means that this error is below the limit and that nothing limits its meaning. USABLE means
+that the readings are better with the calibration, but it has a named shortcoming. BAD means that
+it must not be used. All limits are in `LIMITS`.
+
+"""
+
+from .expected import Expected
+from .limits import GOOD_MG, Limit, LIMITS
+from .shortcomings import RatingName, RATINGS
+from .verdicts import rate, rate_comparison, rate_refinement, rate_verification, Rating
+
+__all__ = ['GOOD_MG', 'LIMITS', 'RATINGS', 'Expected', 'Limit', 'Rating', 'RatingName', 'rate',
+           'rate_comparison', 'rate_refinement', 'rate_verification']

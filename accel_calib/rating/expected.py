@@ -1,0 +1,244 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The expected error of a calibration in new orientations."""
+
+from __future__ import annotations
+
+from functools import cached_property
+import math
+
+import numpy as np
+
+from ..calibrate import Calibration, in_g, next_pose, NextPose, PRIOR
+from ..calibrate.gate import deviations_g
+from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER
+from ..estimate.equations import variance_factor
+from ..estimate.geometry import (
+    error_left_in,
+    free_parameters,
+    identifiability,
+    pose_noise,
+)
+from ..model import Model, MODELS, predict
+from ..sphere import OVER_THE_SPHERE, unit
+from ..table import Floats, Poses
+from ..units import MG
+
+BOUND = 1.5
+"""Factor from the uncertainty of nine values, RMS over the sphere, to a bound."""
+
+_UNSEEN = 1.6
+"""Ratio of the largest omitted values that the F test of `auto` does not see to their noise: the
+0.97 quantile of chi² with five degrees of freedom is 2.5 times its mean."""
+
+_UNLUCKY = 0.1
+"""Probability that the scatter is larger than the bound that few poses allow."""
+
+_LEVEL = 0.05
+"""Level of the test whether the residual is larger than the noise explains."""
+
+_ONLY_AT_POSES = ('time', 'previous', 'std')
+"""Context that the correction of a later single sample does not have."""
+
+
+class Expected:
+    """
+    The expected error of a calibration in new orientations, and its parts.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.poses = calibration.used_poses
+        self.quality = calibration.quality
+
+    @cached_property
+    def noise(self) -> Floats | None:
+        """Return the noise of each pose, in the unit of the readings; None if it is not known."""
+        return pose_noise(self.poses.noise, self.directions)
+
+    @cached_property
+    def next_pose(self) -> NextPose:
+        """Return the pose that improves the calibration most."""
+        name = '12' if self.calibration.name == '12' else '10'
+        return next_pose(self.directions, name, self.noise)
+
+    @cached_property
+    def dof(self) -> int:
+        """Return the number of equations of distinct poses beyond the number of free values."""
+        calibration = self.calibration
+        rows = 3 if self.is_vector else 1
+        count = len(np.unique(self.poses.reading, axis=0)) * rows
+        free = (free_parameters('9') if calibration.name == '9'
+                else int(np.count_nonzero(np.diag(calibration.covariance))))
+        return max(count - free, 0)
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether the errors are those of the force as a vector, not of its length."""
+        return self.calibration.name == '12' and 'reference' in self.poses
+
+    @cached_property
+    def is_partial(self) -> bool:
+        """Whether the sensor could not be turned over."""
+        return self.calibration.method == PRIOR
+
+    @cached_property
+    def stated_mg(self) -> float:
+        """Return the stated uncertainty, RMS over the sphere [mg]; partial: over the poses."""
+        calibration = self.calibration
+        if not calibration.model.effects:
+            return 0.0
+        if self.is_vector and set(calibration.model.effects) <= set(LADDER):
+            spread = calibration.force_covariance(OVER_THE_SPHERE * calibration.force_per_g)
+            squares = np.trace(spread, axis1=1, axis2=2) / calibration.force_per_g ** 2
+            return float(np.sqrt(np.mean(squares))) * MG
+        up = self.directions if self.is_partial else OVER_THE_SPHERE
+        return _rms(deviations_g(calibration, up)) * MG * math.sqrt(1.0 + 2.0 * self.is_vector)
+
+    @cached_property
+    def worst_mg(self) -> float:
+        """Return the largest stated uncertainty over the sphere [mg]."""
+        if not self.calibration.model.effects:
+            return 0.0
+        return float(np.max(deviations_g(self.calibration, OVER_THE_SPHERE))) * MG
+
+    @cached_property
+    def directions(self) -> Floats:
+        """Return the direction of up in each pose, (n, 3) unit vectors in the sensor axes."""
+        return directions_in(self.poses, self.calibration)
+
+    @cached_property
+    def omits(self) -> str:
+        """Return the name of the smaller model if values that every sensor has are omitted."""
+        effects = [name for name in self.calibration.model.effects if name in LADDER]
+        return next((name for name in ('4', '7') if set(MODELS[name]) == set(effects)), '')
+
+    @cached_property
+    def omitted_mg(self) -> float:
+        """Return the error by values that a smaller model omits [mg]; 0 if it omits none."""
+        if not self.omits or self.is_partial:
+            return 0.0
+        typical = error_left_in(self.omits, '10', self.directions, self.noise) * MG
+        own, whole = (identifiability(name, self.directions, self.noise)
+                      for name in (self.omits, '10'))
+        if whole.undetermined:
+            return typical
+        ratio = (whole.mean_dilution / own.mean_dilution) ** 2 - 1.0
+        return min(_UNSEEN * self.stated_mg * math.sqrt(max(ratio, 0.0)), typical)
+
+    @cached_property
+    def noise_mg(self) -> float | None:
+        """Return the noise of a pose [mg], RMS over the poses; None if it is not known."""
+        floor = self.quality.noise_floor_mg
+        return None if floor is None else floor * self._per_dof
+
+    @cached_property
+    def few(self) -> float:
+        """Return the factor on the uncertainty because few poses check the noise."""
+        chi2 = self.quality.chi2_per_dof
+        if chi2 is None or not self.dof:
+            return 1.0
+        stated = variance_factor(chi2 * self.dof, self.dof, True)
+        return max(math.sqrt(chi2 / stated) * _few(self.dof), 1.0)
+
+    @property
+    def _per_dof(self) -> float:
+        """Return the ratio of an error to its residual after a fit."""
+        count = len(self.poses) * (3 if self.is_vector else 1)
+        return math.sqrt(count / self.dof) if self.dof else 1.0
+
+    @cached_property
+    def hidden_mg(self) -> float:
+        """Return the residual beyond the noise [mg]; without known noise, the residual."""
+        quality = self.quality
+        if not self.dof or self.is_partial:
+            return 0.0
+        if quality.noise_floor_mg is None or quality.chi2_per_dof is None:
+            return quality.rms_after_mg * self._per_dof
+        if _by_chance(quality.chi2_per_dof, self.dof) > _LEVEL:
+            return 0.0
+        squared = quality.rms_after_mg ** 2 - quality.noise_floor_mg ** 2
+        return math.sqrt(max(squared, 0.0)) * self._per_dof
+
+    @cached_property
+    def not_corrected(self) -> tuple[tuple[str, float], ...]:
+        """Return effects that the correction of a later sample cannot use, with size [mg]."""
+        values = self.calibration.model.values
+        sizes = ((name, self._size_mg(Model({name: values[name]}))) for name in values
+                 if depends_on(name) & set(_ONLY_AT_POSES))
+        return tuple(sorted(sizes, key=lambda each: -each[1]))
+
+    def _size_mg(self, model: Model) -> float:
+        """Return the contribution of an effect along the force, RMS over the poses [mg]."""
+        calibration, up = self.calibration, self.directions
+        context = {**self.poses.columns, 'previous': up}
+        if any(key not in context for key in model.needs):
+            return 0.0
+        if 'std' in self.poses:
+            context['std'] = calibration.units.to_g(self.poses['std'])
+        along = np.sum((predict(model, up, context) - up) * up, axis=1)
+        return _rms(along) * MG
+
+    @cached_property
+    def error_mg(self) -> float:
+        """Return the expected error, as a bound [mg]."""
+        few = _few(self.dof) if self.noise_mg is not None and self.dof else 1.0
+        return math.hypot(self.inexact_mg, self.hidden_mg * few,
+                          *(size for _, size in self.not_corrected))
+
+    @property
+    def inexact_mg(self) -> float:
+        """Return the part of the expected error that more poses reduce [mg]."""
+        return math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
+
+    @cached_property
+    def own_mg(self) -> float:
+        """Return the expected error by what the poses show, without omitted values [mg]."""
+        return math.hypot(self.stated_mg, self.hidden_mg)
+
+    @cached_property
+    def before_mg(self) -> float | None:
+        """Return the error without the calibration, without noise [mg]; None if not known."""
+        if self.calibration.units.name == 'native':
+            return None
+        before, noise = self.quality.rms_before_mg, self.noise_mg or 0.0
+        return math.sqrt(max(before ** 2 - noise ** 2, 0.0))
+
+
+def _few(dof: int) -> float:
+    """Return the ratio of the largest scatter that `dof` squares allow to their RMS."""
+    from scipy.special import chdtri
+
+    return math.sqrt(dof / float(chdtri(dof, 1.0 - _UNLUCKY)))
+
+
+def _by_chance(chi2_per_dof: float, dof: int) -> float:
+    """Return the probability that noise alone causes residuals at least this large."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(dof, chi2_per_dof * dof))
+
+
+def directions_in(poses: Poses, calibration: Calibration) -> Floats:
+    """Return the direction of up in each pose, (n, 3) unit vectors in the sensor axes."""
+    mat_w, vec_v = calibration.model.linear_part
+    return unit(np.linalg.solve(mat_w, (in_g(poses, calibration.units).reading - vec_v).T).T)
+
+
+def depends_on(name: str) -> set[str]:
+    """Return the context that an effect is a function of."""
+    if name.startswith(f'{EMPIRICAL}-'):
+        return {empirical_parts(name)[1]}
+    effect = effect_named(name)
+    return set(effect.over or effect.needs)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))

@@ -1,0 +1,229 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The rating of calibrations, refinements, verifications and comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+from typing import TYPE_CHECKING
+
+from .expected import directions_in, Expected
+from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
+from .shortcomings import (
+    advice_of,
+    degrees,
+    mg,
+    number,
+    RatingName,
+    Shortcoming,
+    shortcomings,
+    temperature_words,
+)
+from ..calibrate import Calibration, Verification
+from ..errors import counted
+from ..estimate.geometry import coverage
+from ..table import Poses
+from ..units import MG
+
+if TYPE_CHECKING:
+    from ..compare import Comparison
+    from ..refine import Refinement
+
+
+@dataclass(frozen=True)
+class Rating:
+    """
+    A verdict about a result.
+
+    Parameters
+    ----------
+    name : {'GOOD', 'USABLE', 'BAD'}
+        The verdict.
+    reason : str
+        Reason, as one sentence without a full stop.
+    figures : str
+        The figures of the result.
+    next : str
+        What to do next; may be empty.
+
+    """
+
+    name: RatingName
+    reason: str
+    figures: str
+    next: str  # noqa: A003, the name of the second line
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return the rating as lines of text: the figures, the reason unless GOOD, and next."""
+        width = len('reason') if self.name != 'GOOD' else len('next')
+        lines: list[tuple[str, str]] = [(self.name, self.figures)]
+        if self.name != 'GOOD':
+            lines.append(('reason', self.reason))
+        if self.next:
+            lines.append(('next', self.next))
+        return tuple(f'{label:<{width}}  {text}' for label, text in lines)
+
+
+def _rated(found: list[Shortcoming], good: str, figures: str, advice: str) -> Rating:
+    """Return the rating with the first of the worst shortcomings."""
+    for name in ('BAD', 'USABLE'):
+        own = [each for each in found if each.name == name]
+        if own:
+            remedies = list(dict.fromkeys(each.remedy for each in [own[0], *found] if each.remedy))
+            return Rating(own[0].name, own[0].reason, figures, '; '.join(remedies[:2]))
+    return Rating('GOOD', good, figures, advice)
+
+
+def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> Rating:
+    """
+    Rate a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    refinement : Refinement, optional
+        A refinement of the same poses; its calibration, or the base, is rated.
+
+    Returns
+    -------
+    Rating
+        The verdict.
+
+    """
+    expected = Expected(calibration)
+    good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
+            f'({degrees(expected.error_mg)} of tilt)')
+    return _rated(shortcomings(expected, refinement), good, _figures(expected),
+                  advice_of(calibration))
+
+
+def rate_refinement(result: Refinement) -> Rating:
+    """Rate the calibration of a refinement."""
+    return rate(result.calibration, refinement=result)
+
+
+def _figures(expected: Expected) -> str:
+    """Return the figures of a calibration in one line."""
+    quality = expected.quality
+    parts = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
+    if quality.held_out_rms_mg is not None and not expected.is_partial:
+        parts.append(f'of new poses {mg(quality.held_out_rms_mg)}')
+    noise = quality.noise_floor_mg
+    parts.append('noise not known' if noise is None else f'noise {mg(noise)}')
+    parts += [counted(len(expected.poses), 'pose'),
+              f'{100.0 * quality.coverage:.0f} % of the sphere']
+    return ', '.join(parts)
+
+
+def rate_verification(verification: Verification, calibration: Calibration,
+                      poses: Poses | None = None) -> Rating:
+    """
+    Rate a calibration by poses that it was not fitted to.
+
+    Parameters
+    ----------
+    verification : Verification
+        Its residuals on these poses.
+    calibration : Calibration
+        The calibration.
+    poses : Poses, optional
+        These poses. If they cover only a part of the sphere, the rating is not better than that
+        of the calibration itself.
+
+    Returns
+    -------
+    Rating
+        The verdict.
+
+    """
+    expected, floor = Expected(calibration), verification.noise_floor_mg
+    error = _without_noise(verification.rms_after_mg, floor)
+    found = [*_on_new_poses(verification, expected, error)]
+    covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
+    if expected.is_partial or covered < COVERED.value / 100.0:
+        own = rate(calibration)
+        found += [Shortcoming(own.name, own.reason, own.next)] if own.name != 'GOOD' else []
+    noise = 'noise not known' if floor is None else f'noise {mg(floor)}'
+    figures = (f'{number(verification.rms_before_mg)} -> {mg(verification.rms_after_mg)}, '
+               f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}')
+    if poses is not None:
+        figures += f', {counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere'
+    good = f'the error of these poses is {mg(error)} ({degrees(error)} of tilt)'
+    return _rated(found, good, figures, temperature_words(calibration))
+
+
+def _on_new_poses(verification: Verification, expected: Expected, error: float
+                  ) -> Iterator[Shortcoming]:
+    """Yield the shortcomings that a verification shows."""
+    floor, again = verification.noise_floor_mg, 'fit again with these poses'
+    native = expected.calibration.units.name == 'native'
+    before = _without_noise(verification.rms_before_mg, floor)
+    if error > BAD_ERROR.value:
+        yield Shortcoming('BAD', f'the error of these poses is {mg(error)}, expected at most '
+                          f'{mg(BAD_ERROR.value)}', again)
+    elif not native and error > max(before, floor or 0.0):
+        yield Shortcoming('BAD' if error > MATTERS.value else 'USABLE', 'the error of these '
+                          f'poses is {mg(error)}, and {mg(before)} without the calibration',
+                          again)
+    stated = expected.error_mg
+    changed = error > max(CHANGED.value * stated, MATTERS.value)
+    if changed and rate(expected.calibration).name == 'GOOD':
+        yield Shortcoming('USABLE', f'the error of these poses is {mg(error)}, and the fit '
+                          f'states {mg(stated)}: the sensor has changed', again)
+    elif error > GOOD_ERROR.value:
+        yield Shortcoming('USABLE', f'the error of these poses is {mg(error)}, expected at most '
+                          f'{mg(GOOD_ERROR.value)}', again)
+    if floor is not None and floor > GOOD_ERROR.value:
+        yield Shortcoming('USABLE', f'the noise of these poses is {mg(floor)}, too large to see '
+                          f'an error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in each '
+                          'pose')
+
+
+def rate_comparison(comparison: Comparison) -> Rating:
+    """
+    Rate the agreement of calibrations of one sensor.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The comparison.
+
+    Returns
+    -------
+    Rating
+        GOOD if they agree, USABLE if the differences are small, otherwise BAD.
+
+    """
+    largest = max(comparison.runs, key=lambda run: run.rms_mg)
+    figures = (f'{counted(len(comparison.runs), "calibration")}, difference '
+               f'{mg(largest.rms_mg)}, up to {mg(max(r.largest_mg for r in comparison.runs))}, '
+               f'expected {mg(largest.expected_mg)}, p = {comparison.p_value:.1g}')
+    found = []
+    which = ('' if comparison.outlier is None
+             else f'; run {comparison.outlier + 1} differs from the others')
+    if not comparison.agree:
+        large = largest.rms_mg > GOOD_ERROR.value
+        found.append(Shortcoming(
+            'BAD' if large else 'USABLE', f'the calibrations differ by {mg(largest.rms_mg)}, '
+            f'which noise does not explain{which}', 'use the latest calibration, or take the '
+            'poses again' if large else 'use the latest calibration'))
+    elif largest.expected_mg > GOOD_ERROR.value:
+        found.append(Shortcoming('USABLE', 'the uncertainty of the differences is '
+                                 f'{mg(largest.expected_mg)}, too large to see a change of '
+                                 f'{mg(GOOD_ERROR.value)}', 'fit them with more poses'))
+    tilt = comparison.tilt_deg
+    if tilt is not None and tilt > TILT.value:
+        found.append(Shortcoming('USABLE', f'the mountings differ by {tilt:.1f}°',
+                                 'check that the level ground is level, and that the sensor was '
+                                 'not mounted again'))
+    return _rated(found, 'the calibrations agree within their uncertainties', figures,
+                  next(iter(comparison.notes), ''))
+
+
+def _without_noise(residual_mg: float, noise_mg: float | None) -> float:
+    return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))

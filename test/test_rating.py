@@ -1,0 +1,421 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The rating: GOOD can be trusted, and USABLE and BAD say why and what to do."""
+
+from dataclasses import replace
+import math
+from pathlib import Path
+
+import accel_calib as ac
+from accel_calib.calibrate import EDITED, fit_partial, fit_poses, mounting_only, verify
+from accel_calib.capture import capture
+from accel_calib.files import read_calibration, read_poses, read_recording
+from accel_calib.rating import (
+    Expected,
+    GOOD_MG,
+    LIMITS,
+    rate,
+    rate_comparison,
+    rate_refinement,
+    rate_verification,
+    Rating,
+)
+from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from shared import data
+
+MS2, NATIVE = units_of('m/s2'), units_of('native')
+COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],
+          'cross_axis': [0.006, -0.004, 0.005]}
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+TIME = 20.0 * np.arange(30)
+WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
+STORED = Path(__file__).parent / 'data'
+
+
+def poses_of(effects=COMMON, **options):
+    return ac.simulate(effects, **options)
+
+
+def true_error_mg(calibration, effects=COMMON, **context):
+    up = random_directions(500, np.random.default_rng(5))
+    new = poses_of(effects, directions=up, noise=1e-9, **{
+        key: np.full(500, value) for key, value in context.items()})
+    force = calibration.correct(new.reading, new.columns)
+    lengths = np.linalg.norm(force, axis=1) / calibration.force_per_g
+    return 1e3 * float(np.sqrt(np.mean((lengths - 1.0) ** 2)))
+
+
+def without(poses, *names):
+    return Poses({key: values for key, values in poses.columns.items() if key not in names},
+                 poses.row)
+
+
+def moved(poses, rows, by):
+    reading = poses.reading.copy()
+    reading[np.asarray(rows) - 1] += by
+    return poses.with_columns(reading=reading)
+
+
+def tilted():
+    up = np.array([[0, 0, 1], [0.2, 0, 1], [-0.2, 0, 1], [0, 0.2, 1], [0, -0.2, 1]])
+    return poses_of(directions=up / np.linalg.norm(up, axis=1, keepdims=True))
+
+
+def test_many_spread_poses_are_good_and_the_figures_are_in_the_first_line():
+    calibration = ac.fit(poses_of(poses=24))
+    rating = rate(calibration)
+    quality = calibration.quality
+    assert rating.name == 'GOOD'
+    first, *others = rating.lines
+    assert first.startswith(f'GOOD  {quality.rms_before_mg:.1f} -> {quality.rms_after_mg:.2g} mg, '
+                            f'of new poses {quality.held_out_rms_mg:.2g} mg, noise '
+                            f'{quality.noise_floor_mg:.2g} mg, 24 poses, ')
+    assert first.endswith(' % of the sphere')
+    assert len(first) <= 100
+    assert len(others) == 1
+    assert others[0].startswith('next  ')
+
+
+@pytest.mark.parametrize('seed', range(8))
+@pytest.mark.parametrize(('poses', 'noise'), [(12, 0.001), (18, 0.01), (40, 0.02)])
+def test_the_error_of_a_good_calibration_is_below_the_stated_one(poses, noise, seed):
+    up = np.random.default_rng(seed).permutation(spread_directions(poses))
+    calibration = ac.fit(poses_of(directions=up, noise=noise, seed=seed), model='10')
+    rating = rate(calibration)
+    assert rating.name == 'GOOD', rating
+    stated = Expected(calibration).error_mg
+    assert f'right to {stated:.2g} mg' in rating.reason
+    assert true_error_mg(calibration) < min(1.2 * stated, GOOD_MG)
+
+
+def test_a_noisy_sensor_with_many_poses_is_good_and_with_few_it_is_not():
+    noisy = {'noise': 0.06, 'seed': 3}
+    assert rate(ac.fit(poses_of(poses=200, **noisy))).name == 'GOOD'
+    few = rate(ac.fit(poses_of(poses=12, **noisy)))
+    assert few.name == 'USABLE'
+    assert few.next
+
+
+def test_six_faces_are_usable_and_the_next_pose_is_named():
+    rating = rate(ac.fit(poses_of(directions=FACES)))
+    assert rating.name == 'USABLE'
+    assert 'as many poses as values' in rating.reason
+    assert 'points up' in rating.next
+
+
+def test_a_model_without_cross_axis_is_usable_if_the_poses_do_not_determine_it():
+    up = np.vstack([FACES, FACES[[0, 1, 2]]]) + 1e-3
+    rating = rate(ac.fit(poses_of(directions=up / np.linalg.norm(up, axis=1, keepdims=True))))
+    assert rating.name == 'USABLE'
+    assert 'model 7 omits' in rating.reason
+
+
+def test_a_smaller_model_is_good_if_the_poses_show_that_nothing_is_missing():
+    calibration = ac.fit(poses_of({'offset': COMMON['offset']}, poses=30, seed=1))
+    assert calibration.name == '4'
+    assert rate(calibration).name == 'GOOD'
+
+
+def test_bunched_poses_are_not_good():
+    up = random_directions(400, np.random.default_rng(1))
+    rating = rate(ac.fit(poses_of(directions=up[up[:, 2] > 0.4][:14]), model='auto'))
+    assert rating.name != 'GOOD'
+    assert 'points up' in rating.next
+
+
+def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_other():
+    up = spread_directions(60)
+    calibration = ac.fit(poses_of(directions=up[up[:, 2] > 0.0], noise=0.001))
+    rating = rate(calibration)
+    assert true_error_mg(calibration) < GOOD_MG
+    assert rating.name == 'USABLE'
+    assert 'far from all poses' in rating.reason
+    assert rating.next
+
+
+@pytest.mark.parametrize(('effects', 'context'), [
+    ({'quadratic': [0.03, -0.02, 0.02]}, {}),
+    ({'offset_temperature': [2e-3, -1e-3, 1e-3]}, {'temperature': WARM, 'time': TIME})])
+def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, context):
+    table = poses_of({**COMMON, **effects}, poses=30, **context)
+    rating = rate(ac.fit(table))
+    assert rating.name == 'USABLE'
+    assert 'are not noise' in rating.reason
+    assert 'refine' in rating.next
+    result = ac.refine(table)
+    assert [step.effect for step in result.steps] == list(effects)
+    assert rate_refinement(result).name == 'GOOD'
+    base = rate(ac.fit(table), refinement=result)
+    assert base.name == 'USABLE'
+    assert next(iter(effects)) in base.reason
+    assert 'refined' in base.next
+
+
+def test_a_hidden_effect_without_its_column_stays_usable_after_a_refinement():
+    table = without(poses_of({**COMMON, 'offset_temperature': [2e-3, -1e-3, 1e-3]}, poses=30,
+                             temperature=WARM), 'temperature')
+    result = ac.refine(table)
+    rating = rate_refinement(result)
+    assert result.verdict == 'unexplained'
+    assert rating.name == 'USABLE'
+    assert 'no effect explains' in rating.reason
+
+
+def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
+    table = poses_of({**COMMON, 'quadratic': [0.0015, -0.001, 0.001]}, poses=30, noise=1e-4)
+    calibration = ac.fit(table)
+    assert calibration.quality.chi2_per_dof > 400.0
+    assert Expected(calibration).hidden_mg < 1.0
+    assert rate(calibration).name == 'GOOD'
+
+
+def test_a_drift_with_time_is_usable_because_it_may_go_on():
+    mixed = np.random.default_rng(2).permutation(spread_directions(30))
+    table = poses_of({**COMMON, 'offset_drift': [0.03, 0.03, -0.03, 0.0]}, directions=mixed,
+                     time=TIME)
+    result = ac.refine(table)
+    assert 'offset_drift' in result.calibration.model.effects
+    rating = rate_refinement(result)
+    assert rating.name == 'USABLE'
+    assert 'changed with time' in rating.reason
+    assert 'offset_drift' in rating.reason
+
+
+def test_an_effect_of_the_pose_before_cannot_be_corrected_in_single_samples():
+    up = np.random.default_rng(4).permutation(spread_directions(40))
+    way = np.vstack([np.zeros(3), up[:-1] - up[1:]])
+    way[1:] /= np.linalg.norm(way[1:], axis=1, keepdims=True)
+    table = poses_of({**COMMON, 'hysteresis': [0.01, 0.008, -0.01]}, directions=up, previous=way)
+    result = ac.refine(without(table, 'previous'))
+    assert 'hysteresis' in result.calibration.model.effects
+    rating = rate_refinement(result)
+    assert rating.name == 'USABLE'
+    assert 'cannot be corrected in single samples' in rating.reason
+
+
+def test_a_refused_refinement_is_bad_with_the_reason_of_the_gate():
+    result = ac.refine(poses_of(poses=24))
+    rating = rate_refinement(replace(result, refusal=('the covariance is not valid', 'fit again')))
+    assert (rating.name, rating.reason) == ('BAD', 'the covariance is not valid')
+    assert 'fit again' in rating.next
+
+
+def test_many_knocked_poses_are_usable_and_one_of_many_is_good():
+    table = poses_of(poses=24)
+    one = moved(table, [7], 0.3)
+    many = moved(table, [2, 7, 9, 14, 20], [[0.3], [-0.25], [0.4], [0.2], [-0.35]])
+    assert len(ac.fit(one).rejected) == 1
+    assert rate(ac.fit(one)).name == 'GOOD'
+    rating = rate(ac.fit(many))
+    assert rating.name == 'USABLE'
+    assert rating.next
+
+
+def test_an_outlier_among_few_poses_is_usable():
+    table = moved(poses_of(poses=12), [5], 0.4)
+    calibration = ac.fit(table)
+    assert rate(calibration).name == 'USABLE'
+
+
+def test_a_calibration_that_is_worse_than_none_is_bad():
+    ideal = {'offset': [0.001, -0.001, 0.0005]}
+    calibration = ac.fit(poses_of(ideal, poses=11, noise=0.25, seed=2), model='10')
+    assert true_error_mg(calibration, ideal) > 5.0
+    rating = rate(calibration)
+    assert rating.name == 'BAD'
+    assert 'without the calibration' in rating.reason
+
+
+def test_a_sensor_that_was_right_before_is_usable():
+    rating = rate(ac.fit(poses_of({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=0.01)))
+    assert rating.name == 'USABLE'
+    assert 'without the calibration' in rating.reason
+
+
+@pytest.mark.parametrize(('poses', 'expected'), [(10, 'USABLE'), (30, 'GOOD')])
+def test_poses_without_noise_need_more_poses_to_be_good(poses, expected):
+    rating = rate(ac.fit(without(poses_of(poses=poses), 'std', 'count')))
+    assert rating.name == expected
+    assert 'noise not known' in rating.figures
+
+
+def test_an_edited_file_is_usable():
+    calibration = ac.fit(poses_of(poses=24))
+    rating = rate(replace(calibration, warnings=(EDITED,)))
+    assert (rating.name, rating.reason) == ('USABLE', EDITED)
+    assert 'verify' in rating.next
+
+
+@pytest.mark.parametrize(('fitted', 'reason'), [(fit_partial, 'near one direction'),
+                                                (mounting_only, 'mounting alone')])
+def test_a_robot_that_cannot_be_turned_over_is_usable(fitted, reason):
+    rating = rate(fitted(tilted(), MS2))
+    assert rating.name == 'USABLE'
+    assert reason in rating.reason
+
+
+def known(mirror):
+    table = poses_of(poses=24, reference=True)
+    return table.with_columns(reading=table.reading * mirror)
+
+
+def test_a_wrong_sign_that_model_10_does_not_correct_is_bad():
+    rating = rate(ac.fit(known([1.0, -1.0, 1.0]), model='10'))
+    assert rating.name == 'BAD'
+    assert 'the y axis has the wrong sign' in rating.reason
+
+
+def test_a_wrong_sign_that_model_12_corrects_is_usable():
+    calibration = ac.fit(known([1.0, -1.0, 1.0]))
+    assert calibration.name == '12'
+    rating = rate(calibration)
+    assert rating.name == 'USABLE'
+    assert 'model 12 corrects it' in rating.reason
+    assert rate(ac.fit(known([1.0, 1.0, 1.0]))).name == 'GOOD'
+
+
+def test_a_flat_pose_on_another_axis_is_usable():
+    rating = rate(ac.fit(poses_of(directions=np.vstack([[1.0, 0.0, 0.0], spread_directions(20)])),
+                         flat=1))
+    assert rating.name == 'USABLE'
+    assert 'flat pose' in rating.reason
+
+
+def test_doubtful_poses_that_the_fit_needs_make_it_usable():
+    table = poses_of(poses=9).with_columns(doubtful=np.eye(9)[4])
+    calibration = ac.fit(table, model='10')
+    assert any('may have moved' in line for line in calibration.warnings)
+    rating = rate(calibration)
+    assert rating.name == 'USABLE'
+    assert 'take these poses again' in rating.next
+
+
+def test_next_names_the_row_near_level_until_the_calibration_is_levelled():
+    table = poses_of(poses=24)
+    assert 'level in row 1, take it as --flat' in rate(ac.fit(table)).next
+    assert '--flat' not in rate(ac.fit(table, flat=1)).next
+    sideways = table.take(table.reading[:, 2] < 8.0)
+    assert 'level ground' in rate(ac.fit(sideways)).next
+
+
+def test_next_names_the_range_of_the_temperature():
+    table = poses_of(poses=24, temperature=[24.2, 30.7])
+    assert 'the temperature leaves 24..31 °C' in rate(ac.fit(table)).next
+    constant = poses_of(poses=24, temperature=[25.0, 25.0])
+    assert 'the temperature leaves 23..27 °C' in rate(ac.fit(constant)).next
+    assert 'record the temperature' in rate(ac.fit(poses_of(poses=24))).next
+
+
+def test_native_readings_have_no_error_before_the_calibration():
+    calibration = ac.fit(poses_of(poses=24, units='native'))
+    assert Expected(calibration).before_mg is None
+    assert rate(calibration).name == 'GOOD'
+
+
+@pytest.mark.parametrize('factor', [1.0, 1.0 / 9.80665, 1670.0])
+def test_the_rating_does_not_depend_on_the_unit(factor):
+    table = poses_of(poses=18, seed=4)
+    scaled = table.with_columns(reading=table.reading * factor, std=table['std'] * factor)
+    units = NATIVE if factor > 1.0 else units_of('m/s2' if factor == 1.0 else 'g')
+    expected = Expected(fit_poses(table, MS2)).error_mg
+    assert math.isclose(Expected(fit_poses(scaled, units)).error_mg, expected, rel_tol=1e-3)
+
+
+@pytest.mark.parametrize('path', sorted(STORED.glob('calibration_*.yaml')),
+                         ids=lambda path: path.name)
+def test_stored_calibrations_of_all_versions_are_rated(path):
+    rating = rate(read_calibration(path))
+    assert rating.name in ('GOOD', 'USABLE', 'BAD')
+    assert rating.reason
+
+
+@pytest.mark.parametrize(('name', 'units'), [('mpu9150_imu0', MS2), ('mpu9150_imu1', MS2),
+                                             ('xsens_mti_counts', NATIVE)])
+def test_real_recordings_are_good(name, units):
+    found = capture(read_recording(data(f'{name}.csv')), units)
+    rating = rate(fit_poses(found.poses, units))
+    assert rating.name == 'GOOD'
+    even, odd = np.arange(len(found.poses)) % 2 == 0, np.arange(len(found.poses)) % 2 == 1
+    half = fit_poses(found.poses.take(even), units)
+    other = found.poses.take(odd)
+    assert rate_verification(verify(half, other), half).name == 'GOOD'
+
+
+@pytest.mark.parametrize('name', ['esgi95_dataset1_huawei', 'esgi95_dataset2',
+                                  'esgi95_dataset3_gt'])
+def test_phones_of_the_report_are_good_with_all_poses_and_usable_with_the_first(name):
+    units, table = units_of('m/s2', 9.8061), read_poses(data(f'{name}.csv'))
+    assert rate(fit_poses(table, units)).name == 'GOOD'
+    for count in (6, 9, 12):
+        assert rate(fit_poses(table.take(np.arange(count)), units)).name == 'USABLE'
+
+
+def test_new_poses_of_the_same_sensor_are_good():
+    calibration = ac.fit(poses_of(poses=24))
+    new = poses_of(poses=12, seed=9)
+    rating = rate_verification(ac.verify(new, calibration), calibration, new)
+    assert rating.name == 'GOOD'
+    assert '12 poses' in rating.figures
+
+
+def test_a_sensor_that_changed_is_usable_with_the_advice_to_fit_again():
+    calibration = ac.fit(poses_of(poses=24))
+    changed = poses_of({**COMMON, 'offset': [0.036, -0.02, 0.04]}, poses=12, seed=9)
+    rating = rate_verification(ac.verify(changed, calibration), calibration)
+    assert rating.name == 'USABLE'
+    assert 'the sensor has changed' in rating.reason
+    assert 'fit again' in rating.next
+
+
+def test_a_calibration_of_another_sensor_is_bad_on_new_poses():
+    calibration = ac.fit(poses_of(poses=24))
+    other = poses_of({'offset': [-0.01, 0.005, -0.005]}, poses=12, seed=9)
+    rating = rate_verification(ac.verify(other, calibration), calibration)
+    assert rating.name == 'BAD'
+
+
+def test_a_verification_of_few_directions_does_not_improve_the_rating():
+    calibration = ac.fit(poses_of(directions=FACES))
+    near = FACES[[0]] + 0.1 * random_directions(12, np.random.default_rng(3))
+    new = poses_of(directions=near / np.linalg.norm(near, axis=1, keepdims=True), seed=9)
+    checked = ac.verify(new, calibration)
+    assert rate_verification(checked, calibration, new).name == 'USABLE'
+
+
+def test_poses_that_are_too_noisy_do_not_verify():
+    calibration = ac.fit(poses_of(poses=24))
+    rating = rate_verification(ac.verify(poses_of(poses=12, noise=0.1, seed=9), calibration),
+                               calibration)
+    assert rating.name == 'USABLE'
+
+
+@pytest.mark.parametrize(('offset', 'expected'), [(0.03, 'GOOD'), (0.032, 'USABLE'),
+                                                  (0.06, 'BAD')])
+def test_calibrations_that_differ_are_usable_or_bad(offset, expected):
+    runs = [ac.fit(poses_of(poses=24)),
+            ac.fit(poses_of({**COMMON, 'offset': [offset, -0.02, 0.04]}, poses=24, seed=7))]
+    rating = rate_comparison(ac.compare(runs))
+    assert rating.name == expected
+    assert '2 calibrations' in rating.figures
+
+
+def test_calibrations_that_are_too_uncertain_to_differ_are_usable():
+    runs = [ac.fit(poses_of(poses=10, noise=0.15, seed=seed)) for seed in (1, 2)]
+    comparison = ac.compare(runs)
+    assert comparison.agree
+    assert rate_comparison(comparison).name == 'USABLE'
+
+
+def test_lines_are_aligned_and_leave_out_an_empty_next():
+    assert Rating('BAD', 'why', 'figures', '').lines == ('BAD     figures', 'reason  why')
+    assert Rating('GOOD', 'why', 'figures', 'do').lines == ('GOOD  figures', 'next  do')
+
+
+def test_limits_have_a_unit_and_a_meaning_and_one_name_each():
+    assert len({limit.name for limit in LIMITS}) == len(LIMITS)
+    assert all(limit.unit and limit.meaning and limit.value > 0.0 for limit in LIMITS)
