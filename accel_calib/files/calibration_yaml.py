@@ -56,7 +56,15 @@ _FIRST_LINE = f'format: {FORMAT}'
 VERSION = 2
 """Version 1 had no stream and no checksum, and NaN for an undetermined covariance."""
 
+_CORRECTION = ('force = transpose(rotation) matrix (reading - offset), plus the effects other '
+               'than offset and gain; offset in the unit of the readings')
+OTHER_CORRECTION = 'the correction in the file is not that of its effects; the effects are used'
+"""Warning of a calibration whose file was edited by hand in one of the two."""
+
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
+_SAME = 1e-9
+"""A stated correction may differ by this share from that of the effects."""
+
 _CHECKSUM = '\nchecksum: sha256 '
 _NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
 
@@ -74,12 +82,12 @@ def format_calibration(calibration: Calibration) -> str:
                     for (name, values), effect in zip(model.values.items(), model.terms.effects,
                                                       strict=True)},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
-        **({'mounting': mounting_figures(model.rotation, calibration.sensor)}
-           if calibration.is_levelled else {}),
+        **_derived(calibration),
         'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality), **_rest_noise(calibration),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
-        'warnings': [line for line in calibration.warnings if line != EDITED],
+        'warnings': [line for line in calibration.warnings
+                     if line not in (EDITED, OTHER_CORRECTION)],
         'poses': {'row': calibration.poses.row.tolist(),
                   **{key: calibration.poses[key].tolist() for key, column in COLUMNS.items()
                      if key in calibration.poses and not column.made}},
@@ -87,6 +95,16 @@ def format_calibration(calibration: Calibration) -> str:
     text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99,
                      default_flow_style=None)
     return f'{text.rstrip()}{_CHECKSUM}{_digest(text.rstrip())}\n'
+
+
+def _derived(calibration: Calibration) -> dict[str, Any]:
+    """Return what follows from the other values, for users of the file: mounting, W⁻¹ and V."""
+    correction = {'equation': _CORRECTION, 'matrix': calibration.matrix.tolist(),
+                  'offset': calibration.offset.tolist()}
+    if not calibration.is_levelled:
+        return {'correction': correction}
+    return {'mounting': mounting_figures(calibration.rotation, calibration.sensor),
+            'correction': correction}
 
 
 def _rest_noise(calibration: Calibration) -> dict[str, Any]:
@@ -163,9 +181,26 @@ def parse_calibration(text: str, name: str) -> Calibration:
     body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
         raise _damaged(name, 'its last line, the checksum, is missing')
-    if digest.strip() != _digest(body.rstrip()):
-        return replace(calibration, warnings=(*calibration.warnings, EDITED))
-    return calibration
+    if digest.strip() == _digest(body.rstrip()):
+        return calibration
+    other = _other_correction(content, calibration, name)
+    return replace(calibration, warnings=(*calibration.warnings, EDITED, *other))
+
+
+def _other_correction(content: Mapping[str, Any], calibration: Calibration, name: str
+                      ) -> tuple[str, ...]:
+    """Return a warning if a file states a correction that is not that of its effects."""
+    if content.get('correction') is None:
+        return ()
+    try:
+        stated = _mapping(content, 'correction')
+        pairs = ((_array(stated, 'offset', (3,)), calibration.offset, calibration.units.per_g),
+                 (_array(stated, 'matrix', (3, 3)), calibration.matrix,
+                  float(np.max(np.abs(calibration.matrix)))))
+    except (KeyError, TypeError, ValueError) as err:
+        raise _damaged(name, f'correction: {err}') from err
+    same = all(np.allclose(found, own, rtol=0.0, atol=_SAME * size) for found, own, size in pairs)
+    return () if same else (OTHER_CORRECTION,)
 
 
 def _damaged(name: str, what: str) -> DamagedCalibrationError:
