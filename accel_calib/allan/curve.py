@@ -1,0 +1,227 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The Allan deviation of a still sensor, and the covariance of its estimates.
+
+**Deviation.** For the averaging time τ = m τ0, the Allan variance is half the mean square of the
+difference between successive averages of m samples. The overlapping estimate uses each start
+(IEEE Std 952-1997, annex C [1]_; NIST SP 1065 [2]_, eq. 11). With x the integral of the samples,
+the difference is the second difference of x::
+
+    d(k) = (x(k + 2m) - 2 x(k + m) + x(k)) / (m √2),    variance = mean of d(k)²
+
+**Components.** A sum of independent components is fitted to the variance:
+
+| component | variance at τ | slope of the deviation | c(t) |
+|---|---|---|---|
+| quantisation Q | 3 Q²/τ² | -1 | Q² at t = 0 |
+| white noise N | N²/τ | -1/2 | -N² abs(t)/2 |
+| bias instability B | B² 2 ln2/π | 0 | B² t² ln(abs(t))/(2π) |
+| random walk K | K² τ/3 | +1/2 | K² abs(t)³/12 |
+| drift R | R² τ²/2 | +1 | none: it is not random |
+
+√(2 ln2/π) = 0.664 is the factor between the flat part of the curve and B.
+
+**Covariance.** c(t) is the generalised covariance of x: second differences do not depend on the
+polynomials that it leaves open. It gives the covariance γ of any two differences d in closed form,
+for different m, too. For Gaussian noise, the covariance of two estimates is::
+
+    cov = 2 / (n_i n_j) · sum over all pairs of γ²
+
+This includes the overlap, the few averages at long τ, and mixed components. For one component it
+agrees with the equivalent degrees of freedom, edf = 2 variance² / cov, of Greenhall and Riley
+[3]_. A drift adds its product with the mean of d, whose covariance is a sum of γ.
+The sum over the lags uses points that are dense near the kinks of γ.
+
+References
+----------
+.. [1] IEEE Std 952-1997, annex C; IEEE Std 1293-2018, annex on noise of accelerometers.
+.. [2] W. J. Riley, Handbook of Frequency Stability Analysis, NIST SP 1065, 2008.
+.. [3] C. A. Greenhall, W. J. Riley, Uncertainty of stability variances based on finite
+   differences, PTTI 2003.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..units import Floats
+
+FLAT = 2.0 * np.log(2.0) / np.pi
+"""Allan variance of flicker noise in units of B²."""
+
+LEAST_AVERAGES = 4
+"""Smallest number of averages of length τ in the record, at the longest τ."""
+
+_GROWTH = 1.15
+"""Ratio of successive distances of the lags from a kink."""
+
+_RANDOM = 4
+"""Number of components that are random."""
+
+_SECOND = np.array([1.0, -2.0, 1.0])
+_FLICKER = np.array([[0.0], [0.0], [1.0], [0.0]])
+_FAR = 16
+"""Lag in units of m_i + m_j from which γ of flicker noise is its fourth derivative."""
+
+Counts = NDArray[np.int64]
+
+
+def octaves(samples: int) -> Counts:
+    """Return the numbers of samples per average: powers of 2."""
+    most = samples // LEAST_AVERAGES
+    return 2 ** np.arange(most.bit_length(), dtype=np.int64)
+
+
+def shares(lengths: Counts) -> Floats:
+    """Return the (k, 5) variance of each component of size 1 at each length, for τ0 = 1."""
+    m = lengths.astype(float)
+    return np.column_stack([3.0 / m**2, 1.0 / m, np.full(len(m), FLAT), m / 3.0, 0.5 * m**2])
+
+
+def allan_variances(values: Floats, lengths: Counts) -> Floats:
+    """
+    Return the overlapping Allan variance at each length.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Samples with equal spacing.
+    lengths : (k,) array of int
+        Numbers of samples per average, at most n/2.
+
+    Raises
+    ------
+    InputError
+        If allantools is not installed.
+
+    """
+    check_allantools()
+    found = import_module('allantools').oadev(values - np.mean(values), rate=1.0,
+                                              data_type='freq', taus=lengths.astype(float))
+    return np.asarray(found[1], dtype=float) ** 2
+
+
+def check_allantools() -> None:
+    """
+    Check that the Allan deviation can be computed.
+
+    Raises
+    ------
+    InputError
+        If allantools is not installed.
+
+    """
+    if find_spec('allantools') is None:
+        raise InputError('allantools is not installed, but the Allan deviation needs it',
+                         'run pip install allantools')
+
+
+@dataclass(frozen=True)
+class Spread:
+    """
+    Covariances of the estimates at all lengths, for any sizes of the components.
+
+    Parameters
+    ----------
+    size : int
+        Number of lengths k.
+    pairs : (p, 2) array of int
+        Pairs of lengths i <= j.
+    gamma : (p, 4, g) array
+        Covariance of the differences at each lag, for each component of size 1.
+    weight : (p, g) array
+        Weight of the square at each lag.
+    of_mean : (4, k, k) array
+        Covariance of the mean differences times m_i m_j, for each component of size 1.
+
+    """
+
+    size: int
+    pairs: NDArray[np.intp]
+    gamma: Floats
+    weight: Floats
+    of_mean: Floats
+
+    def covariance(self, sizes: Floats) -> Floats:
+        """Return the (k, k) covariance of the variances for (5,) squared components, τ0 = 1."""
+        used = np.flatnonzero(sizes[:_RANDOM])
+        gamma = np.einsum('c,pcg->pg', sizes[used], self.gamma[:, used])
+        found = np.einsum('pg,pg->p', self.weight, gamma**2)
+        matrix = np.zeros((self.size, self.size))
+        matrix[self.pairs[:, 0], self.pairs[:, 1]] = found
+        matrix[self.pairs[:, 1], self.pairs[:, 0]] = found
+        if sizes[_RANDOM] > 0.0:
+            matrix += 2.0 * sizes[_RANDOM] * _definite(
+                np.einsum('c,cij->ij', sizes[:_RANDOM], self.of_mean))
+        return matrix
+
+
+def spread_of(lengths: Counts, samples: int) -> Spread:
+    """Return the covariances for these lengths and this number of samples."""
+    first, second = np.triu_indices(len(lengths))
+    lags = [_lags(lengths[i], lengths[j], samples) for i, j in zip(first, second, strict=True)]
+    most = max(map(len, lags))
+    gamma, weight = np.zeros((len(lags), 4, most)), np.zeros((len(lags), most))
+    for p, (i, j, lag) in enumerate(zip(first, second, lags, strict=True)):
+        gamma[p, :, :len(lag)] = _between(lag, lengths[i], lengths[j])
+        weight[p, :len(lag)] = _weights(lag, lengths[i], lengths[j], samples)
+    of_mean = np.zeros((_RANDOM, len(lengths), len(lengths)))
+    of_mean[:, first, second] = 0.5 * np.einsum('pg,pcg->cp', weight, gamma) * (
+        lengths[first] * lengths[second])
+    of_mean[:, second, first] = of_mean[:, first, second]
+    return Spread(len(lengths), np.column_stack([first, second]), gamma, weight, of_mean)
+
+
+def _definite(matrix: Floats) -> Floats:
+    """Return a symmetric matrix without the negative eigenvalues of rounded sums."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)
+
+
+def _lags(one: int, two: int, samples: int) -> Counts:
+    """Return lags between the centres of the differences, dense near each kink of γ."""
+    last = samples + 1 - one - two
+    growth = np.arange(1.0, np.log(max(last, 2)) / np.log(_GROWTH) + 1.0)
+    distance = np.concatenate([np.arange(9), np.round(_GROWTH**growth).astype(np.int64)])
+    kinks = np.array([0, one, two, two - one, two + one])
+    around = kinks[:, np.newaxis] + np.concatenate([-distance, distance])
+    return np.unique(np.concatenate([around[(around >= 0) & (around <= last)], [0, last]]))
+
+
+def _weights(lag: Counts, one: int, two: int, samples: int) -> Floats:
+    """Return the weights of γ² at the lags: 2/(n_i n_j) times the number of pairs."""
+    counts = samples + 1 - 2 * one, samples + 1 - 2 * two
+    pairs = np.minimum(min(counts), samples + 1 - one - two - lag).astype(float)
+    width = np.zeros(len(lag))
+    width[1:] += 0.5 * np.diff(lag)
+    width[:-1] += 0.5 * np.diff(lag)
+    return 4.0 / (float(counts[0]) * float(counts[1])) * width * np.maximum(pairs, 0.0)
+
+
+def _between(lag: Counts, one: int, two: int) -> Floats:
+    """Return the (4, g) covariance of two differences for components of size 1."""
+    total = np.zeros((4, len(lag)))
+    for a, weight_a in zip((-1, 0, 1), _SECOND, strict=True):
+        for b, weight_b in zip((-1, 0, 1), _SECOND, strict=True):
+            total += weight_a * weight_b * _generalised(lag + a * one - b * two)
+    # Rounding would exceed the small differences at long lags: all but flicker noise is 0 there.
+    total[:, lag > one + two] *= _FLICKER
+    far = lag > _FAR * (one + two)
+    total[2, far] = -(float(one) * float(two) / lag[far])**2 / np.pi
+    return total / (2.0 * float(one) * float(two))
+
+
+def _generalised(lag: Counts) -> Floats:
+    """Return the (4, g) generalised covariance c(t) of the integral, for size 1."""
+    t = np.abs(lag).astype(float)
+    log = np.log(np.maximum(t, 1.0))
+    return np.array([(t == 0.0).astype(float), -0.5 * t, t**2 * log / (2.0 * np.pi), t**3 / 12.0])

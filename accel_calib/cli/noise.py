@@ -1,0 +1,131 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``accel-calib noise``: noise density, bias instability and random walk from a long rest."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import options
+from .terminal import progress
+from ..allan import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
+from ..calibrate import Calibration, check_sensor, check_units, of_samples
+from ..errors import counted, InputError
+from ..files import open_log, OpenLog, Progress
+from ..report import check_matplotlib
+from ..report.noise_page import figure_rows, kalibr_lines, need_lines, write_noise_page
+from ..table import Recording
+from ..units import Units, units_of
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..allan import AxisNoise
+
+_EXAMPLE = 'accel-calib noise rest.mcap --json noise.json --report noise.html'
+
+
+def add_to(made: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    options.add_example(made, _EXAMPLE)
+    made.add_argument('recording', type=Path, metavar='RECORDING',
+                      help='recording with a long rest: any log, or a bag')
+    made.add_argument('-c', '--calibration', type=Path, metavar='FILE',
+                      help='stored calibration to apply first, for readings in counts or volts')
+    made.add_argument('--report', type=Path, metavar='FILE',
+                      help='page to write with the Allan deviation and the figures (HTML)')
+    options.add_log(made)
+    options.add_json(made)
+    made.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Find the rest, compute the figures, and print them."""
+    check_allantools()
+    if args.report is not None:
+        check_matplotlib()
+    found, lines = _noise(args)
+    options.write_json(args.json, {'recording': args.recording, **to_json(found)})
+    if args.report is not None:
+        write_noise_page(args.report, found, str(args.recording))
+    _show(args, found, lines)
+    return 0
+
+
+def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
+    """Return the figures, and how the recording was read."""
+    asked = options.log_options(args)
+    calibration = args.calibration and options.stored_calibration(args.calibration)
+    if calibration and calibration.units.name == 'native':
+        asked = replace(asked, units=asked.units or 'native')
+    with open_log(args.recording, asked) as log:
+        with progress('samples') as moved:
+            recording = _samples(log, args.recording, moved)
+        lines = [f'read as: {log.read_as}'] if log.read_as else []
+        lines += [f'note: {note}' for note in log.notes]
+        units = log.units
+    if calibration:
+        recording, units = _corrected(recording, units, calibration)
+    with progress('axes') as moved:
+        return noise_of(recording, units, args.gravity, moved), lines
+
+
+def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
+    """
+    Return the samples of a log.
+
+    A table of slow samples has the form of a pose table without the columns of a pose.
+
+    """
+    if log.poses is None:
+        return joined(log.watched(moved))
+    if 'time' in log.poses and 'count' not in log.poses:
+        return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
+    raise InputError(f'{path} is a pose table, expected a recording',
+                     'use the samples of a long rest, with their time')
+
+
+def _corrected(recording: Recording, units: Units, calibration: Calibration
+               ) -> tuple[Recording, Units]:
+    """Return the corrected recording, in g if it was in native units."""
+    own = calibration.in_units(units)
+    check_units(recording, own.units)
+    check_sensor(own, recording.sensor)
+    known = of_samples(recording.columns, len(recording), own.model)
+    made = recording.with_columns(reading=own.correct(recording.reading, known))
+    return made, units_of('g') if units.name == 'native' else units
+
+
+def _show(args: argparse.Namespace, found: NoiseFigures, lines: list[str]) -> None:
+    """Print the figures by axis, the notes, and the figures for Kalibr."""
+    console = options.console(args)
+    for line in lines:
+        console.print(line)
+    console.print(f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
+                  f'{found.rate:.5g} Hz')
+    for kind in found.kinds:
+        console.print(_table(kind, found.of(kind)))
+    for line in [f'note: {note}' for note in found.notes] + need_lines(found):
+        console.print(line)
+    for line in kalibr_lines(found):
+        console.print(line)
+    if args.report is not None:
+        console.print(f'stored in {args.report}')
+
+
+def _table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
+    """Return the table of one sensor, at most 60 columns wide."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=kind, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column('')
+    for axis in axes:
+        table.add_column(axis.axis, justify='right', no_wrap=True)
+    for label, unit, cells in figure_rows(axes):
+        table.add_row(f'{label}, {unit}', *cells)
+    return table

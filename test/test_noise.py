@@ -1,0 +1,373 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Noise figures from a long rest, by Allan deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+from typing import Any
+
+from accel_calib.allan import duration, noise_of, NoiseFigures, to_json
+from accel_calib.allan.components import COMPONENTS, fit_components
+from accel_calib.allan.curve import allan_variances, octaves, shares, spread_of
+from accel_calib.allan.rest import longest_rest
+from accel_calib.cli.main import main
+from accel_calib.errors import InputError
+from accel_calib.files import write_table
+from accel_calib.sphere import spread_directions
+from accel_calib.table import Floats, numbered, Poses, Recording
+from accel_calib.units import STANDARD_GRAVITY, units_of
+import numpy as np
+import pytest
+
+allantools = pytest.importorskip('allantools')
+
+G = units_of('g')
+RATE = 100.0
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def flicker(rng: np.random.Generator, count: int, size: float) -> Floats:
+    """Return noise with the two-sided density B²/(2π f), of twice the length and cut."""
+    frequency = np.fft.rfftfreq(2 * count)[1:]
+    power = size**2 / (np.pi * frequency) * count / 2.0
+    parts = rng.normal(size=(2, len(frequency))) * np.sqrt(power)
+    return np.fft.irfft(np.append(0.0, parts[0] + 1j * parts[1]), 2 * count)[:count]
+
+
+def noise(rng: np.random.Generator, count: int, white: float, flat: float = 0.0,
+          walk: float = 0.0) -> Floats:
+    """Return a sum of N, B and K for a spacing of 1 s."""
+    return (white * rng.normal(size=count) + flicker(rng, count, flat)
+            + walk * np.cumsum(rng.normal(size=count)))
+
+
+def resting(seed: int, count: int, white: float = 1e-4, *, flat: float = 0.0, walk: float = 0.0,
+            gyro: float = 0.0, mean: Sequence[float] = UP) -> Recording:
+    """Return a rest with these densities, in g/√Hz, g, g/s/√Hz and rad/s/√Hz."""
+    rng = np.random.default_rng(seed)
+    columns = {'time': np.arange(count) / RATE, 'reading': np.column_stack(
+        [noise(rng, count, white * np.sqrt(RATE), flat, walk / np.sqrt(RATE))
+         for _ in range(3)]) + mean}
+    if gyro:
+        columns['rate'] = gyro * np.sqrt(RATE) * rng.normal(size=(count, 3))
+    return Recording(columns, numbered(columns))
+
+
+def figure_of(found: NoiseFigures, name: str, axis: int = 0) -> Any:
+    return found.axes[axis].figures[name]
+
+
+def test_allan_deviations_are_those_published_by_nist() -> None:
+    # NIST SP 1065, section 12.4: 1000 points of a prescribed random generator.
+    values = [1234567890]
+    for _ in range(999):
+        values.append(16807 * values[-1] % 2147483647)
+    found = np.sqrt(allan_variances(np.array(values) / 2147483647.0, np.array([1, 10, 100])))
+    assert found == pytest.approx([2.922319e-1, 9.159953e-2, 3.241343e-2], rel=1e-6)
+
+
+@pytest.mark.parametrize(('component', 'alpha'), [(0, 2), (1, 0), (2, -1), (3, -2)])
+def test_degrees_of_freedom_are_those_of_greenhall_and_riley(component: int, alpha: int) -> None:
+    count = 4096
+    lengths = octaves(count)
+    sizes = np.eye(5)[component]
+    freedom = 2.0 * shares(lengths)[:, component]**2 / np.diag(
+        spread_of(lengths, count).covariance(sizes))
+    published = [allantools.edf_greenhall(alpha, 2, int(m), count + 1, overlapping=True)
+                 for m in lengths]
+    # At short τ the published formula is for continuous time.
+    assert freedom[5:] == pytest.approx(published[5:], rel=0.035)
+
+
+def test_covariance_of_the_curve_is_that_of_simulated_curves() -> None:
+    rng = np.random.default_rng(3)
+    count, sizes = 2048, np.array([0.0, 1.0, 0.02, 1e-4, 0.0])
+    lengths = octaves(count)
+    curves = [allan_variances(noise(rng, count, *np.sqrt(sizes[1:4])), lengths)
+              for _ in range(600)]
+    expected = spread_of(lengths, count).covariance(sizes)
+    deviation = np.sqrt(np.diag(expected))
+    found = np.cov(np.array(curves).T) / np.outer(deviation, deviation)
+    assert found == pytest.approx(expected / np.outer(deviation, deviation), abs=0.2)
+    assert np.mean(curves, axis=0) == pytest.approx(shares(lengths) @ sizes, rel=0.1)
+
+
+@pytest.mark.parametrize(('count', 'true'), [
+    (16000, (1.0, 0.0, 0.006)), (30000, (1.0, 0.15, 0.0)), (30000, (1.0, 0.06, 0.006)),
+    (500, (1.0, 0.0, 0.0))])
+def test_intervals_hold_the_true_value(count: int, true: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(11)
+    lengths = octaves(count)
+    spread = spread_of(lengths, count)
+    fits = [fit_components(allan_variances(noise(rng, count, *true), lengths), lengths, spread)
+            for _ in range(60)]
+    for component, value in enumerate(true, start=1):
+        found = [fit.components[component] for fit in fits]
+        seen = [each for each in found if each.seen]
+        if value == 0.0:
+            assert len(seen) <= 3, COMPONENTS[component]
+        elif len(seen) > 30:
+            inside = [each.interval[0] <= value <= each.interval[1] for each in seen]
+            assert np.mean(inside) >= 0.87, COMPONENTS[component]
+            sizes = np.array([each.value for each in seen])
+            assert abs(np.mean(sizes) / value - 1.0) < 0.06
+            assert 0.6 < np.std(sizes) / np.mean([each.sd for each in seen]) < 1.3
+        assert np.mean([each.upper >= value for each in found]) >= 0.87
+
+
+def test_density_and_walk_have_their_units() -> None:
+    found = noise_of(resting(1, 200_000, 1e-4, walk=1e-5, gyro=2e-4), G)
+    for axis in range(3):
+        assert figure_of(found, 'noise_density', axis).value == pytest.approx(
+            1e-4 * STANDARD_GRAVITY, rel=0.02)
+        low, high = figure_of(found, 'random_walk', axis).interval
+        assert 0.8 * low < 1e-5 * STANDARD_GRAVITY < 1.25 * high
+        assert figure_of(found, 'noise_density', axis + 3).value == pytest.approx(2e-4, rel=0.02)
+    assert found.rate == pytest.approx(RATE)
+
+
+def test_the_flat_part_is_divided_by_its_factor() -> None:
+    found = noise_of(resting(2, 200_000, 1e-6, flat=1e-4), G)
+    axis = found.axes[0]
+    assert axis.figures['bias_instability'].value == pytest.approx(
+        1e-4 * STANDARD_GRAVITY, rel=0.1)
+    middle = axis.deviation[len(axis.tau) // 2]
+    assert middle / axis.figures['bias_instability'].value == pytest.approx(0.664, rel=0.1)
+
+
+def test_white_noise_alone_shows_nothing_else_and_states_the_necessary_rest() -> None:
+    found = noise_of(resting(3, 18_000), G)
+    assert [figure_of(found, name).seen for name in COMPONENTS] == [
+        False, True, False, False, False]
+    need = found.needs['accelerometer', 'bias_instability']
+    assert 'needs about ' in need
+    assert 'this has 3 min' in need
+    assert 'h at rest' in found.needs['accelerometer', 'random_walk']
+
+
+def test_readings_in_m_s2_and_g_have_the_same_figures() -> None:
+    in_g = resting(4, 6000)
+    in_si = in_g.with_columns(reading=in_g.reading * STANDARD_GRAVITY)
+    one, two = noise_of(in_g, G), noise_of(in_si, units_of('m/s2'))
+    assert one.common('accelerometer', 'noise_density') == pytest.approx(
+        two.common('accelerometer', 'noise_density'), rel=1e-6)
+
+
+def test_figures_of_native_readings_stay_native() -> None:
+    recording = resting(5, 6000)
+    counts = recording.with_columns(reading=recording.reading * 16384.0)
+    found = noise_of(counts, units_of('native'))
+    assert figure_of(found, 'noise_density').value == pytest.approx(1.6384, rel=0.1)
+    made = to_json(found)
+    assert made['accelerometer_noise_density'] is None
+    assert 'native' in made['accelerometer_noise_density_reason']
+
+
+def test_rates_in_counts_are_not_taken_for_rad_s() -> None:
+    recording = resting(5, 6000, gyro=1e-4)
+    counts = recording.with_columns(rate=recording['rate'] * 7506.0)
+    found = noise_of(counts, G)
+    assert any('not in rad/s' in note for note in found.notes)
+    assert to_json(found)['gyroscope_noise_density'] is None
+    assert to_json(found)['accelerometer_noise_density'] is not None
+
+
+def test_the_longest_rest_of_a_recording_with_turns_is_used() -> None:
+    parts = [resting(6, 3000), resting(7, 20_000, mean=(0.0, 1.0, 0.0)),
+             resting(8, 5000, mean=(1.0, 0.0, 0.0))]
+    columns = {'time': np.arange(28_000) / RATE,
+               'reading': np.concatenate([part.reading for part in parts])}
+    rest = longest_rest(Recording(columns, numbered(columns)), G)
+    assert 28.0 < rest.start < 35.0
+    assert 19_000 < rest.samples <= 20_000
+    assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_rest_ends_at_an_interruption() -> None:
+    recording = resting(9, 30_000)
+    time = recording['time'] + 60.0 * (np.arange(30_000) >= 10_000)
+    rest = longest_rest(recording.with_columns(time=time), G)
+    assert rest.start > 159.0
+    assert 19_000 < rest.samples <= 20_000
+
+
+def test_single_missing_samples_do_not_shorten_the_rest() -> None:
+    recording = resting(10, 30_000)
+    kept = np.random.default_rng(0).random(30_000) > 0.005
+    found = noise_of(recording.take(kept), G)
+    assert found.rate == pytest.approx(RATE, rel=1e-3)
+    assert found.samples > 29_000
+    assert any('missing' in note for note in found.notes)
+    assert figure_of(found, 'noise_density').value == pytest.approx(
+        1e-4 * STANDARD_GRAVITY, rel=0.05)
+
+
+def test_jitter_of_the_stamps_does_not_change_the_figures() -> None:
+    recording = resting(11, 30_000)
+    late = np.random.default_rng(0).uniform(0.0, 0.008, 30_000)
+    found = noise_of(recording.with_columns(time=recording['time'] + late), G)
+    assert any('uneven' in note for note in found.notes)
+    assert figure_of(found, 'noise_density').value == pytest.approx(
+        1e-4 * STANDARD_GRAVITY, rel=0.05)
+
+
+def test_a_low_pass_filter_is_noted_and_the_density_is_that_of_long_times() -> None:
+    rng = np.random.default_rng(12)
+    raw = 1e-4 * np.sqrt(RATE) * rng.normal(size=(60_007, 3))
+    smooth = np.cumsum(raw, axis=0)
+    columns = {'time': np.arange(60_000) / RATE,
+               'reading': (smooth[7:] - smooth[:-7])[:60_000] / 7.0 + UP}
+    found = noise_of(Recording(columns, numbered(columns)), G)
+    assert any('low-pass filter' in note for note in found.notes)
+    density = figure_of(found, 'noise_density')
+    assert abs(density.value - 1e-4 * STANDARD_GRAVITY) < 4.0 * density.sd
+
+
+def test_a_coarse_output_is_noted() -> None:
+    recording = resting(13, 20_000, mean=(0.0002, 0.0004, 0.9998))
+    coarse = recording.with_columns(reading=np.round(recording.reading / 0.004) * 0.004)
+    found = noise_of(coarse, G)
+    assert any('one step of the output' in note or 'all samples of the rest are the same' in note
+               for note in found.notes)
+
+
+def test_an_axis_without_noise_is_left_out_with_a_note() -> None:
+    recording = resting(14, 5000)
+    reading = recording.reading.copy()
+    reading[:, 1] = 0.0
+    found = noise_of(recording.with_columns(reading=reading), G)
+    assert [axis.axis for axis in found.axes] == ['x', 'z']
+    assert any('accelerometer y: all samples' in note for note in found.notes)
+    assert to_json(found)['accelerometer_noise_density_axes'][1] is None
+
+
+def test_a_change_of_temperature_is_noted() -> None:
+    recording = resting(15, 20_000)
+    warm = recording.with_columns(temperature=np.linspace(20.0, 26.0, 20_000))
+    assert any('temperature changed by' in note for note in noise_of(warm, G).notes)
+    same = recording.with_columns(temperature=np.full(20_000, 20.0))
+    assert not any('temperature' in note for note in noise_of(same, G).notes)
+
+
+def test_a_drift_is_not_taken_for_a_random_walk() -> None:
+    recording = resting(16, 200_000)
+    drift = 2e-6 * recording['time'][:, np.newaxis]
+    found = noise_of(recording.with_columns(reading=recording.reading + drift), G)
+    assert not figure_of(found, 'random_walk').seen
+    drift = figure_of(found, 'drift')
+    assert abs(drift.value - 2e-6 * STANDARD_GRAVITY) < 4.0 * drift.sd
+    assert any('steady drift of 7' in note and 'µg per hour' in note for note in found.notes)
+
+
+def test_a_swing_of_the_temperature_is_not_taken_for_a_random_walk() -> None:
+    recording = resting(16, 200_000)
+    swing = 5e-4 * np.sin(recording['time'] / 200.0)[:, np.newaxis]
+    found = noise_of(recording.with_columns(reading=recording.reading + swing), G)
+    assert not figure_of(found, 'random_walk').seen
+    assert any('slope +' in note for note in found.notes)
+    assert 'another form' in found.needs['accelerometer', 'random_walk']
+
+
+def test_a_recording_without_a_rest_is_refused() -> None:
+    rng = np.random.default_rng(17)
+    columns = {'time': np.arange(3000) / RATE, 'reading': rng.normal(size=(3000, 3)) + UP}
+    with pytest.raises(InputError, match='longest rest .* expected at least 64'):
+        noise_of(Recording(columns, numbered(columns)), G)
+
+
+def test_a_reading_that_is_not_finite_is_refused() -> None:
+    recording = resting(18, 3000)
+    reading = recording.reading.copy()
+    reading[70, 2] = np.nan
+    with pytest.raises(InputError, match='row 71'):
+        noise_of(recording.with_columns(reading=reading), G)
+
+
+@pytest.mark.parametrize(('seconds', 'words'), [
+    (0.02, '20 ms'), (9.8, '9.8 s'), (90.0, '90 s'), (180.0, '3 min'), (2400.0, '40 min'),
+    (18_000.0, '5 h')])
+def test_durations_have_their_usual_unit(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
+
+
+@pytest.fixture(scope='module')
+def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('noise') / 'rest.csv'
+    recording = resting(19, 12_000, gyro=1e-4)
+    write_table(path, Recording(recording.columns, recording.row, 'g'))
+    return path
+
+
+def test_the_json_has_the_names_and_units_of_kalibr(table: Path, tmp_path: Path) -> None:
+    assert main(['noise', str(table), '--json', str(tmp_path / 'noise.json')]) == 0
+    made = json.loads((tmp_path / 'noise.json').read_text())
+    assert made['accelerometer_noise_density'] == pytest.approx(1e-4 * STANDARD_GRAVITY, rel=0.05)
+    assert made['gyroscope_noise_density'] == pytest.approx(1e-4, rel=0.05)
+    assert made['update_rate'] == pytest.approx(RATE, rel=1e-3)
+    assert made['accelerometer_random_walk'] is None
+    assert 'needs about' in made['accelerometer_random_walk_reason']
+    assert made['accelerometer_random_walk_axes'] == [None] * 3
+    assert all(limit > 0.0 for limit in made['accelerometer_random_walk_axes_upper'])
+    assert len(made['accelerometer_noise_density_axes_sd']) == 3
+    assert len(made['curves']) == 6
+
+
+def test_the_page_is_self_contained_and_names_the_figures(table: Path, tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    assert main(['noise', str(table), '--report', str(tmp_path / 'noise.html')]) == 0
+    text = (tmp_path / 'noise.html').read_text()
+    for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density'):
+        assert words in text
+    assert 'http' not in text
+
+
+@pytest.mark.parametrize('width', [60, 80])
+def test_lines_fit_the_terminal(table: Path, capsys: pytest.CaptureFixture[str],
+                                monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    monkeypatch.setenv('COLUMNS', str(width))
+    assert main(['noise', str(table)]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= width
+    assert '±' in text
+    assert '…' not in text
+
+
+def test_a_calibration_turns_counts_into_g(tmp_path: Path) -> None:
+    rng = np.random.default_rng(21)
+    directions = spread_directions(24)
+    readings = directions * 16384.0 + [100.0, -50.0, 20.0] + rng.normal(size=(24, 3))
+    columns = {'reading': readings, 'std': np.full((24, 3), 10.0), 'count': np.full(24, 100.0)}
+    write_table(tmp_path / 'poses.csv', Poses(columns, numbered(columns), 'native'))
+    recording = resting(22, 6000)
+    counts = recording.with_columns(reading=recording.reading * 16384.0 + 20.0)
+    write_table(tmp_path / 'rest.csv', Recording(counts.columns, counts.row, 'native'))
+    assert main(['fit', str(tmp_path / 'poses.csv'), '-o', str(tmp_path / 'c.yaml')]) == 0
+    assert main(['noise', str(tmp_path / 'rest.csv'), '-c', str(tmp_path / 'c.yaml'), '--json',
+                 str(tmp_path / 'noise.json')]) == 0
+    made = json.loads((tmp_path / 'noise.json').read_text())
+    assert made['accelerometer_noise_density'] == pytest.approx(1e-4 * STANDARD_GRAVITY, rel=0.05)
+
+
+def test_slow_samples_are_a_recording(tmp_path: Path) -> None:
+    recording = resting(23, 1000)
+    slow = recording.with_columns(time=recording['time'] * 1000.0)
+    write_table(tmp_path / 'slow.csv', Recording(slow.columns, slow.row, 'g'))
+    assert main(['noise', str(tmp_path / 'slow.csv'), '--json', str(tmp_path / 'n.json')]) == 0
+    assert json.loads((tmp_path / 'n.json').read_text())['update_rate'] == pytest.approx(0.1)
+
+
+def test_a_pose_table_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = {'reading': np.eye(3), 'std': np.full((3, 3), 1e-3), 'count': np.full(3, 100.0)}
+    write_table(tmp_path / 'poses.csv', Poses(columns, numbered(columns), 'g'))
+    assert main(['noise', str(tmp_path / 'poses.csv')]) == 2
+    assert 'pose table' in capsys.readouterr().err
+
+
+def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('accel_calib.allan.curve.find_spec', lambda name: None)
+    with pytest.raises(InputError, match='run pip install allantools'):
+        noise_of(resting(20, 1000), G)
