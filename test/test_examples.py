@@ -9,19 +9,21 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted(path.name for path in (ROOT / 'examples').glob('*.py'))
 
 
-def output_of(name, folder):
-    """Run an example in an empty folder, and return its output."""
+def output_of(name, folder, *written):
+    """Run an example in an empty folder, and return its output; it may write these files."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    done = subprocess.run([sys.executable, ROOT / 'examples' / name], cwd=folder, text=True,
-                          env=environment, capture_output=True, timeout=120, check=False)
+    done = subprocess.run([sys.executable, ROOT / 'examples' / name, *written], cwd=folder,
+                          text=True, env=environment, capture_output=True, timeout=120,
+                          check=False)
     assert done.returncode == 0, done.stderr
-    assert not list(folder.iterdir())
+    assert sorted(folder.iterdir()) == sorted(written)
     return done.stdout
 
 
@@ -38,6 +40,21 @@ def test_recording_is_calibrated_from_end_to_end(tmp_path):
     assert before > 20.0
     assert after < 0.5
     assert output.endswith('Corrected force in the flat pose [g]: [0. 0. 1.]\n')
+
+
+def test_error_falls_from_model_to_model(tmp_path):
+    output = output_of('error_surfaces.py', tmp_path)
+    largest = [float(value) for value in re.findall(r'largest error (\S+) mg', output)]
+    # Figures 1 to 4 of AN5286: about 50, 10, 5 and 2.5 mg.
+    np.testing.assert_allclose(largest, [50.0, 10.0, 5.0, 2.5], rtol=0.1)
+
+
+def test_error_surfaces_are_drawn(tmp_path):
+    pytest.importorskip('matplotlib')
+    paths = [tmp_path / name for name in ('surfaces.svg', 'surfaces.png')]
+    output_of('error_surfaces.py', tmp_path, *paths)
+    assert '<svg' in paths[0].read_text(encoding='utf-8')
+    assert paths[1].read_bytes().startswith(b'\x89PNG')
 
 
 @pytest.mark.parametrize('name', EXAMPLES)

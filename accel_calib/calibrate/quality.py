@@ -138,8 +138,8 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     check_sensor(calibration, poses.sensor)
     poses_g = calibration.held(with_history(in_g(poses, units), model))
     vectors = calibration.name == '12' and 'reference' in poses
-    before = _before(poses_g, units, vectors=vectors)
-    after = _errors(model, poses_g, vectors=vectors)
+    before = errors_before(poses_g, units, vectors=vectors)
+    after = errors_after(model, poses_g, vectors=vectors)
     floor = None
     if noise_of(poses_g) is not None:
         known = poses_g if vectors else _without_orientation(poses_g)
@@ -170,8 +170,8 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
 
     """
     vectors = 'reference' in fit.poses_g
-    before = _before(fit.poses_g, units, vectors=vectors)
-    errors = _errors(fit.model, fit.poses_g, vectors=vectors)
+    before = errors_before(fit.poses_g, units, vectors=vectors)
+    errors = errors_after(fit.model, fit.poses_g, vectors=vectors)
     held_out = _held_out(fit)
     return Quality(_rms_mg(before), _rms_mg(errors), _largest_percent(before),
                    _largest_percent(errors), None if held_out is None else _rms_mg(held_out),
@@ -187,7 +187,7 @@ def noise_floor_mg(fit: Fit) -> float:
     return _rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
 
 
-def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
+def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
     """
     Return the (n,) errors without a calibration [g].
 
@@ -202,7 +202,7 @@ def _before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
     return np.linalg.norm(reading, axis=1) - 1.0
 
 
-def _errors(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
+def errors_after(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
     """Return the (n,) errors of corrected poses [g]."""
     if vectors:
         force = correct(model, poses_g.reading, poses_g.columns)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .style import ACCENT, AFTER, INK, new_figure, styled
+from .style import ACCENT, AFTER, Chart, INK, new_figure, styled, THIRD
 from .variables import variable_of, with_thermal
 from ..effects import AXES, CARRIERS, effect_named, empirical_parts
 from ..model import parameter_names
@@ -26,11 +26,9 @@ from ..table import Floats, Poses
 from ..units import MG
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..refine import Refinement
 
-_COLOURS = (AFTER, ACCENT, '#009e73')
+_COLOURS = (AFTER, ACCENT, THIRD)
 """Colours of the parts of a curve."""
 
 _GRID = 201
@@ -104,7 +102,7 @@ def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Flo
     return np.cos(np.pi * np.multiply.outer(np.array(modes), share))
 
 
-def draw_curve(title: str, variable: str, parts: Sequence[CurvePart], unit: str) -> Figure:
+def draw_curve(title: str, variable: str, parts: Sequence[CurvePart], unit: str) -> Chart:
     """
     Draw an empirical curve with its 95 % band, and ticks at the poses.
 
@@ -137,7 +135,7 @@ def draw_curve(title: str, variable: str, parts: Sequence[CurvePart], unit: str)
         panel.set_xlabel(both.label)
         panel.set_ylabel(f'change from the mean [{unit}]')
         panel.legend(ncols=len(parts))
-    return figure
+    return Chart(figure)
 
 
 def carrier_words(carrier: str) -> str:

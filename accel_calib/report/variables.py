@@ -110,6 +110,11 @@ def variable_of(key: str, values: Floats) -> Variable:
     return Variable(label, values * factor)
 
 
+def since_first(poses: Poses) -> Floats:
+    """Return the (n,) time of each pose since the first [s]."""
+    return poses['time'] - np.min(poses['time'])
+
+
 def _time(seconds: Floats) -> Variable:
     since = seconds - np.min(seconds)
     span = np.max(since)

@@ -1,0 +1,215 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The figures of several calibrations of one sensor: side by side, and over their dates.
+
+Offsets are in mg and gains in %. For native units, 1 g is the mean of the sensitivities.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .drawings import Drawing
+from .style import (
+    ACCENT,
+    AFTER,
+    BEFORE,
+    Chart,
+    FAINT,
+    INK,
+    Mark,
+    new_figure,
+    PAPER,
+    styled,
+    THERMAL,
+    THIRD,
+)
+from ..compare import Comparison, History
+from ..compare.comparison import Parameter
+from ..table import Floats
+from ..units import MG
+from ..words import value_unit, with_sd
+
+_COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
+_BAND = 1.96
+"""Half the width of a band, in standard deviations: 95 %."""
+
+_DAY_S = 86400.0
+_ONE_COLOUR = 0.5
+"""Range of temperatures that is drawn in one colour [°C]."""
+
+OFFSETS = ('offset.x', 'offset.y', 'offset.z')
+GAINS = ('gain.x', 'gain.y', 'gain.z')
+CROSS = ('gain.xy', 'gain.xz', 'gain.yz')
+
+
+def scale_of(name: str) -> tuple[float, float, str]:
+    """Return zero, factor and unit of a parameter in figures and tables."""
+    if name in OFFSETS:
+        return 0.0, MG, 'mg'
+    if name in (*GAINS, *CROSS):
+        return 1.0 if name in GAINS else 0.0, 100.0, '%'
+    effect, _, part = name.rpartition('.')
+    unit, factor = value_unit(effect, part)
+    return 0.0, factor, unit
+
+
+def in_words(name: str, value: float, sd: float) -> str:
+    """Return a parameter as ``+value ± sd unit``."""
+    zero, factor, unit = scale_of(name)
+    words = with_sd((value - zero) * factor, sd * factor)
+    return f'{"" if words.startswith("-") else "+"}{words} {unit}'.replace('-', '−', 1)
+
+
+def named_words(name: str, value: float, sd: float) -> str:
+    """Return a parameter with its name, such as ``offset x +20.3 ± 0.1 mg``."""
+    return f'{name.replace(".", " ")} {in_words(name, value, sd)}'
+
+
+def of_parameters(comparison: Comparison, labels: Sequence[str]) -> tuple[Drawing, ...]:
+    """
+    Draw the difference of each parameter of each run from the mean of all runs.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The comparison.
+    labels : sequence of str
+        Name of each run.
+
+    """
+    groups = (('offsets', 'Zero-g offset', OFFSETS), ('gains', 'Gain and cross-axis',
+                                                      (*GAINS, *CROSS)))
+    drawn = []
+    for key, words, names in groups:
+        found = [each for each in comparison.parameters if each.name in names]
+        title = f'{words}: difference of each run from the mean, with 95 % band'
+        drawn.append(Drawing(key, title, _draw_parameters(title, found, labels)))
+    return tuple(drawn)
+
+
+def _draw_parameters(title: str, found: Sequence[Parameter], labels: Sequence[str]) -> Chart:
+    hover = {}
+    with styled():
+        figure = new_figure(3.3)
+        figure.suptitle(title.partition(':')[0] + ' minus the mean of the runs', x=0.02, ha='left',
+                        fontsize=10.5)
+        panel = figure.subplots()
+        panel.grid(visible=True, axis='y')
+        panel.axhline(0.0, color=FAINT, linewidth=1.2)
+        for run, label in enumerate(labels):
+            at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
+            factor = np.array([scale_of(each.name)[1] for each in found])
+            change = np.array([each.values[run] - np.mean(each.values) for each in found])
+            band = _BAND * np.array([each.stated_sd[run] for each in found])
+            colour = _COLOURS[run % len(_COLOURS)]
+            panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
+            panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label,
+                       markeredgecolor=PAPER, markeredgewidth=0.4)
+            hover[f'run{run}'] = tuple(Mark(0, f'{label}, ' + named_words(
+                each.name, each.values[run], each.stated_sd[run])) for each in found)
+        panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
+        panel.set_ylabel(scale_of(found[0].name)[2])
+        if len(labels) <= len(_COLOURS):
+            figure.legend(loc='outside lower center', ncols=2)
+    return Chart(figure, hover)
+
+
+def of_history(history: History) -> tuple[Drawing, ...]:
+    """Draw offset, gain and cross-axis over the dates, with bands."""
+    groups = (('history_offset', 'Zero-g offset', OFFSETS),
+              ('history_gain', 'Gain minus 1', GAINS),
+              ('history_cross_axis', 'Cross-axis gain', CROSS))
+    drawn = []
+    for key, words, names in groups:
+        found = [each for each in history.parameters if each.name in names and (
+            key != 'history_cross_axis' or np.any(each.stated_sd))]
+        if found:
+            title = f'{words} over the dates, with 95 % band'
+            drawn.append(Drawing(key, title, _draw_history(title, history, found)))
+    return tuple(drawn)
+
+
+def _draw_history(title: str, history: History, found: Sequence[Parameter]) -> Chart:
+    at, dated = _positions(history)
+    warm = _temperatures(history)
+    hover = {}
+    with styled():
+        figure = new_figure(0.9 + 1.25 * len(found))
+        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+        panels = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
+        for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
+            drawn = _draw_line(panel, each, at, warm)
+            drawn.set_gid(f'panel{k}')
+            hover[f'panel{k}'] = _marks(history, each)
+        if warm is not None:
+            bar = figure.colorbar(drawn, ax=list(panels), aspect=40, pad=0.02)
+            bar.set_label('temperature [°C]')
+            bar.outline.set_visible(False)
+        _label_dates(panels[-1], at, dated=dated)
+    return Chart(figure, hover)
+
+
+def _positions(history: History) -> tuple[Floats, bool]:
+    """Return the place of each calibration, and whether it is a date."""
+    days = np.array([np.nan if moment.when is None else moment.when.timestamp() / _DAY_S
+                     for moment in history.moments])
+    dated = bool(np.all(np.isfinite(days))) and float(np.ptp(days)) > 0.0
+    return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
+
+
+def _temperatures(history: History) -> Floats | None:
+    """Return the temperature of each calibration, NaN if not known; None if it hardly changes."""
+    warm = np.array([np.nan if moment.temperature is None else moment.temperature
+                     for moment in history.moments])
+    known = warm[np.isfinite(warm)]
+    return warm if len(known) > 1 and np.ptp(known) > _ONE_COLOUR else None
+
+
+def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> Any:
+    zero, factor, unit = scale_of(each.name)
+    values, band = (each.values - zero) * factor, _BAND * each.stated_sd * factor
+    panel.grid(visible=True)
+    panel.fill_between(at, values - band, values + band, color=AFTER, alpha=0.18, linewidth=0.0)
+    panel.plot(at, values, color=FAINT, linewidth=1.2)
+    panel.vlines(at, values - band, values + band, color=BEFORE, linewidth=1.0)
+    panel.set_ylabel(f'{each.name.partition(".")[2]} [{unit}]')
+    if warm is None:
+        return panel.plot(at, values, 'o', color=AFTER, markeredgecolor=PAPER)[0]
+    limits = {'vmin': np.nanmin(warm), 'vmax': np.nanmax(warm)}
+    colours = np.where(np.isfinite(warm), warm, np.nanmean(warm))
+    return panel.scatter(at, values, c=colours, cmap=THERMAL, edgecolors=INK, linewidths=0.5,
+                         zorder=3, **limits)
+
+
+def _marks(history: History, each: Parameter) -> tuple[Mark, ...]:
+    """Return date, value and temperature of each calibration."""
+    marks = []
+    for label, moment, value, sd in zip(history.labels, history.moments, each.values,
+                                        each.stated_sd, strict=True):
+        words = f'{label}, {named_words(each.name, value, sd)}'
+        if moment.temperature is not None:
+            words += f', {moment.temperature:.0f} °C'
+        marks.append(Mark(0, words))
+    return tuple(marks)
+
+
+def _label_dates(panel: Any, at: Floats, *, dated: bool) -> None:
+    """Label the axis with dates, or with numbers of runs."""
+    if not dated:
+        panel.set_xticks(at, [f'{number:.0f}' for number in at])
+        panel.set_xlabel('calibration')
+        return
+    from matplotlib import dates
+
+    locator: Any = dates.AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
+    panel.xaxis.set_major_locator(locator)
+    panel.xaxis.set_major_formatter(
+        dates.ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    panel.set_xlabel('date of the fit')

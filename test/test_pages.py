@@ -1,0 +1,386 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The pages of fits, verifications, comparisons and histories."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import re
+
+import accel_calib as ac
+from accel_calib.calibrate import verify
+from accel_calib.cli.main import main
+from accel_calib.compare import compare, history_of
+from accel_calib.errors import InputError
+from accel_calib.rating import rate, rate_comparison, rate_verification, Rating
+from accel_calib.report import write_history_page
+from accel_calib.report.calibration_sections import linear_figures
+from accel_calib.report.page import calibration_page, page
+from accel_calib.report.repeat_pages import comparison_page, history_page
+from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
+from accel_calib.report.sheet import STYLE
+from accel_calib.report.snippets import snippets
+import numpy as np
+from page_parser import parsed
+import pytest
+
+pytest.importorskip('matplotlib')
+
+SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
+          'cross_axis': [0.004, 0.002, -0.003]}
+HOSTILE = '</script><script>alert(1)</script></title><b onload="x">&\''
+
+
+def simulated(seed=0, poses=24, units='m/s2', **options):
+    return ac.simulate(SENSOR, poses=poses, seed=seed, units=units,
+                       temperature=np.linspace(20.0, 40.0, poses),
+                       time=np.arange(poses) * 10.0, **options)
+
+
+@pytest.fixture(scope='module')
+def poses():
+    return simulated()
+
+
+@pytest.fixture(scope='module')
+def calibration(poses):
+    return ac.fit(poses, flat=1, sensor='imu_link')
+
+
+@pytest.fixture(scope='module')
+def text(calibration):
+    return calibration_page(calibration, rate(calibration), 'poses.csv')
+
+
+@pytest.fixture(scope='module')
+def dated():
+    """Return calibrations of a sensor whose offset of z jumps between the third and the fourth."""
+    found = []
+    for k in range(5):
+        offset = [0.02, -0.01, 0.03 + (0.004 if k > 2 else 0.0)]
+        table = ac.simulate({**SENSOR, 'offset': offset}, poses=24, seed=k,
+                            temperature=[20.0 + k, 22.0 + k])
+        found.append(replace(ac.fit(table), sensor='imu_link',
+                             date=f'2026-0{k + 1}-12T10:00:00+00:00'))
+    return found
+
+
+def headings(text):
+    return re.findall(r'<h2>(.*?)</h2>', text)
+
+
+def test_verdict_is_first_and_the_title_of_a_good_calibration_does_not_alarm(text):
+    assert '<title>Good: calibration of imu_link</title>' in text
+    assert '<h1>Calibration of imu_link</h1>' in text
+    assert 'class="verdict GOOD"' in text
+    assert text.index('class="verdict') < text.index('<h2>')
+    assert not re.search('lack|gap|error', text[:text.index('<style>')])
+
+
+def test_page_without_a_name_has_a_title(calibration):
+    bare = replace(calibration, sensor='')
+    assert '<h1>Calibration</h1>' in calibration_page(bare, rate(bare), '')
+
+
+def test_sections_are_in_the_order_in_which_a_person_asks(text):
+    assert headings(text) == ['The calibration', 'Coverage of the sphere', 'Before and after',
+                              'What remains', 'Poses', 'Use it', 'How to read this']
+
+
+def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses):
+    found = parsed(text)
+    figures = found.named('svg')
+    assert len(figures) == 4
+    assert all(each['role'] == 'img' and each['aria-label'] for each in figures)
+    live = found.named('figure')
+    assert all(each['tabindex'] == '0' and each['aria-label'] for each in live)
+    assert len(live) == len(figures)
+    for row, warm in zip(poses.row, poses['temperature'], strict=True):
+        mine = [mark for mark in found.marks if mark.startswith(f'row {row}, ')]
+        # Coverage, before, after, by direction, against temperature and against time.
+        assert len(mine) == 6
+        assert all(re.fullmatch(rf'row {row}, [+−][\d.]+ mg, {warm:.0f} °C', mark)
+                   for mark in mine)
+    rows = {each['data-row'] for each in found.named('tr') if 'data-row' in each}
+    assert rows == {str(row) for row in poses.row}
+    assert rows == {each['data-row'] for each in found.named('use') if 'data-row' in each}
+
+
+def test_marks_state_the_residual_of_their_pose(text, calibration):
+    residuals = residuals_of(calibration)
+    for row, value, warm in zip(residuals.poses_g.row, residuals.after_mg,
+                                residuals.poses_g['temperature'], strict=True):
+        assert f'row {row}, {milli(value, signed=True)} mg, {warm:.0f} °C' in text
+
+
+def test_tables_scroll_inside_of_the_page_and_nothing_has_a_fixed_width(text):
+    found = parsed(text)
+    tables = [where for tag, _, where in found.tags if tag == 'table']
+    assert tables
+    assert all(where[-1] == 'div' for where in tables)
+    assert text.count('<table') == len(re.findall(
+        r'<div class="scroll(?: long)?" tabindex="0"[^>]*>\s*<table', text))
+    widths = re.findall(r'(?<![\w-])width: ([^;}]+)', STYLE)
+    assert set(widths) <= {'100%', 'fit-content'}
+    assert 'overflow-x: auto' in STYLE
+    assert '(prefers-color-scheme: dark)' in STYLE
+    assert '@media print' in STYLE
+
+
+def test_figures_follow_the_colours_of_the_page(text):
+    drawn = ''.join(re.findall(r'<svg.*?</svg>', text, re.DOTALL))
+    used = set(re.findall(r'var\(--([\w-]+)\)', drawn))
+    assert {'ink', 'paper', 'after', 'before', 'accent', 'grid', 'disc'} <= used
+    for name in used:
+        assert STYLE.count(f'--{name}:') == 3  # light, dark and paper
+    assert not re.search('#222222|#ffffff|#0072b2', drawn)
+    assert '<style' not in drawn.replace('<style type="text/css" />', '')
+
+
+def test_hostile_names_are_text(calibration, poses):
+    labelled = poses.with_columns(label=np.array([HOSTILE] * len(poses)))
+    hostile = replace(calibration, sensor=HOSTILE, date=HOSTILE, warnings=(HOSTILE,),
+                      reason=HOSTILE, poses=labelled)
+    rating = Rating('GOOD', HOSTILE, HOSTILE, HOSTILE)
+    text = calibration_page(hostile, rating, HOSTILE, stored=HOSTILE, notes=(HOSTILE,))
+    found = parsed(text)
+    assert not found.open
+    assert text.count('<script>') == 1
+    assert '<b onload' not in text
+    assert not [attrs for _, attrs, _ in found.tags if 'onload' in attrs]
+    assert '<b onload="x">' in ''.join(found.texts)
+    shown = comparison_page(compare([hostile, hostile]), rating, [Path(HOSTILE)] * 2,
+                            [hostile, hostile])
+    assert shown.count('<script>') == 1
+    assert '<b onload' not in shown
+
+
+@pytest.mark.parametrize(('model', 'units', 'known'), [
+    ('4', 'm/s2', False), ('7', 'g', False), ('9', 'm/s2', False), ('10', 'native', False),
+    ('12', 'm/s2', True)])
+def test_residuals_are_those_of_the_quality(model, units, known):
+    table = simulated(units='m/s2' if units == 'native' else units, reference=known)
+    if units == 'native':
+        table = replace(table, columns={**table.columns, 'reading': table.reading * 1671.0,
+                                        'std': table['std'] * 1671.0}, units='native')
+    fitted = ac.fit(table, model=model)
+    residuals = residuals_of(fitted)
+    quality = fitted.quality
+    assert np.sqrt(np.mean(residuals.before_mg ** 2)) == pytest.approx(quality.rms_before_mg)
+    assert residuals.rms_mg == pytest.approx(quality.rms_after_mg, rel=1e-6)
+    assert residuals.signed is not known
+    assert 'Coverage of the sphere' in calibration_page(fitted, rate(fitted), 'poses.csv')
+
+
+def test_values_and_their_deviations_are_those_of_the_calibration(calibration, text):
+    for axis, value, sd in zip('xyz', calibration.offset, calibration.offset_sd, strict=True):
+        value, sd = (part * 1e3 / 9.80665 for part in (value, sd))
+        cell = re.search(rf'<td>offset {axis}</td><td>([^<]*) ± ([^<]*) mg</td>', text)
+        assert float(cell[1].replace('−', '-')) == pytest.approx(value, abs=sd / 2.0)
+        assert float(cell[2]) == pytest.approx(sd, rel=0.06)
+    found = linear_figures(calibration.model.vector, calibration.model.effects)
+    gains = [float(cell) for cell in re.findall(r'<td>gain .</td><td>([-+][\d.]+)',
+                                                text.replace('−', '-'))]
+    np.testing.assert_allclose(gains, (found[3:6] - 1.0) * 100.0, atol=0.01)
+    assert 'MPU-6050' in text
+
+
+def test_figures_by_axis_are_those_of_the_axes():
+    # Axes of length 1.01, 1 and 0.99; x and y are 89° apart, the others 90°.
+    mat = np.diag([1.01, 1.0, 0.99]) @ np.array(
+        [[1.0, np.cos(np.radians(89.0)), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    mat[0] *= 1.01 / np.linalg.norm(mat[0])
+    vec = np.concatenate([[0.1, 0.2, 0.3], np.diag(mat) - 1.0, [mat[0, 1] / 2.0, 0.0, 0.0],
+                          [0.0, 0.0, -mat[0, 1] / 2.0]])
+    effects = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
+    from accel_calib.model import with_vector
+    model = with_vector(effects, vec)
+    if not np.allclose(model.linear_part[0], mat):
+        vec[-1] *= -1.0
+    np.testing.assert_allclose(with_vector(effects, vec).linear_part[0], mat, atol=1e-12)
+    angle = np.degrees(np.arccos(mat[0] @ mat[1] / np.linalg.norm(mat[0])))
+    np.testing.assert_allclose(linear_figures(vec, effects),
+                               [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, angle, 90.0, 90.0])
+    assert angle == pytest.approx(89.0, abs=0.02)
+
+
+def test_values_that_the_model_lacks_are_absent(poses):
+    small = ac.fit(poses, model='4')
+    text = calibration_page(small, rate(small), 'poses.csv')
+    assert 'gain all axes' in text
+    assert 'angle' not in text
+    assert '0 ± 0' not in text
+
+
+def test_left_out_poses_are_listed_and_drawn(poses):
+    reading = poses.reading.copy()
+    reading[10] *= 1.05
+    fitted = ac.fit(poses.with_columns(reading=reading))
+    assert [each.row for each in fitted.rejected] == [11]
+    text = calibration_page(fitted, rate(fitted), 'poses.csv')
+    found = parsed(text)
+    assert '<h2>Poses left out</h2>' in text
+    assert 'row 11, left out' in found.marks
+    assert not [mark for mark in found.marks if re.match(r'row 11, [+−]', mark)]
+    assert re.search(r'<tr data-row="11">.*left out: ', text)
+
+
+def test_page_of_a_verification_shows_the_other_poses(calibration):
+    other = simulated(seed=7, poses=9)
+    checked = verify(calibration, other)
+    text = calibration_page(calibration, rate_verification(checked, calibration), 'other.csv',
+                            verification=(checked, other))
+    found = parsed(text)
+    assert '<h1>Check of the calibration of imu_link</h1>' in text
+    rows = [each['data-row'] for each in found.named('tr') if 'data-row' in each]
+    assert rows == [str(row) for row in range(1, 10)]
+    residuals = residuals_of(calibration, other)
+    assert residuals.rms_mg == pytest.approx(checked.rms_after_mg)
+    assert np.sqrt(np.mean(residuals.before_mg ** 2)) == pytest.approx(checked.rms_before_mg)
+    assert 'Next pose' not in text
+
+
+def test_one_pose_on_a_hemisphere_has_its_text(calibration):
+    up = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]])
+    few = ac.simulate(SENSOR, directions=up, mounting=(0.0, 0.0, 0.0))
+    checked = verify(calibration, few)
+    text = calibration_page(calibration, rate_verification(checked, calibration), 'few.csv',
+                            verification=(checked, few))
+    assert [mark for mark in parsed(text).marks if mark.startswith('row 3, ')]
+
+
+def test_refinement_that_is_not_used_is_shown_beside_the_fit(calibration, poses):
+    refined = ac.refine(poses, base='4')
+    assert refined.steps
+    both = calibration_page(calibration, rate(calibration), 'poses.csv', refinement=refined)
+    assert 'The calibration of this page does not contain these effects.' in both
+    assert refined.verdict == 'explained'
+    assert both.count('The gap is explained') == 1
+    assert both.index('Effects that were found') < both.index('The gap is explained')
+    assert f'{milli(residuals_of(calibration).after_mg[0], signed=True)} mg' in both
+    own = page(refined, 'poses.csv')
+    assert 'does not contain these effects' not in own
+    assert 'What remains after the refinement' not in own
+    first = residuals_of_refinement(refined).after_mg[0]
+    assert f'row 1, {milli(first, signed=True)} mg' in own
+
+
+def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
+    known = ac.refine(simulated(reference=True), base='10')
+    residuals = residuals_of(known.calibration)
+    assert residuals.signed
+    assert residuals.rms_mg == pytest.approx(known.calibration.quality.rms_after_mg)
+    left = residuals_of_refinement(known)
+    assert left.rms_mg == pytest.approx(known.remaining_gap_mg, rel=0.01)
+    text = page(known, 'poses.csv')
+    assert 'What remains after the refinement' in text
+    assert f'Remaining residual: {left.rms_mg:.3g} mg RMS' in text
+    assert f'Remaining residual: {residuals.rms_mg:.3g} mg RMS' in text
+
+
+def test_lines_of_c_correct_as_apply_does(calibration):
+    lines = dict(snippets(calibration, 'calibration.yaml'))
+    numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
+    vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
+    reading = np.array([[1.0, -4.0, 9.0], [-9.0, 3.0, 1.0]])
+    np.testing.assert_allclose((reading - vec) @ mat.T, calibration.apply(reading), rtol=1e-6)
+
+
+def test_lines_of_python_run(calibration, tmp_path):
+    path = tmp_path / "robot's.yaml"
+    calibration.save(path)
+    reading = np.array([[1.0, -4.0, 9.0]])
+    known = {'readings': reading}
+    exec(dict(snippets(calibration, str(path)))['Python'], known)
+    np.testing.assert_allclose(known['force'], calibration.apply(reading))
+
+
+def test_numbers_have_the_digits_that_a_person_compares():
+    texts = [milli(value, signed=True) for value in (0.4, -0.4123, 46.63, 1234.5, -1e-9, 0.0012)]
+    assert texts == ['+0.40', '−0.41', '+46.6', '+1234', '+0.000', '+0.001']
+    assert milli(0.4, signed=False) == '0.40'
+
+
+def test_comparison_has_a_page(dated):
+    comparison = compare(dated)
+    rating = rate_comparison(comparison)
+    paths = [Path(f'{k}.yaml') for k in range(5)]
+    text = comparison_page(comparison, rating, paths, dated)
+    found = parsed(text)
+    assert not found.open
+    assert 'Comparison of 5 calibrations of imu_link' in text
+    assert len(found.marks) == 5 * 9
+    assert any(re.fullmatch(r'4 3\.yaml, offset z \+3[34]\.\d+ ± 0\.\d+ mg', mark)
+               for mark in found.marks)
+
+
+def test_history_is_in_order_of_date_and_finds_the_change(dated):
+    shuffled = [dated[k] for k in (3, 0, 4, 2, 1)]
+    history = history_of(shuffled)
+    assert [moment.index for moment in history.moments] == [1, 4, 3, 0, 2]
+    assert [change.comparison.agree for change in history.changes] == [True, True, False, True]
+    jump = history.changes[2]
+    assert jump.parameter == 'offset.z'
+    assert jump.change == pytest.approx(0.004, abs=4.0 * jump.sd)
+    assert [moment.temperature for moment in history.moments] == pytest.approx(
+        [21.0, 22.0, 23.0, 24.0, 25.0])
+    offset = next(each for each in history.parameters if each.name == 'offset.z')
+    expected = [each.offset[2] / 9.80665 for each in dated]
+    np.testing.assert_allclose(offset.values, expected, atol=1e-9)
+
+
+def test_history_without_dates_keeps_the_order(dated):
+    undated = [dated[2], replace(dated[0], date=''), dated[1]]
+    history = history_of(undated)
+    assert [moment.index for moment in history.moments] == [0, 1, 2]
+    assert history.labels == ('2026-03-12', 'no date', '2026-02-12')
+    assert 'calibration 2 has no date: the order is that of the input' in history.notes
+    assert 'calibration' in history_page(history, [Path('a.yaml')] * 3, undated)
+
+
+def test_history_tells_fits_of_one_day_apart(dated):
+    history = history_of([replace(dated[0], date='2026-01-12T17:30:00+02:00'), dated[0]])
+    assert history.labels == ('2026-01-12 10:00', '2026-01-12 15:30')
+
+
+def test_history_refuses_what_it_cannot_compare(dated):
+    with pytest.raises(InputError, match="the date of calibration 2 is 'Monday', expected"):
+        history_of([dated[0], replace(dated[1], date='Monday')])
+    with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
+        history_of(dated[:1])
+
+
+def test_history_has_a_page(dated, tmp_path):
+    history = history_of(dated)
+    path = tmp_path / 'history.html'
+    write_history_page(path, history, [Path(f'{k}.yaml') for k in range(5)], dated)
+    text = path.read_text(encoding='utf-8')
+    found = parsed(text)
+    assert not found.open
+    assert len(found.named('svg')) == 3
+    assert len(found.marks) == 5 * 9
+    assert any(re.fullmatch(r'2026-04-12, offset z \+3[34]\.\d+ ± 0\.\d+ mg, 24 °C', mark)
+               for mark in found.marks)
+    assert text.count('<td>differ, ') == 1
+    assert 'temperature [°C]' in text
+
+
+def test_history_command_prints_tables_and_changes(dated, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '60')
+    paths = [tmp_path / f'{k}.yaml' for k in range(5)]
+    for path, each in zip(paths, dated, strict=True):
+        each.save(path)
+    page_, result = tmp_path / 'history.html', tmp_path / 'history.json'
+    assert main(['history', *map(str, paths[::-1]), '--report', str(page_), '--json',
+                 str(result)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r'2026-01-12 .*±.*±.*±', printed)
+    assert 'differ' in printed
+    assert page_.exists()
+    found = json.loads(result.read_text(encoding='utf-8'))
+    assert [run['file'] for run in found['runs']] == [str(path) for path in paths]
+    assert [change['agree'] for change in found['changes']] == [True, True, False, True]
+    assert {change['rating'] for change in found['changes']} <= {'GOOD', 'USABLE', 'BAD'}
+    assert main(['history', str(paths[0])]) == 2
+    assert capsys.readouterr().err.count('\n') == 1
