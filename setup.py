@@ -42,9 +42,17 @@ setup(
             'ros-jazzy-common-interfaces==5.3.6',
             'ros-jazzy-ament-index-python',
         ],
-        # Figures: accel-calib report, and refine --report.
+        # Figures and pages.
         'report': ['matplotlib>=3.6'],
-        'test': ['matplotlib>=3.6', 'pandas', 'pytest', 'setuptools'],
+        # Flight logs of PX4 and ArduPilot.
+        'logs': ['pyulog', 'pymavlink'],
+        # Allan deviation: accel-calib noise.
+        'noise': ['allantools'],
+        # Completion of the command line by the shell.
+        'completion': ['argcomplete'],
+        'docs': ['sphinx', 'myst-parser', 'sphinx-rtd-theme'],
+        'test': ['allantools', 'argcomplete', 'imucal', 'matplotlib>=3.6', 'pandas', 'pymavlink',
+                 'pytest', 'pyulog', 'setuptools'],
         'dev': [
             'flake8',
             'flake8-builtins',

@@ -22,14 +22,9 @@ from .capture import settings_from
 from .compare import compare as compare_calibrations
 from .compare import Comparison
 from .errors import counted, InputError
-from .files import (
-    is_bag,
-    open_recording,
-    read_calibration,
-    write_calibration,
-)
-from .files import read_poses as read_pose_table
+from .files import LogOptions, open_log, read_calibration, read_log, write_calibration
 from .files import read_recording as read_whole_recording
+from .intake import nothing_still, poses_of
 from .refine import refine as find_effects
 from .refine import Refinement
 from .simulate import model_with, simulate_poses, simulate_recording
@@ -122,7 +117,7 @@ class Calibration(calibrate.Calibration):
 
         check_matplotlib()
         result = find_effects(self.used_poses, self.units, base=self)
-        write_page(Path(path), result, f'poses of {self!r}')
+        write_page(Path(path), result, '')
         return result
 
 
@@ -153,7 +148,7 @@ def load(path: Source) -> Calibration:
 
 def read_poses(path: Source) -> Poses:
     """
-    Read a pose table (CSV).
+    Read a pose table: text in any dialect, with the columns by name.
 
     Parameters
     ----------
@@ -168,17 +163,24 @@ def read_poses(path: Source) -> Poses:
     Raises
     ------
     InputError
-        If the table is empty, lacks columns, or contains a value that is not a finite number.
+        If the table cannot be read, or is a recording.
     OSError
         If the file cannot be read.
 
     """
-    return read_pose_table(Path(path))
+    table = read_log(Path(path)).table
+    if isinstance(table, Poses):
+        return table
+    raise InputError(f'{path} is a recording of {counted(len(table), "sample")}, expected a pose '
+                     'table', 'use capture')
 
 
 def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Recording:
     """
-    Read a recording: a CSV table, a rosbag2 (folder, mcap, db3) or a ROS 1 bag.
+    Read a recording.
+
+    Text in any dialect, a rosbag2 (folder, mcap, db3), a ROS 1 bag, or a flight log of PX4 (.ulg)
+    or ArduPilot (.bin).
 
     Parameters
     ----------
@@ -197,8 +199,7 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
     Raises
     ------
     InputError
-        If the format does not match the file name, or the file contains no samples or samples of
-        several sensors.
+        If the recording cannot be read, or contains no samples or samples of several sensors.
     OSError
         If the file cannot be read.
 
@@ -240,18 +241,18 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
     """
     if isinstance(recording, str | PathLike):
         path = Path(recording)
-        with open_recording(path, topic, sensor) as opened:
-            known = _units(units, gravity, opened.units, str(path))
-            found = find_still(opened.blocks, known, settings_from(settings, known))
+        options = LogOptions(units=units or '', gravity=gravity, topic=topic, sensor=sensor)
+        with open_log(path, options) as log:
+            known = log.units
+            found = find_still(log.blocks, known, settings_from(settings, known))
     else:
+        path = Path('the recording')
         samples = _table(recording, Recording, 'the recording')
         known = _units(units, gravity, samples.units, 'the recording')
         calibrate.check_units(samples, known)
         found = find_still(samples, known, settings_from(settings, known))
     if not len(found.poses):
-        raise InputError(f'there is no still stretch in {counted(found.recorded, "sample")}, '
-                         'expected at least one', 'hold the sensor still in each pose for some '
-                         'seconds, or set still_std_max and min_dwell')
+        raise nothing_still(str(path), found.recorded)
     return replace(found.poses, units=known.name)
 
 
@@ -298,7 +299,7 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
         If the readings are clearly in another unit, or a row does not exist.
 
     """
-    table = _poses(poses)
+    table = _poses(poses, units, gravity)
     known = _units(units, gravity, table.units, 'the pose table')
     calibration = calibrate.fit_poses(table, known, model=model, method=method, sensor=sensor,
                                       date=now())
@@ -318,9 +319,9 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
     base : {'auto', 'ideal', '4', '7', '10', '12'} or Calibration
         The model to start from. A stored calibration is compared as it is, without a new fit.
     units : {'m/s2', 'g', 'native'}, optional
-        Unit of the readings; by default the unit of the base or of the poses, or m/s².
+        Unit of the readings; by default the unit of the poses, or of the base, or m/s².
     gravity : float
-        Local gravity [m/s²].
+        Local gravity [m/s²]; not used with a stored calibration.
     sensor : str
         Name of the sensor; by default the name in the poses.
 
@@ -328,7 +329,7 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
     -------
     Refinement
         The verdict, the effects with their residuals before and after, and the refined
-        calibration.
+        calibration, in the unit of the poses.
 
     Raises
     ------
@@ -338,24 +339,31 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
         If the readings are clearly in another unit.
 
     """
-    table = _poses(poses)
-    known = (base.units if isinstance(base, calibrate.Calibration)
-             else _units(units, gravity, table.units, 'the pose table'))
-    found = find_effects(table, known, base=base, sensor=sensor, date=now())
+    if isinstance(base, calibrate.Calibration):
+        table = _poses(poses, _asked(units, base), base.units.per_g)
+        stored = _in_units_of(base, table, units)
+        found = find_effects(table, stored.units, base=stored, sensor=sensor, date=now())
+    else:
+        table = _poses(poses, units, gravity)
+        known = _units(units, gravity, table.units, 'the pose table')
+        found = find_effects(table, known, base=base, sensor=sensor, date=now())
     return replace(found, calibration=_public(found.calibration))
 
 
-def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibration
-           ) -> Verification:
+def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibration, *,
+           units: UnitName | None = None) -> Verification:
     """
     Compute the residuals of a calibration on poses that it was not fitted to.
 
     Parameters
     ----------
     poses : str, Path, Poses, DataFrame or (n, 3) array
-        The poses, in the unit of the calibration.
+        The poses. A calibration in g is converted for poses in m/s², and the other way round.
     calibration : str, Path or Calibration
         The calibration.
+    units : {'m/s2', 'g', 'native'}, optional
+        Unit of the readings; by default the unit of the poses, or that of g and m/s² that their
+        length shows.
 
     Returns
     -------
@@ -365,13 +373,14 @@ def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibra
     Raises
     ------
     InputError
-        If the readings are clearly in another unit, or lack a column that the effects need.
+        If the readings are clearly in another unit, or lack a column that the effects need, or if
+        only one of calibration and poses is in native units.
 
     """
-    table = _poses(poses)
-    known = (calibration if isinstance(calibration, calibrate.Calibration)
-             else load(calibration))
-    _units(known.units.name, known.units.per_g, table.units, 'the pose table')
+    stored = (calibration if isinstance(calibration, calibrate.Calibration)
+              else load(calibration))
+    table = _poses(poses, _asked(units, stored), stored.units.per_g)
+    known = _in_units_of(stored, table, units)
     calibrate.check_units(table, known.units)
     return calibrate.verify(known, table)
 
@@ -427,7 +436,8 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     recording : bool
         Return samples of a sensor that is turned, instead of pose means.
     poses : int
-        Number of poses, spread evenly over the sphere; the first pose is flat.
+        Number of poses, spread evenly over the sphere; the first pose is flat. The others are in
+        mixed order, so that direction is not correlated with time or temperature.
     directions : (n, 3) array, optional
         Directions of up in the levelled frame; they replace `poses`.
     noise : float
@@ -487,18 +497,18 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
 
 
 def _directions(count: int) -> Floats:
-    """Return directions spread over the sphere; the first direction is flat."""
-    return np.vstack([[[0.0, 0.0, 1.0]], spread_directions(count)[1:]])
+    """Return directions spread over the sphere, in mixed order; the first direction is flat."""
+    others = spread_directions(count)[1:]
+    mixed = np.random.default_rng(count).permutation(others)
+    return np.vstack([[[0.0, 0.0, 1.0]], mixed])
 
 
-def _poses(given: Source | Poses | Data) -> Poses:
-    """Return poses from a file, a table, an array or a DataFrame."""
+def _poses(given: Source | Poses | Data, units: str | None = None,
+           gravity: float = STANDARD_GRAVITY) -> Poses:
+    """Return poses from a log, a table, an array or a DataFrame; a recording is captured."""
     if isinstance(given, str | PathLike):
-        path = Path(given)
-        if is_bag(path):
-            raise InputError(f'{path} is a recording, expected a pose table',
-                             'call capture first')
-        return read_pose_table(path)
+        known: Any = units or ''
+        return poses_of(Path(given), LogOptions(units=known, gravity=gravity)).poses
     return _table(given, Poses, 'the pose table')
 
 
@@ -524,6 +534,20 @@ def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> 
         raise InputError(f'{source} is in {stated}, expected {asked}', f'set units={stated!r}')
     name: Any = asked or stated or 'm/s2'
     return units_of(name, gravity)
+
+
+def _asked(units: UnitName | None, calibration: calibrate.Calibration) -> UnitName | None:
+    """Return the unit to read poses in: native for a native calibration, else recognised."""
+    return units or ('native' if calibration.units.name == 'native' else None)
+
+
+def _in_units_of(calibration: calibrate.Calibration, table: Table, asked: UnitName | None
+                 ) -> calibrate.Calibration:
+    """Return a calibration in the unit that the caller or the table states, or that it shows."""
+    if asked is not None:
+        _units(asked, STANDARD_GRAVITY, table.units, 'the pose table')
+        return calibration.in_units(asked)
+    return calibration.in_units_of(table)
 
 
 def _public(calibration: calibrate.Calibration) -> Calibration:

@@ -52,7 +52,8 @@ class DamagedCalibrationError(StoredCalibrationError):
 TAKE_ALL_SIDES = 'take poses with each side of the sensor up and down, and some edges'
 """Advice for poses that do not determine a calibration."""
 
-NEEDS_ROS = "source /opt/ros/jazzy/setup.bash, or run pip install 'accel_calib[ros]'"
+NEEDS_ROS = ("source /opt/ros/jazzy/setup.bash, or run pip install '.[ros]' in the folder of the "
+             'sources')
 """Advice if ROS 2 is not installed."""
 
 

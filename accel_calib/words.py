@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .effects import effect_named, empirical_parts
+from .effects import effect_named, EMPIRICAL, empirical_parts
 from .errors import counted
 from .table import COLUMNS
 from .units import MG
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .refine import Refinement, Step
 
 _LEAST_P = 1e-16
+_ZERO = 1e-12
+"""Values below are zero but for rounding."""
 _IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
 _WITHOUT_UNIT = ('of_sensor', 'form')
 """Constants of a shape that select one of two forms."""
@@ -80,14 +82,23 @@ def chance(p_value: float) -> str:
 def values_of(step: Step) -> list[tuple[str, str]]:
     """Return name and text of each value of a step; values in g are given in mg."""
     effect = effect_named(step.name)
-    own = effect.unit if not step.curve else curve_unit(step.curve)
-    unit, scale = (f'm{own}', MG) if own in _IN_MILLI else (own, 1.0)
     values = []
     for name, value in step.parameters.items():
+        unit, scale = value_unit(step.name, name)
         words = (f'{value * scale:+.3g} {unit}'.replace('-', '−') if name in effect.parameters
-                 else f'{value:.5g} {_shape_unit(name, step)}'.rstrip())
+                 else f'{value:.5g} {unit}'.rstrip())
         values.append((name, words))
     return values
+
+
+def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
+    """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
+    effect = effect_named(effect_name)
+    curve = effect_name if effect_name.startswith(f'{EMPIRICAL}-') else ''
+    if value_name not in effect.parameters:
+        return _shape_unit(value_name, curve), 1.0
+    unit = curve_unit(curve) if curve else effect.unit
+    return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
 
 
 def curve_unit(name: str) -> str:
@@ -95,15 +106,26 @@ def curve_unit(name: str) -> str:
     return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
 
 
-def _shape_unit(name: str, step: Step) -> str:
+def _shape_unit(name: str, curve: str) -> str:
     """Return the unit of a constant of the shape of an effect."""
     if name in _WITHOUT_UNIT:
         return ''
-    if step.curve:
-        return unit_of(empirical_parts(step.curve)[1])
-    return 's'
+    return unit_of(empirical_parts(curve)[1]) if curve else 's'
 
 
 def unit_of(column: str) -> str:
     """Return the unit of a quantity of the context, with readings in g."""
     return 'g' if column == 'std' else COLUMNS[column].unit
+
+
+def with_sd(value: float, sd: float) -> str:
+    """
+    Return ``value ± sd`` with two significant digits of the standard deviation.
+
+    A value without a standard deviation has six significant digits.
+
+    """
+    if not sd > 0.0:
+        return '0' if abs(value) < _ZERO else f'{value:.6g}'
+    decimals = max(0, 1 - int(np.floor(np.log10(sd))))
+    return f'{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}'

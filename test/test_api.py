@@ -110,7 +110,7 @@ def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
     for given in (str(path), ac.read_recording(path)):
         np.testing.assert_allclose(ac.capture(given).reading, expected.reading, atol=1e-6)
     assert len(ac.capture(recording, min_dwell=2.0)) == 6
-    with pytest.raises(InputError, match='there is no still stretch'):
+    with pytest.raises(InputError, match='has no still stretch'):
         ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
 
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .options import progress
+from .terminal import progress
 from ..calibrate import (
     Calibration,
     check_sensor,
@@ -20,8 +21,10 @@ from ..calibrate import (
     Outside,
     outside,
 )
+from ..effects import Context
 from ..errors import counted, InputError
-from ..files import correct_bag, is_bag, read_samples, write_table
+from ..files import correct_bag, is_bag, Log, LogOptions, read_log, write_table
+from ..table import Poses, Recording
 from ..units import UnitName
 
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'
@@ -31,7 +34,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLE)
     made.add_argument('recording', type=Path, metavar='RECORDING',
-                      help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
+                      help='any log: CSV, rosbag2 folder, .mcap, .db3, ROS 1 .bag, …')
     made.add_argument('-c', '--calibration', type=Path, required=True, metavar='FILE',
                       help='stored calibration')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
@@ -39,7 +42,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('--no-rotate', action='store_true', help='correct offset and gain alone, '
                       'and stay in the frame of the sensor; otherwise a levelled calibration '
                       'turns everything in a message, and its frame_id ends with _levelled')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
+    options.add_log(made)
     made.set_defaults(run=run)
 
 
@@ -49,37 +52,59 @@ def run(args: argparse.Namespace) -> int:
     if args.no_rotate:
         calibration = calibration.in_sensor_frame
     left: list[Outside] = []
+    lines: list[str] = []
     if is_bag(args.recording):
         with progress('messages') as moved:
             count = correct_bag(args.recording, calibration, args.output, args.topic, moved,
-                                left.append)
+                                left.append, note=lambda line: lines.append(f'note: {line}'),
+                                temperature_topic=args.temperature_topic,
+                                supply_topic=args.supply_topic)
     else:
-        count = _correct_table(args.recording, calibration, args.output, left.append)
+        count = _correct_table(args, calibration, left.append, lines)
     console = options.console(args)
-    for each in left:
-        console.print(f'note: {each.line}', markup=False)
-    console.print(f'corrected {counted(count, "sample")}, stored in {args.output}', markup=False)
+    for line in (*lines, *(f'note: {each.line}' for each in left)):
+        console.print(line)
+    console.print(f'corrected {counted(count, "sample")}, stored in {args.output}')
     return 0
 
 
-def _correct_table(path: Path, calibration: Calibration, out: Path,
-                   report: Callable[[Outside], object]) -> int:
+def _correct_table(args: argparse.Namespace, calibration: Calibration,
+                   report: Callable[[Outside], object], lines: list[str]) -> int:
+    """Correct a log that is not a bag; how it was read is added to the lines."""
+    path, out = args.recording, args.output
     if out.exists() and out.samefile(path):
         raise InputError(f'{out} is the recording itself, expected another file',
                          'choose another name')
-    recording = read_samples(path)
-    check_units(recording, calibration.units)
-    check_sensor(calibration, recording.sensor)
-    if recording.units not in ('', calibration.units.name):
-        raise InputError(f'{path} is in {recording.units}, but the calibration is for readings in '
-                         f'{calibration.units.name}', 'use a recording in that unit')
-    known = of_samples(recording.columns, len(recording), calibration.model)
+    log = _log_for(calibration, path, options.log_options(args))
+    lines += [f'read as: {log.read_as}'] if log.read_as else []
+    lines += [f'note: {line}' for line in log.notes]
+    calibration = calibration.in_units(log.units)
+    check_units(log.table, calibration.units)
+    check_sensor(calibration, log.table.sensor)
+    known = of_samples(log.table.columns, len(log.table), calibration.model)
     for each in outside(calibration, known).values():
         if each.count:
             report(each)
-    columns = {'reading': calibration.correct(recording.reading, known)}
+    write_table(out, _corrected(log.table, calibration, known))
+    return len(log.table)
+
+
+def _log_for(calibration: Calibration, path: Path, asked: LogOptions) -> Log:
+    """Return a log; without a stated unit, it is native if the calibration is native."""
+    if calibration.units.name == 'native' and not asked.units:
+        # If this fails because the log states a unit, the calibration refuses that unit below.
+        with suppress(InputError):
+            return read_log(path, replace(asked, units='native'))
+    return read_log(path, asked)
+
+
+def _corrected(table: Poses | Recording, calibration: Calibration, known: Context
+               ) -> Poses | Recording:
+    """Return a table with the corrected readings, in m/s² or g."""
+    columns = {'reading': calibration.correct(table.reading, known)}
     units: UnitName = 'g' if calibration.units.name == 'native' else calibration.units.name
-    if 'rate' in recording:
-        columns['rate'] = recording['rate'] @ calibration.model.rotation
-    write_table(out, replace(recording.with_columns(**columns), units=units))
-    return len(recording)
+    if 'rate' in table:
+        columns['rate'] = table['rate'] @ calibration.model.rotation
+    if 'std' in table:
+        columns['std'] = calibration.units.to_g(table['std']) * calibration.force_per_g
+    return replace(table.with_columns(**columns), units=units)

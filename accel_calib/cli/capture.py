@@ -11,11 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .options import progress
+from .terminal import progress
 from ..calibrate import check_units
 from ..capture import capture, Captured, CaptureSettings, REPEATED, settings_from
-from ..errors import counted, InputError
-from ..files import open_recording, OpenRecording, Progress, write_table
+from ..errors import counted
+from ..files import open_log, OpenLog, Progress, write_table
+from ..intake import Intake, nothing_still
 from ..table import Recording
 from ..units import Units
 
@@ -26,12 +27,10 @@ def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLE)
     made.add_argument('recording', type=Path, metavar='RECORDING',
-                      help='CSV, rosbag2 folder, .mcap, .db3 or ROS 1 .bag')
+                      help='CSV in any dialect, rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 '
+                      '.ulg or ArduPilot .bin')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='pose table to write')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
-    made.add_argument('--sensor', default='', help='frame_id of the messages to use, for a topic '
-                      'with several sensors')
     made.add_argument('--still-window', type=options.positive, metavar='S',
                       help='length of the sliding window [s]')
     made.add_argument('--still-std-max', type=options.positive, metavar='STD',
@@ -43,59 +42,56 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='largest difference of |mean| from 1 g')
     made.add_argument('--min-dwell', type=options.positive, metavar='S',
                       help='shortest still stretch that becomes a pose')
-    made.add_argument('--max-dwell', type=options.positive, metavar='S',
-                      help='split a longer stretch into poses with the same orientation')
     made.add_argument('--min-pose-angle', type=options.positive, metavar='RAD',
                       help='poses within this angle count as repeated')
     made.add_argument('--repeated', choices=REPEATED,
                       help='keep, merge or refuse repeated poses (default: keep)')
-    options.add_units(made)
+    options.add_log(made)
+    options.add_max_dwell(made)
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Capture and write the poses, and print their number."""
-    with (open_recording(args.recording, args.topic, args.sensor) as recording,
+    options.check_folder('-o', args.output)
+    with (open_log(args.recording, options.log_options(args)) as log,
           progress('samples') as moved):
-        units = options.units_from(args, recording.units, args.recording)
-        captured = capture(_blocks(recording, units, moved), units, _settings(args, units))
+        captured = capture(_checked(log, moved), log.units, _settings(args, log.units))
+        lines = Intake(captured.poses, log.units, log.read_as, log.notes).lines
     if len(captured.poses) == 0:
-        raise InputError(f'{args.recording} has no still stretch in '
-                         f'{counted(captured.recorded, "sample")}, expected at least one',
-                         'hold the sensor still in each pose for some seconds, or set '
-                         '--still-std-max and --min-dwell')
-    write_table(args.output, replace(captured.poses, units=units.name))
+        raise nothing_still(str(args.recording), captured.recorded)
+    write_table(args.output, replace(captured.poses, units=log.units.name))
     options.write_json(args.json, {
         'poses': len(captured.poses), 'samples': captured.recorded,
         'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
-        'interruptions': [item._asdict() for item in captured.interruptions]})
-    _show(args, captured)
+        'interruptions': [item._asdict() for item in captured.interruptions],
+        'read_lines': lines})
+    _show(args, captured, lines)
     return 0
 
 
-def _show(args: argparse.Namespace, captured: Captured) -> None:
+def _show(args: argparse.Namespace, captured: Captured, lines: tuple[str, ...]) -> None:
     """Print the result."""
     console = options.console(args)
+    for line in lines:
+        console.print(line)
     console.print(f'{counted(len(captured.poses), "pose")} in {captured.seconds:.0f} s of '
-                  f'{args.recording}, stored in {args.output}', markup=False)
+                  f'{args.recording}, stored in {args.output}')
     for item in captured.interruptions:
         what = {'gap': f'samples are missing for {item.seconds:.3g} s',
                 'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
                 'stopped': 'the stamps do not change'}[item.kind]
-        console.print(f'note: after {item.time:.3f} s {what}', markup=False)
+        console.print(f'note: after {item.time:.3f} s {what}')
 
 
-def _blocks(recording: OpenRecording, units: Units, moved: Progress) -> Iterator[Recording]:
+def _checked(log: OpenLog, moved: Progress) -> Iterator[Recording]:
     """Yield the blocks, check the unit of the first block, and update the progress bar."""
-    done = 0
-    for block in recording.blocks:
-        if not done:
-            check_units(block, units)
+    for number, block in enumerate(log.watched(moved)):
+        if not number:
+            check_units(block, log.units)
         yield block
-        done += len(block)
-        moved(done, recording.samples)
 
 
 def _settings(args: argparse.Namespace, units: Units) -> CaptureSettings:

@@ -14,6 +14,7 @@ from . import options
 from ..compare import compare, Comparison, LEVEL
 from ..errors import AccelCalibError
 from ..files import read_calibration
+from ..rating import rate_comparison
 from ..units import MG
 
 _EXAMPLE = ('accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
@@ -28,12 +29,18 @@ def add_to(made: argparse.ArgumentParser) -> None:
     options.add_example(made, _EXAMPLE)
     made.add_argument('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
                       help='two or more stored calibrations of one sensor')
+    made.add_argument('--report', type=Path, metavar='FILE', help='page to write (HTML)')
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compare the calibrations, and print the result."""
+    if args.report is not None:
+        from ..report import check_matplotlib
+
+        check_matplotlib()
+        options.check_folder('--report', args.report)
     try:
         calibrations = [read_calibration(path) for path in args.calibrations]
         comparison = compare(calibrations)
@@ -41,8 +48,16 @@ def run(args: argparse.Namespace) -> int:
         options.write_json(args.json, {'error': err.message, 'advice': err.advice})
         raise
     models = [calibration.name for calibration in calibrations]
-    options.write_json(args.json, _result(args.calibrations, models, comparison))
+    rating = rate_comparison(comparison)
+    if args.report is not None:
+        from ..report import write_comparison_page
+
+        write_comparison_page(args.report, comparison, rating, args.calibrations, calibrations)
+    options.write_json(args.json, {**_result(args.calibrations, models, comparison),
+                                   **options.rated(rating)})
     _show(args, models, comparison)
+    for line in rating.lines:
+        options.console(args).print(line)
     return 0 if comparison.agree else DISAGREE
 
 
@@ -60,11 +75,11 @@ def _show(args: argparse.Namespace, models: list[str], comparison: Comparison) -
     console.print(_runs_table(args.calibrations, models, comparison))
     console.print(_parameters_table(comparison))
     for note in comparison.notes:
-        console.print(f'note: {note}', markup=False)
+        console.print(f'note: {note}')
     if comparison.tilt_deg is not None:
         console.print('the directions of up of levelled calibrations differ by up to '
                       f'{comparison.tilt_deg:.3g}°; the test does not use them')
-    console.print(_answer(comparison), markup=False)
+    console.print(_answer(comparison))
 
 
 def _answer(comparison: Comparison) -> str:

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     console = options.console(args)
 
     def report(line: str) -> None:
-        console.print(line, markup=False)
+        console.print(line)
 
     if args.hidden is not None:
         found = demonstrate_hidden(args.hidden, report)

@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from . import options
-from .results import fit_result, gyro_line, parameter_table, quality_table
+from .results import calibration_result, show_calibration
+from .terminal import working
 from ..calibrate import (
     Calibration,
     fit_poses,
@@ -21,8 +23,10 @@ from ..calibrate import (
     MODEL_NAMES,
     outlook,
 )
-from ..errors import AccelCalibError, InputError
-from ..files import read_poses, write_calibration
+from ..errors import AccelCalibError
+from ..files import write_calibration
+from ..intake import Intake
+from ..rating import rate, Rating
 from ..words import now
 
 _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
@@ -31,9 +35,12 @@ _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
 def add_to(made: argparse.ArgumentParser) -> None:
     """Add the options."""
     options.add_example(made, _EXAMPLE)
-    made.add_argument('poses', nargs='+', type=Path, metavar='POSES', help='pose table (CSV)')
+    made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
+                      help='pose table, or a recording, whose poses are captured first')
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
                       help='calibration to write (YAML); a folder for several POSES')
+    made.add_argument('--report', type=Path, metavar='FILE',
+                      help='page to write (HTML); a folder for several POSES')
     made.add_argument('--model', choices=MODEL_NAMES, default='auto',
                       help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
                       'cross-axis; 12: known orientation; auto (default): the smallest that the '
@@ -50,91 +57,116 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       'heading of the mounting (needs --flat)')
     made.add_argument('--frame', choices=FRAMES, default='ros',
                       help='levelled frame (default: ros, z up)')
-    made.add_argument('--sensor', default='',
-                      help='name of the sensor (frame_id of its messages; default: the name in '
-                      'the table)')
     made.add_argument('--jobs', type=int, default=1, metavar='N',
                       help='number of tables to process in parallel')
-    options.add_units(made)
+    options.add_log(made)
+    options.add_max_dwell(made)
     options.add_json(made)
     made.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and store, and print the quality."""
+    """Fit and store, and print the quality and the rating."""
+    if args.report is not None:
+        from ..report import check_matplotlib
+
+        check_matplotlib()
+    for option, path in (('-o', args.output), ('--report', args.report)):
+        if path is not None:
+            options.check_folder(option, path, len(args.poses))
     if len(args.poses) == 1:
         return _run_one(args)
-    if args.output is not None and not args.output.is_dir():
-        raise InputError(f'-o {args.output} is not a folder, expected a folder for '
-                         f'{len(args.poses)} pose tables', 'use an existing folder')
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
     options.write_json(args.json, results)
     console = options.console(args)
     for result in results:
-        console.print(result['file'], _in_a_line(result), markup=False)
+        console.print(f'{result["file"]} {_in_a_line(result)}')
     return 2 if any('error' in result for result in results) else 0
 
 
 def _run_one(args: argparse.Namespace) -> int:
     try:
-        calibration = fit_file(args, args.poses[0])
+        fitted = _fit(args, args.poses[0])
     except AccelCalibError as err:
         options.write_json(args.json, {'error': err.message, 'advice': err.advice})
         raise
-    _store(calibration, args.output)
-    options.write_json(args.json, {'file': args.poses[0], **fit_result(calibration, args.model)})
-    _show(args, calibration)
+    _store(fitted, args.output, args.report)
+    options.write_json(args.json, _result(args, fitted))
+    _show(args, fitted)
     return 0
 
 
-def fit_file(args: argparse.Namespace, path: Path) -> Calibration:
-    """Fit one pose table with the given options."""
-    table = read_poses(path)
-    units = options.units_from(args, table.units, path)
-    calibration = fit_poses(options.rows_between(table, args.rows), units, model=args.model,
-                            method=args.method, sensor=args.sensor, date=now())
-    return level_by_rows(calibration, table, args.frame, args.flat, args.nose_down)
+@dataclass(frozen=True)
+class _Fitted:
+    """A calibration of one log, with its rating."""
+
+    path: Path
+    intake: Intake
+    calibration: Calibration
+    rating: Rating
+
+
+def _fit(args: argparse.Namespace, path: Path) -> _Fitted:
+    """Fit one log with the given options."""
+    intake = options.intake(args, path)
+    poses = intake.poses
+    with working('fitting'):
+        calibration = fit_poses(options.rows_between(poses, args.rows), intake.units,
+                                model=args.model, method=args.method, sensor=args.sensor,
+                                date=now())
+        calibration = level_by_rows(calibration, poses, args.frame, args.flat, args.nose_down)
+    return _Fitted(path, intake, calibration, rate(calibration))
+
+
+def _result(args: argparse.Namespace, fitted: _Fitted) -> dict[str, Any]:
+    """Return the result for JSON."""
+    return {'file': fitted.path, **calibration_result(fitted.calibration, args.model),
+            **options.rated(fitted.rating), 'read_lines': fitted.intake.lines}
 
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Fit one of several pose tables; an error is returned as the result."""
+    """Fit one of several logs; an error is returned as the result."""
     try:
-        calibration = fit_file(args, path)
-        _store(calibration, args.output and args.output / f'{path.stem}.yaml')
+        fitted = _fit(args, path)
+        _store(fitted, args.output and args.output / f'{path.stem}.yaml',
+               args.report and args.report / f'{path.stem}.html')
     except AccelCalibError as err:
         return {'file': path, 'error': err.message, 'advice': err.advice}
     except OSError as err:
         return {'file': path, 'error': f'{path}: {err.strerror}',
                 'advice': 'check the name and the permissions'}
-    result: dict[str, Any] = options.plain({'file': path, **fit_result(calibration, args.model)})
+    result: dict[str, Any] = options.plain(_result(args, fitted))
     return result
 
 
-def _store(calibration: Calibration, output: Path | None) -> None:
+def _store(fitted: _Fitted, output: Path | None, report: Path | None) -> None:
     if output is not None:
-        write_calibration(output, calibration)
+        write_calibration(output, fitted.calibration)
+    if report is not None:
+        from ..report import write_calibration_page
+
+        write_calibration_page(report, fitted.calibration, fitted.rating, str(fitted.path),
+                               stored=str(output or 'calibration.yaml'),
+                               notes=fitted.intake.lines)
 
 
 def _in_a_line(result: dict[str, Any]) -> str:
     if 'error' in result:
         return f'{result["error"]}; {result["advice"]}'
     return (f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-            f'{result["rms_after_mg"]:.3g} mg')
+            f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}')
 
 
-def _show(args: argparse.Namespace, calibration: Calibration) -> None:
+def _show(args: argparse.Namespace, fitted: _Fitted) -> None:
     """Print the result."""
-    console = options.console(args)
-    console.print(quality_table(calibration))
-    console.print(parameter_table(calibration))
-    console.print(f'model {calibration.name}: {calibration.reason}', markup=False)
-    if calibration.gyro is not None:
-        console.print(gyro_line(calibration.gyro), markup=False)
-    for rejected in calibration.rejected:
-        console.print(f'left out: row {rejected.row}: {rejected.reason}', markup=False)
-    for warning in calibration.warnings:
-        console.print(f'note: {warning}', markup=False)
+    console, calibration = options.console(args), fitted.calibration
+    for line in fitted.intake.lines:
+        console.print(line)
+    show_calibration(console, calibration)
+    console.print(f'model {calibration.name}: {calibration.reason}')
     asked = outlook(calibration, args.model).next_pose
-    console.print(f'next pose: {asked.words}', markup=False)
-    if args.output is not None:
-        console.print(f'stored in {args.output}', markup=False)
+    console.print(f'next pose: {asked.words}')
+    for path in filter(None, (args.output, args.report)):
+        console.print(f'stored in {path}')
+    for line in fitted.rating.lines:
+        console.print(line)

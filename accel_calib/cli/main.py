@@ -1,6 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
+# PYTHON_ARGCOMPLETE_OK
 """
 The command ``accel-calib``.
 
@@ -12,9 +13,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Collection, Sequence
+from difflib import get_close_matches
 from importlib import import_module
+import os
+import re
 import sys
+from typing import NoReturn
 
+from .characters import in_one_line, use_plain_characters
 from .. import __version__
 from ..errors import AccelCalibError
 
@@ -23,12 +29,16 @@ INTERRUPTED = 130
 
 COMMANDS = {
     'demo': 'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
+    'calibrate': 'make a calibration, a page and a verdict from any log',
     'capture': 'find the still stretches of a recording and write the pose table',
     'fit': 'fit a calibration to still poses',
     'verify': 'evaluate a calibration on poses that it was not fitted to',
     'compare': 'test whether calibrations of one sensor agree within their uncertainties',
+    'history': 'show offset and gain over the dates of calibrations of one sensor',
     'refine': 'find effects that a calibration lacks, and add them',
     'apply': 'correct a recording with a calibration',
+    'export': 'write a calibration in the format of a firmware, an autopilot or another tool',
+    'noise': 'find noise density, bias instability and random walk from a long rest',
     'simulate': 'simulate poses or a recording of a sensor with known effects',
     'report': 'write a report about effects that a calibration lacks, with figures (HTML)',
     'watch': 'show the progress of a calibrator node, and which pose is next',
@@ -40,20 +50,54 @@ COMMANDS = {
 _MODULES = {'node': 'nodes', 'simulator': 'nodes'}
 
 
-def parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, with the nearest known name."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line, and exit with status 2."""
+        known = self._known()
+        given = message.partition(' (choose')[0]
+        wrong = re.findall(r"'([^']+)'", given) or given.split()
+        near = [name for word in wrong if word not in known
+                for name in get_close_matches(word, known, 1)]
+        meant = f' (did you mean {near[0]}?)' if near else ''
+        self.exit(BAD_INPUT, f'{self.prog}: {in_one_line(message)}{meant}; see {self.prog} '
+                  '--help\n')
+
+    def parse_command(self, arguments: Sequence[str], command: str) -> argparse.Namespace:
+        """Parse arguments; the parser of the command reports unknown options."""
+        args, unknown = self.parse_known_args(arguments)
+        if unknown:
+            own = next((action.choices[command] for action in self._actions
+                        if isinstance(action.choices, dict) and command in action.choices), self)
+            own.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return args
+
+    def _known(self) -> list[str]:
+        """Return the options and the choices of this parser."""
+        return [str(name) for action in self._actions
+                for name in (*action.option_strings, *(action.choices or ()))]
+
+
+def parser(wanted: Collection[str] = tuple(COMMANDS)) -> _Parser:
     """Return the parser of the command line, with the options of the wanted commands."""
-    top = argparse.ArgumentParser(
+    top = _Parser(
         prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
         'gravity as the reference.')
     top.add_argument('--version', action='version', version=__version__)
-    commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND',
-                                  required=True)
+    top.set_defaults(run=lambda args: _help(top))
+    commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND')
     for name, summary in COMMANDS.items():
         made = commands.add_parser(name, help=summary,
                                    description=f'{summary[0].upper()}{summary[1:]}.')
         if name in wanted:
             import_module(f'.{_MODULES.get(name, name)}', __package__).add_to(made)
     return top
+
+
+def _help(top: argparse.ArgumentParser) -> int:
+    top.print_help()
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,9 +111,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         standard error.
 
     """
+    use_plain_characters()
+    if '_ARGCOMPLETE' in os.environ:
+        _complete()
     own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
     try:
-        args = parser(own[:1]).parse_args(own)
+        args = parser(own[:1]).parse_command(own, own[0] if own else '')
     except KeyboardInterrupt:
         return INTERRUPTED
     args.for_ros = for_ros
@@ -86,6 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
+def _complete() -> None:
+    """Print the completions that the shell asks for, and exit."""
+    try:
+        import argcomplete
+    except ImportError:
+        return  # the shell then shows no completions
+    argcomplete.autocomplete(parser())
+
+
 def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     """Split the arguments into those of this program and those of ROS."""
     at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
@@ -93,7 +149,7 @@ def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
 
 
 def _refuse(command: str, line: str) -> int:
-    print(f'accel-calib {command}: {" ".join(line.split())}', file=sys.stderr)
+    print(f'accel-calib {command}: {in_one_line(line)}', file=sys.stderr)
     return BAD_INPUT
 
 

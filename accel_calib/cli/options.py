@@ -1,51 +1,31 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Options that several commands have, and the output of results.
-
-**Progress.** A progress bar on standard error, if it is a terminal.
-
-"""
+"""Options that several commands have, and the output of results."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 import json
 from pathlib import Path
-import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from .terminal import Output, progress
 from ..calibrate import Calibration, EDITED
 from ..errors import InputError
-from ..files import read_calibration
+from ..files import LogOptions, read_calibration
 from ..files.atomic import write_atomically
-from ..table import Poses
-from ..units import STANDARD_GRAVITY, UNIT_NAMES, Units, units_of
-
-if TYPE_CHECKING:
-    from ..files import Progress
-
-
-@contextmanager
-def progress(what: str) -> Iterator[Progress]:
-    """Show a progress bar, and yield the function that updates it."""
-    if not sys.stderr.isatty():
-        yield lambda done, count: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (BarColumn(), TextColumn('{task.completed:,.0f} of {task.total:,.0f} ' + what),
-               TimeRemainingColumn())
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task('', visible=False)
-        yield lambda done, count: bar.update(task, completed=done, total=count, visible=True)
+from ..files.calibration_yaml import OTHER_CORRECTION
+from ..files.logs.formats import NAMES
+from ..intake import Intake, poses_of
+from ..rating import Rating
+from ..table import COLUMNS, Poses
+from ..units import STANDARD_GRAVITY, UNIT_NAMES
 
 
 def add_example(made: argparse.ArgumentParser, example: str) -> None:
@@ -66,26 +46,104 @@ def add_units(made: argparse.ArgumentParser, default: str = '') -> None:
     """Add ``--units`` and ``--gravity``; without a default, the file states the unit."""
     made.add_argument('--units', choices=UNIT_NAMES, default=default,
                       help='unit of ax,ay,az; native is counts or volts (default: '
-                      f'{default or "the unit in the file, or m/s2"})')
+                      f'{default or "the unit in the file, or recognised"})')
     made.add_argument('--gravity', type=positive, default=STANDARD_GRAVITY, metavar='M/S2',
                       help='local gravity [m/s2] (default: %(default)s)')
 
 
-def units_from(args: argparse.Namespace, stated: str, path: Path) -> Units:
+def add_log(made: argparse.ArgumentParser) -> None:
+    """Add the options for reading a log: its format, columns, topics and unit."""
+    made.add_argument('--format', choices=NAMES, default='', help='layout of the log (default: it '
+                      'is recognised)')
+    made.add_argument('--columns', type=_columns, action='append', default=[],
+                      metavar='OURS=THEIRS,...', help='columns by their name or number in the '
+                      'log, such as time=t_ms,ax=accX,ay=accY,az=accZ')
+    made.add_argument('--skip-bad', action='store_true', help='skip lines that cannot be read')
+    made.add_argument('--topic', default='', help='Imu topic of a bag, or message of a flight '
+                      'log, if there are several')
+    made.add_argument('--sensor', default='', help='name of the sensor: frame_id of its messages, '
+                      'or its number in a flight log (default: the name in the log)')
+    made.add_argument('--temperature-topic', default='', metavar='TOPIC[:FIELD]', help='topic of '
+                      'the temperature, for a bag without sensor_msgs/Temperature or with several')
+    made.add_argument('--supply-topic', default='', metavar='TOPIC[:FIELD]', help='topic of the '
+                      'supply voltage, for a bag')
+    add_units(made)
+
+
+def add_max_dwell(made: argparse.ArgumentParser) -> None:
+    """Add ``--max-dwell``."""
+    made.add_argument('--max-dwell', type=positive, metavar='S', help='for a recording: split '
+                      'longer rests into poses with the same orientation')
+
+
+def _columns(text: str) -> dict[str, str]:
+    """Return the columns that an argument names."""
+    pairs = [part.partition('=') for part in text.split(',')]
+    names = [name for column in COLUMNS.values() for name in column.names if not column.made]
+    for ours, equals, _ in pairs:
+        if ours.strip() not in names or not equals:
+            raise argparse.ArgumentTypeError(f'{text}: expected NAME=COLUMN with a name of '
+                                             f'{", ".join(names)}')
+    return {ours.strip(): theirs.strip() for ours, _, theirs in pairs}
+
+
+def log_options(args: argparse.Namespace) -> LogOptions:
+    """Return how to read a log, from the options of `add_log`."""
+    columns = {ours: theirs for given in args.columns for ours, theirs in given.items()}
+    return LogOptions(columns=columns, format=args.format, skip_bad=args.skip_bad,
+                      units=args.units, gravity=args.gravity, topic=args.topic,
+                      sensor=args.sensor, temperature_topic=args.temperature_topic,
+                      supply_topic=args.supply_topic)
+
+
+def intake(args: argparse.Namespace, path: Path) -> Intake:
+    """Return the poses of a log; a recording is captured."""
+    return _intake(args, path, log_options(args))
+
+
+def intake_for(args: argparse.Namespace, path: Path, calibration: Calibration
+               ) -> tuple[Intake, Calibration]:
+    """Return the poses of a log, and a calibration in their unit."""
+    asked, units = log_options(args), calibration.units
+    if units.name == 'm/s2':
+        asked = replace(asked, gravity=units.per_g)
+    elif units.name == 'native' and not asked.units:
+        with suppress(InputError):  # a log with a unit is refused below, by `in_units`
+            return _intake(args, path, replace(asked, units='native')), calibration
+    found = _intake(args, path, asked)
+    return found, calibration.in_units(found.units)
+
+
+def _intake(args: argparse.Namespace, path: Path, asked: LogOptions) -> Intake:
+    with progress('samples') as moved:
+        return poses_of(path, asked, _settings(args), moved)
+
+
+def _settings(args: argparse.Namespace) -> dict[str, float]:
+    return {} if args.max_dwell is None else {'max_dwell': args.max_dwell}
+
+
+def rated(rating: Rating) -> dict[str, str]:
+    """Return a rating for JSON."""
+    return {'rating': rating.name, 'rating_reason': rating.reason}
+
+
+def check_folder(option: str, path: Path, count: int = 1) -> None:
     """
-    Return the unit that the option or the file states.
+    Check before the work that the folder of an output exists.
 
     Raises
     ------
     InputError
-        If both are stated and differ.
+        If the path is not a folder for several outputs, or is not in a folder.
 
     """
-    if args.units and stated and args.units != stated:
-        raise InputError(f'{path} is in {stated}, but --units is {args.units}',
-                         'remove --units, or correct the file')
-    name: Any = args.units or stated or 'm/s2'
-    return units_of(name, args.gravity)
+    if count > 1 and not path.is_dir():
+        raise InputError(f'{option} {path} is not a folder, expected a folder for {count} tables',
+                         'use an existing folder')
+    if count == 1 and not path.parent.is_dir():
+        raise InputError(f'{option} {path}: {path.parent} is not a folder, expected a folder',
+                         'choose a file in an existing folder')
 
 
 def add_json(made: argparse.ArgumentParser) -> None:
@@ -120,20 +178,16 @@ def plain(value: object) -> Any:
 
 def stored_calibration(path: Path) -> Calibration:
     """Read a stored calibration; report on standard error if it was edited by hand."""
-    from rich.console import Console
-
     calibration = read_calibration(path)
-    if EDITED in calibration.warnings:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f'note: {path}: {EDITED}',
-                                                                    markup=False)
+    for warning in (EDITED, OTHER_CORRECTION):
+        if warning in calibration.warnings:
+            Output(stderr=True).print(f'note: {path}: {warning}')
     return calibration
 
 
-def console(args: argparse.Namespace) -> Any:
+def console(args: argparse.Namespace) -> Output:
     """Return the console for text output: standard error if JSON goes to standard output."""
-    from rich.console import Console
-
-    return Console(stderr=getattr(args, 'json', None) == '-', highlight=False, soft_wrap=True)
+    return Output(stderr=getattr(args, 'json', None) == '-')
 
 
 def rows_between(poses: Poses, text: str | None) -> Poses:

@@ -10,24 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from . import options
 from .results import in_a_line, refine_result, steps_table
+from .terminal import Output, working
 from ..calibrate import Calibration
-from ..capture import capture, settings_from
-from ..errors import AccelCalibError, InputError, listed, RefusedFitError
-from ..files import is_bag, read_poses, read_recording, write_calibration
+from ..errors import AccelCalibError, listed, RefusedFitError
+from ..files import write_calibration
 from ..files.plan_table import write_plan
+from ..rating import rate_refinement
 from ..refine import BASES, refine, Refinement
 from ..report import check_matplotlib, write_page
-from ..table import Poses, Recording
-from ..units import Units
 from ..words import now, residual_words, verdict_words
 
 _EXAMPLE = 'accel-calib refine poses.csv -o refined.yaml --report report.html'
-_SAMPLES_APART_S = 0.5
-_MANY_ROWS = 5000
 
 
 def add_to(made: argparse.ArgumentParser) -> None:
@@ -59,14 +54,8 @@ def add_inputs(made: argparse.ArgumentParser) -> None:
                       help='model to start from (default: the model that fit --model auto '
                       'selects)')
     made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
-    made.add_argument('--sensor', default='',
-                      help='name of the sensor (frame_id of its messages; default: the name in '
-                      'the file)')
-    made.add_argument('--topic', default='', help='Imu topic, for a bag with several Imu topics')
-    made.add_argument('--max-dwell', type=options.positive, metavar='S',
-                      help='for a recording: split longer rests into poses with the same '
-                      'orientation')
-    options.add_units(made)
+    options.add_log(made)
+    options.add_max_dwell(made)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,25 +65,15 @@ def run(args: argparse.Namespace) -> int:
     for option, path in (('-o', args.output), ('--report', args.report),
                          ('--plan', args.plan)):
         if path is not None:
-            _check_target(option, path, len(args.poses))
+            options.check_folder(option, path, len(args.poses))
     if len(args.poses) == 1:
         return _run_one(args)
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
     options.write_json(args.json, results)
     console = options.console(args)
     for result in results:
-        console.print(f'{result["file"]}: {in_a_line(result)}', markup=False)
+        console.print(f'{result["file"]}: {in_a_line(result)}')
     return 2 if any('error' in result for result in results) else 0
-
-
-def _check_target(option: str, path: Path, count: int) -> None:
-    """Check before the work that the folder of an output exists."""
-    if count > 1 and not path.is_dir():
-        raise InputError(f'{option} {path} is not a folder, expected a folder for {count} tables',
-                         'use an existing folder')
-    if count == 1 and not path.parent.is_dir():
-        raise InputError(f'{option} {path}: {path.parent} is not a folder, expected a folder',
-                         'choose a file in an existing folder')
 
 
 def _run_one(args: argparse.Namespace) -> int:
@@ -104,7 +83,7 @@ def _run_one(args: argparse.Namespace) -> int:
     except AccelCalibError as err:
         options.write_json(args.json, {'file': path, 'error': err.message, 'advice': err.advice})
         raise
-    options.write_json(args.json, {'file': path, **refine_result(result)})
+    options.write_json(args.json, _result(path, result))
     stored = _store(result, path, args.output, args.report, args.plan)
     _show(args, result, stored)
     if args.output is not None and args.output not in stored:
@@ -121,48 +100,34 @@ def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
                args.report and args.report / f'{path.stem}.html',
                args.plan and args.plan / f'{path.stem}.csv')
         if args.output and result.refusal:
-            return options.plain({'file': path, **refine_result(result),
-                                  'error': result.refusal[0], 'advice': result.refusal[1]})
+            return options.plain({**_result(path, result), 'error': result.refusal[0],
+                                  'advice': result.refusal[1]})
     except AccelCalibError as err:
         return {'file': str(path), 'error': err.message, 'advice': err.advice}
     except OSError as err:
         return {'file': str(path), 'error': f'{path}: {err.strerror}',
                 'advice': 'check the name and the permissions'}
-    made: dict[str, Any] = options.plain({'file': path, **refine_result(result)})
+    made: dict[str, Any] = options.plain(_result(path, result))
     return made
 
 
+def _result(path: Path, result: Refinement) -> dict[str, Any]:
+    """Return the result for JSON."""
+    return {'file': path, **refine_result(result), **options.rated(rate_refinement(result))}
+
+
 def refine_file(args: argparse.Namespace, path: Path) -> Refinement:
-    """Refine with one table or recording, with the given options."""
+    """Refine with one log and the given options; print how it was read."""
     base: str | Calibration = args.base
     if args.calibration is not None:
-        base = options.stored_calibration(args.calibration)
-    poses, units = _poses_from(args, path, base.units if isinstance(base, Calibration) else None)
-    return refine(options.rows_between(poses, args.rows), units, base=base,
-                  sensor=args.sensor, date=now())
-
-
-def _poses_from(args: argparse.Namespace, path: Path, units: Units | None) -> tuple[Poses, Units]:
-    """Return the poses of a table or of a recording, and their unit."""
-    table: Poses | Recording = (read_recording(path, args.topic, args.sensor) if is_bag(path)
-                                else read_poses(path))
-    if units is not None and table.units not in ('', units.name):
-        raise InputError(f'{path} is in {table.units}, but the calibration is for readings in '
-                         f'{units.name}', 'use poses in that unit')
-    units = units or options.units_from(args, table.units, path)
-    if isinstance(table, Poses) and not _are_samples(table):
-        return table, units
-    recording = Recording(table.columns, table.row, table.units, table.sensor)
-    given = {} if args.max_dwell is None else {'max_dwell': args.max_dwell}
-    return capture(recording, units, settings_from(given, units)).poses, units
-
-
-def _are_samples(table: Poses) -> bool:
-    """Return whether rows are samples: with time, without count, and dense or many."""
-    if 'time' not in table or 'count' in table or len(table) < 2:
-        return False
-    apart = float(np.median(np.diff(table['time'])))
-    return apart < _SAMPLES_APART_S or len(table) > _MANY_ROWS
+        intake, base = options.intake_for(args, path, options.stored_calibration(args.calibration))
+    else:
+        intake = options.intake(args, path)
+    for line in intake.lines:
+        Output(stderr=True).print(line)
+    with working('refining'):
+        return refine(options.rows_between(intake.poses, args.rows), intake.units, base=base,
+                      sensor=args.sensor, date=now())
 
 
 def _store(result: Refinement, source: Path, output: Path | None, report: Path | None,
@@ -185,19 +150,21 @@ def _show(args: argparse.Namespace, result: Refinement, stored: list[Path]) -> N
     """Print the result."""
     console = options.console(args)
     if result.steps:
-        console.print(steps_table(result), soft_wrap=False)
-    console.print(f'{verdict_words(result)}\n{residual_words(result)}', markup=False)
+        console.print(steps_table(result))
+    console.print(f'{verdict_words(result)}\n{residual_words(result)}')
     if result.disturbed_poses:
-        console.print(f'left out: {listed("row", result.disturbed_poses)}', markup=False)
+        console.print(f'left out: {listed("row", result.disturbed_poses)}')
     for line in result.calibration.warnings:
-        console.print(f'note: {line}', markup=False)
+        console.print(f'note: {line}')
     for line in result.advice:
-        console.print(f'advice: {line}', markup=False)
+        console.print(f'advice: {line}')
     if args.plan is not None:
         for line in result.plan.lines:
-            console.print(f'plan: {line}', markup=False)
+            console.print(f'plan: {line}')
     if result.not_testable:
         names = ', '.join(effect for effect, _ in result.not_testable)
-        console.print(f'these data cannot show: {names}', markup=False)
+        console.print(f'these data cannot show: {names}')
     for path in stored:
-        console.print(f'stored in {path}', markup=False)
+        console.print(f'stored in {path}')
+    for line in rate_refinement(result).lines:
+        console.print(line)

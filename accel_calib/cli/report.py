@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     result = refine_file(args, args.poses)
     write_page(args.output, result, str(args.poses))
     console = options.console(args)
-    console.print(f'{result.verdict}, stored in {args.output}', markup=False)
+    console.print(f'{result.verdict}, stored in {args.output}')
     if args.figures is not None:
         count = len(write_figures(args.figures, result))
-        console.print(f'{counted(count, "file")}, stored in {args.figures}', markup=False)
+        console.print(f'{counted(count, "file")}, stored in {args.figures}')
     return 0

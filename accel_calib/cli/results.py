@@ -5,27 +5,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
-from ..effects import effect_named
+from ..effects import effect_named, LADDER
 from ..errors import counted
 from ..estimate.closed_form import sensing_axes
 from ..table import Floats
 from ..units import MG
-from ..words import base_words, chance, short
+from ..words import base_words, chance, short, value_unit, with_sd
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from .terminal import Output
     from ..refine import Refinement
 
 
-def fit_result(calibration: Calibration, asked: str) -> dict[str, Any]:
-    """Return the result of ``fit`` for JSON; `asked` is the requested model."""
+def calibration_result(calibration: Calibration, asked: str) -> dict[str, Any]:
+    """Return a calibration for JSON; `asked` is the requested model."""
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -52,9 +54,9 @@ def _known(values: Floats) -> Floats | None:
     return None if np.isnan(values).all() else values
 
 
-def gyro_line(gyro: GyroBias) -> str:
+def _gyro_line(gyro: GyroBias) -> str:
     """Return the gyro bias as a line of text, in °/s."""
-    values = ', '.join(f'{axis} {bias:+.3f} ± {sd:.1g}' for axis, bias, sd in zip(
+    values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
         'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
     slope = ('' if not np.any(gyro.slope) else
              f' at {gyro.temperature:.1f} °C, changes by '
@@ -90,39 +92,72 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
     return {}
 
 
-def quality_table(calibration: Calibration) -> Table:
+def show_calibration(console: Output, calibration: Calibration) -> None:
+    """Print quality, parameters, poses left out and warnings of a calibration."""
+    console.print(_quality_table(calibration))
+    console.print(_parameter_table(calibration))
+    if calibration.gyro is not None:
+        console.print(_gyro_line(calibration.gyro))
+    for rejected in calibration.rejected:
+        console.print(f'left out: row {rejected.row}: {rejected.reason}')
+    for warning in calibration.warnings:
+        console.print(f'note: {warning}')
+
+
+def _quality_table(calibration: Calibration) -> Table:
     """Return a table of the residual before and after the fit."""
     from rich.table import Table
 
     quality = calibration.quality
-    table = Table(title=f'Residual of |force| over {counted(len(calibration.used_poses), "pose")} '
-                  f'(model {calibration.name})')
-    table.add_column('')
+    table = Table(title='Residual of |force| [mg]')
+    table.add_column(f'model {calibration.name}, {counted(len(calibration.used_poses), "pose")}')
     for name in ('before', 'after'):
         table.add_column(name, justify='right')
-    table.add_row('RMS, mg', _short(quality.rms_before_mg), _short(quality.rms_after_mg))
-    table.add_row('largest, mg', _short(quality.max_before_percent * MG / 100.0),
+    table.add_row('RMS', _short(quality.rms_before_mg), _short(quality.rms_after_mg))
+    table.add_row('largest', _short(quality.max_before_percent * MG / 100.0),
                   _short(quality.max_after_percent * MG / 100.0))
-    table.add_row('held out, mg', '', _short(quality.held_out_rms_mg))
-    table.add_row('noise floor, mg', '', _short(quality.noise_floor_mg))
+    table.add_row('held out', '', _short(quality.held_out_rms_mg))
+    table.add_row('noise floor', '', _short(quality.noise_floor_mg))
     return table
 
 
-def parameter_table(calibration: Calibration) -> Table:
-    """Return a table of offset and gain with their standard deviations."""
+def _parameter_table(calibration: Calibration) -> Table:
+    """Return a table of the parameters that the model has, with their standard deviations."""
     from rich.table import Table
 
-    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[calibration.units.name]
-    table = Table(title='reading = W ΔR force + V')
-    table.add_column('axis')
-    for name in (f'offset V, {unit}', 'gain W: x', 'y', 'z'):
-        table.add_column(name, justify='right')
-    values = np.column_stack([calibration.offset, calibration.gain])
-    deviations = np.column_stack([calibration.offset_sd, calibration.gain_sd])
-    for axis, row, sds in zip('xyz', values, deviations, strict=True):
-        table.add_row(axis, *(f'{value:.6g} ± {sd:.1g}' for value, sd in
-                              zip(row, sds, strict=True)))
+    table = Table(title='reading = W ΔR force + V', show_header=False)
+    table.add_column('', no_wrap=True)
+    table.add_column('', no_wrap=True, justify='right')
+    table.add_column('', no_wrap=True)
+    for row in (*_linear_rows(calibration), *_effect_rows(calibration)):
+        table.add_row(*row)
     return table
+
+
+def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and unit of the entries of V and W that the model has."""
+    name = calibration.units.name
+    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[name]
+    for axis, value, sd in zip('xyz', calibration.offset, calibration.offset_sd, strict=True):
+        yield f'offset {axis}', with_sd(value, sd), unit
+    per_g = 'per g' if name == 'native' else ''
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1)):
+        value, sd = calibration.gain[i, j], calibration.gain_sd[i, j]
+        mirrored = i > j and value == calibration.gain[j, i]
+        if (sd > 0.0 or value) and not mirrored:
+            yield f'gain {"xyz"[i]}{"xyz"[j] if i != j else ""}', with_sd(value, sd), per_g
+
+
+def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and unit of the parameters beyond V and W."""
+    deviations = dict(zip(calibration.parameters, np.sqrt(np.diag(calibration.covariance)),
+                          strict=True))
+    for effect, values in calibration.model.values.items():
+        shown = {} if effect in LADDER else effect_named(effect).shown(values)
+        for own, value in shown.items():
+            unit, scale = value_unit(effect, own)
+            yield (f'{effect} {own}', with_sd(value * scale, deviations[f'{effect}.{own}'] * scale),
+                   unit)
 
 
 def _short(value: float | None) -> str:
@@ -161,15 +196,13 @@ def steps_table(result: Refinement) -> Table:
 
     table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
                   show_lines=True)
-    table.add_column('', justify='right')
-    table.add_column('effect, and where it was found', min_width=24, overflow='fold')
+    table.add_column('effect, and where it was found', overflow='fold')
     for name in ('residual', 'chance'):
         table.add_column(name, no_wrap=True)
-    table.add_column('rivals', overflow='fold')
     for number, step in enumerate(result.steps, 1):
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        effect = f'{step.effect}\n{effect_named(step.name).words}\n{step.where}'
-        table.add_row(str(number), effect, gap, chance(step.p_value),
-                      '\n'.join(step.likely_rivals) or 'none')
+        lines = [f'{number}. {step.effect}', effect_named(step.name).words, step.where,
+                 f'rivals: {", ".join(step.likely_rivals) or "none"}']
+        table.add_row('\n'.join(lines), gap, chance(step.p_value))
     return table

@@ -62,6 +62,5 @@ def run(args: argparse.Namespace) -> int:
     table = simulate(dict(parse_effect(text) for text in args.effect),
                      **{name: getattr(args, name) for name in names})
     write_table(args.output, table)
-    options.console(args).print(f'{counted(len(table), "row")}, stored in {args.output}',
-                                markup=False)
+    options.console(args).print(f'{counted(len(table), "row")}, stored in {args.output}')
     return 0

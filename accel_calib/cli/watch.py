@@ -82,14 +82,13 @@ def _signals() -> Iterator[Callable[[], bool]]:
 
 def _print(node: str, progress: Progress | None) -> None:
     """Print a progress once."""
-    from rich.console import Console
-
+    from .terminal import Output
     from .watch_view import screen, state
 
     if progress is None:
         return
     if sys.stdout.isatty():
-        Console(highlight=False).print(screen(node, progress))
+        Output().print(screen(node, progress))
     else:
         print(*state(node, progress), sep='\n', flush=True)
 
@@ -97,10 +96,11 @@ def _print(node: str, progress: Progress | None) -> None:
 @contextmanager
 def _output(bell: bool) -> Iterator[Show]:
     """Yield the function that shows the progress."""
-    from rich.console import Console
     from rich.live import Live
 
-    console = Console(highlight=False)
+    from .terminal import Output
+
+    console = Output()
     if not sys.stdout.isatty() or console.is_dumb_terminal:
         yield _Lines().show
         return

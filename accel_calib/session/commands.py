@@ -54,6 +54,9 @@ if TYPE_CHECKING:
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
 
+_Fitted = tuple[Calibration, str, OSError | None]
+"""A calibration, the words about it if it is used, and why it is not stored."""
+
 _NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
 
 
@@ -123,23 +126,23 @@ class Commands:
                  session.present_context())
         offered = session.settings.confirm
 
-        def run(compute: Compute) -> tuple[Calibration, bool, OSError | None] | RefusedFitError:
+        def run(compute: Compute) -> _Fitted | RefusedFitError:
             try:
                 calibration = compute(fitted, *given)
             except RefusedFitError as error:  # `finish` decides whether to report it
                 return error
             used = is_used(before, calibration)
-            stored = used and not offered
-            return calibration, used, compute(_stored, store, calibration) if stored else None
+            not_stored = compute(_stored, store, calibration) if used and not offered else None
+            return calibration, compute(summary, calibration) if used else '', not_stored
 
-        def finish(found: tuple[Calibration, bool, OSError | None] | RefusedFitError) -> str:
+        def finish(found: _Fitted | RefusedFitError) -> str:
             if isinstance(found, RefusedFitError):
                 raise found
-            calibration, used, not_stored = found
+            calibration, story_of_fit, not_stored = found
             session.fitted_poses = len(poses)
-            if not used:
+            if not story_of_fit:
                 return ''
-            words = [summary(calibration), change_words(before, calibration)]
+            words = [story_of_fit, change_words(before, calibration)]
             return self._use(calibration, not_stored, words, offered=offered)
 
         return Job(run, finish)
@@ -152,18 +155,19 @@ class Commands:
         given = session.live.book.poses(), session.units, session.sensor, before
         offered = session.settings.confirm
 
-        def run(compute: Compute) -> tuple[Refinement, OSError | None]:
+        def run(compute: Compute) -> tuple[Refinement, str, OSError | None]:
             refinement = compute(refined, *given)
+            words = compute(story, refinement)
             if refinement.refusal or offered:
-                return refinement, None
-            return refinement, compute(_stored, store, refinement.calibration)
+                return refinement, words, None
+            return refinement, words, compute(_stored, store, refinement.calibration)
 
-        def finish(found: tuple[Refinement, OSError | None]) -> str:
-            refinement, not_stored = found
+        def finish(found: tuple[Refinement, str, OSError | None]) -> str:
+            refinement, story_of_search, not_stored = found
             if refinement.refusal:
-                raise RefusedFitError(f'{story(refinement)}; not used: {refinement.refusal[0]}',
+                raise RefusedFitError(f'{story_of_search}; not used: {refinement.refusal[0]}',
                                       refinement.refusal[1])
-            words = [story(refinement), change_words(before, refinement.calibration)]
+            words = [story_of_search, change_words(before, refinement.calibration)]
             session.guide.follow(refinement.plan.poses)
             if refinement.plan.poses:
                 session.fitted_poses = 0  # more poses are asked for

@@ -29,6 +29,7 @@ from ..effects import Context
 from ..errors import counted, listed, RefusedFitError
 from ..estimate.geometry import coverage, pose_noise
 from ..model import Model
+from ..rating import rate, rate_refinement
 from ..refine import refine, Refinement
 from ..sphere import spread_directions
 from ..table import Floats, Poses
@@ -202,13 +203,14 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
 
 
 def summary(calibration: Calibration) -> str:
-    """Return the quality of a fit as one line."""
+    """Return the rating and the quality of a fit as one line."""
     quality = calibration.quality
     floor = ('' if quality.noise_floor_mg is None
              else f', noise floor {quality.noise_floor_mg:.3f} mg')
-    words = [f'model {calibration.name} from {len(calibration.used_poses)} of '
-             f'{counted(len(calibration.poses), "pose")}: residual {quality.rms_before_mg:.2f} mg '
-             f'before, {quality.rms_after_mg:.3f} mg after{floor}']
+    words = [f'{rate(calibration).name}: model {calibration.name} from '
+             f'{len(calibration.used_poses)} of {counted(len(calibration.poses), "pose")}: '
+             f'residual {quality.rms_before_mg:.2f} mg before, {quality.rms_after_mg:.3f} mg after'
+             f'{floor}']
     if is_partial(calibration):
         words.append(calibration.reason)
     words += [f'pose {rejected.row} left out: {rejected.reason}'
@@ -217,8 +219,9 @@ def summary(calibration: Calibration) -> str:
 
 
 def story(refinement: Refinement) -> str:
-    """Return the result of a refinement as one line."""
-    lines = [f'{verdict_words(refinement).rstrip(".")}; {residual_words(refinement)}']
+    """Return the rating and the result of a refinement as one line."""
+    lines = [f'{rate_refinement(refinement).name}: {verdict_words(refinement).rstrip(".")}; '
+             f'{residual_words(refinement)}']
     for step in refinement.steps:
         rivals = f' (or {", ".join(step.likely_rivals)})' if step.rivals else ''
         lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '

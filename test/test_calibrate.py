@@ -1,0 +1,155 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One command from any log to a calibration, a page and a verdict."""
+
+import json
+
+from accel_calib.cli.main import main
+from accel_calib.files import read_calibration
+from accel_calib.files.logs import are_samples
+import numpy as np
+import pytest
+from shared import data
+
+OFFSET = (0.02, -0.01, 0.03)
+EFFECTS = ('--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005')
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def calibrated(capsys, *arguments):
+    """Return exit status, JSON and the lines on standard error of the command."""
+    capsys.readouterr()
+    status = run('calibrate', *arguments, '--json', '-')
+    printed = capsys.readouterr()
+    return status, json.loads(printed.out), printed.err.splitlines()
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / 'log.csv'
+    assert run('simulate', '-o', path, '--recording', '--poses', 14, '--dwell', 3, *EFFECTS,
+               '--mounting', 5, -3, 0) == 0
+    return path
+
+
+def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_path, capsys):
+    out = tmp_path / 'c.yaml'
+    status, result, lines = calibrated(capsys, recording, '-o', out, '--flat', 'first')
+    assert (status, result['rating']) == (0, 'GOOD')
+    assert result['rating_reason']
+    assert any(line.startswith('GOOD  ') for line in lines)
+    np.testing.assert_allclose(np.array(result['offset']) / 9.80665, OFFSET, atol=2e-3)
+    stored = read_calibration(out)
+    assert stored.is_levelled
+    np.testing.assert_allclose(stored.offset, result['offset'])
+    page = (tmp_path / 'c.html').read_text(encoding='utf-8')
+    assert 'GOOD' in page
+
+
+def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    run('simulate', '-o', path, '--poses', 60, *EFFECTS, '--effect',
+        'quadratic=0.004,0.003,-0.004')
+    _, found, lines = calibrated(capsys, path, '-o', tmp_path / 'c.yaml')
+    assert found['refined'].startswith('refined with quadratic')
+    assert 'quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
+    assert [step['effect'] for step in found['refinement']['steps']] == ['quadratic']
+    _, plain, _ = calibrated(capsys, path, '-o', tmp_path / 'd.yaml', '--no-refine')
+    assert plain['refinement'] is None
+    assert 'quadratic' not in read_calibration(tmp_path / 'd.yaml').model.effects
+    assert any(found['refined'][:20] in line for line in lines)
+
+
+def bent(path, *, bend_mg):
+    """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
+    rng = np.random.default_rng(5)
+    up = rng.normal(size=(40, 3))
+    up /= np.linalg.norm(up, axis=1)[:, np.newaxis]
+    rough = np.sign(np.sin(9.0 * up[:, :1])) * bend_mg * 1e-3
+    np.savetxt(path, 9.80665 * up * (1.0 + rough), delimiter=',', header='ax,ay,az', comments='')
+    return path
+
+
+def test_a_bad_calibration_is_not_stored_unless_asked_for(tmp_path, capsys):
+    path, out = bent(tmp_path / 'poses.csv', bend_mg=40.0), tmp_path / 'c.yaml'
+    status, result, lines = calibrated(capsys, path, '-o', out, '--no-refine')
+    assert (status, result['rating']) == (1, 'BAD')
+    assert any(line.startswith('BAD ') for line in lines)
+    assert not out.exists()
+    assert out.with_suffix('.html').exists()
+    status, _, _ = calibrated(capsys, path, '-o', out, '--no-refine', '--keep-bad')
+    assert status == 1
+    assert out.exists()
+
+
+def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):
+    path, out = bent(tmp_path / 'poses.csv', bend_mg=150.0), tmp_path / 'c.yaml'
+    status, result, _ = calibrated(capsys, path, '-o', out, '--keep-bad')
+    assert status == 2
+    assert set(result) == {'file', 'error', 'advice'}
+    assert not out.exists()
+
+
+@pytest.mark.parametrize('flat', ['first', 'last', '14'])
+def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, recording, tmp_path, capsys):
+    out = tmp_path / 'c.yaml'
+    calibrated(capsys, recording, '-o', out, '--flat', flat)
+    stored = read_calibration(out)
+    row = {'first': 0, 'last': 13}.get(flat, int(flat) - 1 if flat.isdigit() else 0)
+    np.testing.assert_allclose(stored.apply(stored.poses.reading[row]), (0, 0, 9.80665), atol=0.05)
+
+
+@pytest.mark.parametrize(('command', 'rows'), [('fit', 1614), ('verify', 1614)])
+def test_fit_and_verify_capture_a_recording_first(command, rows, recording, tmp_path, capsys):
+    stored = tmp_path / 'c.yaml'
+    assert run('fit', recording, '-o', stored) == 0
+    assert 'captured 14 poses' in capsys.readouterr().out
+    assert len(read_calibration(stored).poses) == 14
+    if command == 'verify':
+        assert run('verify', recording, '-c', stored) == 0
+        assert 'captured 14 poses' in capsys.readouterr().out
+
+
+def test_verify_fails_above_the_largest_residual(recording, tmp_path, capsys):
+    stored = tmp_path / 'c.yaml'
+    assert run('fit', recording, '-o', stored) == 0
+    assert run('verify', recording, '-c', stored, '--max', 10) == 0
+    assert run('verify', recording, '-c', stored, '--max', 0.001) == 1
+    assert 'GOOD' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('command', ['fit', 'verify', 'refine', 'compare', 'calibrate'])
+def test_every_command_with_a_calibration_adds_its_rating(command, tmp_path, capsys):
+    poses, stored = tmp_path / 'poses.csv', tmp_path / 'c.yaml'
+    run('simulate', '-o', poses, '--poses', 40, *EFFECTS)
+    run('fit', poses, '-o', stored)
+    arguments = {'verify': (poses, '-c', stored), 'compare': (stored, stored),
+                 'calibrate': (poses, '-o', tmp_path / 'd.yaml')}.get(command, (poses,))
+    capsys.readouterr()
+    assert run(command, *arguments, '--json', '-') == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result['rating'] == 'GOOD'
+    assert result['rating_reason']
+
+
+@pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu0', 'mpu9150_imu1'])
+def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, capsys):
+    status, result, _ = calibrated(capsys, data(f'{name}.csv'), '-o', tmp_path / 'c.yaml',
+                                   '--no-refine')
+    assert (status, result['rating']) == (0, 'GOOD')
+    assert result['units'] == ('native' if name.startswith('xsens') else 'm/s2')
+    assert result['rms_after_mg'] < 0.3
+
+
+@pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [
+    (0.01, 20, False, True), (20.0, 60, False, False), (0.1, 60, True, False),
+    (10.0, 6000, False, True)])
+def test_samples_are_distinguished_from_poses(step, rows, count, samples):
+    columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3))}
+    if count:
+        columns['count'] = np.ones(rows)
+    assert are_samples(columns) == samples

@@ -1,0 +1,135 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Text on terminals of any width and encoding, and help for wrong arguments."""
+
+import io
+import os
+import pty
+import subprocess
+import sys
+
+from accel_calib.cli.characters import in_one_line, shown
+from accel_calib.cli.main import main
+from accel_calib.cli.terminal import Output
+from accel_calib.words import with_sd
+import numpy as np
+import pytest
+
+COMMAND = [sys.executable, '-m', 'accel_calib.cli.main']
+
+
+@pytest.fixture
+def poses(tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    assert main(['simulate', '-o', str(path), '--effect', 'offset=0.02,-0.01,0.03', '--effect',
+                 'axis_gain=0.01,-0.02,0.005', '--temperature', '20', '30']) == 0
+    capsys.readouterr()
+    return path
+
+
+def printed(*arguments, encoding='utf-8', columns=80, status=0):
+    """Return the output of the real command, and check that its error output is empty."""
+    done = subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, timeout=120,
+                          check=False, env={**os.environ, 'COLUMNS': str(columns),
+                                            'PYTHONIOENCODING': encoding})
+    assert done.returncode == status, done.stderr.decode(encoding)
+    return done.stdout.decode(encoding)
+
+
+@pytest.mark.parametrize('columns', [80, 60])
+def test_output_fits_the_width(columns, poses, tmp_path):
+    stored = tmp_path / 'c.yaml'
+    text = ''.join([printed('fit', poses, '-o', stored, columns=columns),
+                    printed('refine', poses, columns=columns),
+                    printed('verify', poses, '-c', stored, columns=columns),
+                    printed('compare', stored, stored, columns=columns),
+                    printed(columns=columns)])
+    wide = [line for line in text.splitlines() if len(line) > columns
+            and str(tmp_path) not in line]
+    assert not wide
+
+
+@pytest.mark.parametrize('encoding', ['ascii', 'cp1252', 'latin-1'])
+def test_output_of_an_old_encoding_has_replacements(encoding, poses, tmp_path):
+    stored = tmp_path / 'c.yaml'
+    text = printed('fit', poses, '-o', stored, encoding=encoding)
+    assert ('+-' if encoding == 'ascii' else '±') in text
+    assert '?' not in text
+    assert stored.exists()
+
+
+def test_a_long_line_breaks_at_words_and_a_path_stays_whole(monkeypatch):
+    monkeypatch.setenv('COLUMNS', '30')
+    output = Output()
+    output.file = io.StringIO()
+    path = '/a/long/path/of/a/calibration/of/one/sensor.yaml'
+    output.print(f'the calibration with 12.3 ± 0.4 mg at 31 °C is stored in {path}')
+    lines = output.file.getvalue().splitlines()
+    assert [line.strip() for line in lines] == [
+        'the calibration with', '12.3 ± 0.4 mg at 31 °C is', 'stored in', path]
+
+
+@pytest.mark.parametrize(('value', 'sd', 'text'), [
+    (1.23456, 0.0123, '1.235 ± 0.012'), (-8.67e-19, 1e-3, '0.0000 ± 0.0010'),
+    (32768.123, 53.2, '32768 ± 53'), (-0.00001, 0.02, '0.000 ± 0.020'), (-1e-19, 0.0, '0'),
+    (5.25, 0.0, '5.25')])
+def test_a_value_has_as_many_digits_as_its_deviation_has_meaning(value, sd, text):
+    assert with_sd(value, sd) == text
+
+
+def test_parameters_that_the_model_lacks_are_absent(poses):
+    text = printed('fit', poses, '--model', '4')
+    assert 'gain x ' in text
+    assert 'gain xy' not in text
+    assert 'gain xy' in printed('fit', poses, '--model', '10')
+
+
+def test_control_characters_are_escaped():
+    assert in_one_line('a\x1b[31m\nb') == 'a\\x1b[31m b'
+    assert shown('\x1b[31m', 'utf-8') == '\\x1b[31m'
+    assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
+
+
+def test_the_command_alone_shows_the_help(capsys):
+    assert main([]) == 0
+    assert 'calibrate' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('arguments', 'meant'), [
+    (['calibrte', 'x'], 'calibrate'), (['fit', 'x.csv', '--modle', '4'], '--model'),
+    (['refine', 'x.csv', '--bsae', '4'], '--base'), (['fit', 'x', '--units', 'm/s'], 'm/s2')])
+def test_a_misspelt_name_gets_a_suggestion_in_one_line(arguments, meant, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        main(arguments)
+    error = capsys.readouterr().err
+    assert f'(did you mean {meant}?)' in error
+    assert error.count('\n') == 1
+
+
+def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
+    rng = np.random.default_rng(3)
+    path, count = tmp_path / 'rest.csv', 400_000
+    values = np.column_stack([np.arange(count) / 100.0, rng.normal((0.1, 0.2, 9.8), 0.02,
+                                                                   (count, 3))])
+    np.savetxt(path, values, fmt='%.4f', delimiter=',', header='time,ax,ay,az', comments='')
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen([*COMMAND, 'capture', str(path), '-o', str(tmp_path / 'p.csv')],
+                               stdout=subprocess.PIPE, stderr=theirs,
+                               env={**os.environ, 'TERM': 'xterm'})
+    os.close(theirs)
+    process.communicate(timeout=120)
+    shown_text = os.read(ours, 1 << 16).decode()
+    os.close(ours)
+    assert 'samples' in shown_text
+
+
+def test_the_shell_completes_options(tmp_path):
+    pytest.importorskip('argcomplete')
+    out = tmp_path / 'completions'
+    line = 'accel-calib fit --mod'
+    subprocess.run(COMMAND, env={**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line,
+                                 'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
+                                 '_ARGCOMPLETE_STDOUT_FILENAME': str(out)},
+                   timeout=60, check=False)
+    assert '--model' in out.read_text(encoding='utf-8')
