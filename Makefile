@@ -24,13 +24,14 @@ unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 endif
 
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test lint docs bench clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo   the main job, without hardware'
 	@echo 'make test   the tests; PYTEST_ARGS="-k name" for some of them'
 	@echo 'make lint   linter and type check'
+	@echo 'make docs   the documentation site, in build/docs'
 	@echo 'make bench  measures speed, beside what it is compared to, and writes it to the docs'
 	@echo 'make clean  removes .venv and what was built'
 
@@ -48,6 +49,9 @@ lint: $(VENV)/extra-dev
 	@$(BIN)/mypy
 	@$(BIN)/reuse lint --quiet
 
+docs: $(VENV)/extra-docs
+	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
+
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
 	@for name in imu_path recordings stillness_speed fits; do \
@@ -63,7 +67,7 @@ $(VENV)/made:
 	@$(PIP) install 'setuptools>=70.1'
 	@touch $@
 
-$(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
+$(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev $(VENV)/extra-docs: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
 	@$(PIP) install --no-build-isolation '.[ros,$*]'
 	@touch $@
 

@@ -19,6 +19,7 @@ from accel_calib.files import write_table
 from accel_calib.session import CalibratorSettings
 import numpy as np
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', *(
@@ -154,9 +155,9 @@ def anchors_of(path):
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
-def test_services_and_topics_of_the_readme_are_those_of_the_node():
+def test_services_and_topics_of_the_docs_are_those_of_the_node():
     source = text_of('accel_calib/ros/calibrator_node.py')
-    table = [line for line in text_of('README.md').splitlines() if line.startswith('| `')]
+    table = [line for line in text_of('docs/node.md').splitlines() if line.startswith('| `')]
     listed = set(re.findall(r'`(~/\w+|imu/\w+|/diagnostics|temperature)`', '\n'.join(
         line for line in table if '_msgs/' in line or 'std_srvs' in line)))
     made = set(re.findall(r"'(~/\w+|imu/\w+|/diagnostics|temperature)'", source))
@@ -165,13 +166,55 @@ def test_services_and_topics_of_the_readme_are_those_of_the_node():
     assert listed == made
 
 
-def test_parameters_of_the_readme_are_those_of_the_node():
-    table = text_of('README.md').partition('| parameters | |\n')[2].partition('\n\n')[0]
+def test_parameters_of_the_docs_are_those_of_the_node():
+    table = text_of('docs/node.md').partition('| parameters | |\n')[2].partition('\n\n')[0]
     listed = re.findall(r'`(\w+)`', table)
     assert sorted(listed) == sorted(field.name for field in fields(CalibratorSettings))
 
 
 def test_the_rule_of_frames_is_in_one_place():
-    assert [page for page in OWN_PAGES if '<frame_id>_levelled' in text_of(page)] == ['README.md']
+    pages = [page for page in OWN_PAGES if '<frame_id>_levelled' in text_of(page)]
+    assert pages == ['docs/robot.md']
     for page in ('docs/files.md', 'docs/method.md'):
-        assert '../README.md#which-frame-a-corrected-message-is-in' in text_of(page)
+        assert 'robot.md#which-frame-a-corrected-message-is-in' in text_of(page)
+
+
+def test_the_readme_is_short_and_shows_pictures():
+    readme = text_of('README.md')
+    assert len(readme.splitlines()) < 120
+    assert len(re.findall(r'!\[[^\]]+\]\(docs/pictures/[\w.]+\)', readme)) >= 3
+
+
+@pytest.fixture
+def conf(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
+    return importlib.import_module('conf')
+
+
+@pytest.mark.parametrize(('page', 'link', 'expected'), [
+    ('node', '](../launch/a.py)',
+     '](https://github.com/accel-calib/accel_calib/blob/main/launch/a.py)'),
+    ('guides/esp32', '](../install.md#ros)', '](../install.md#ros)'),
+    ('guides/esp32', '](../../README.md#try-it)',
+     '](https://github.com/accel-calib/accel_calib/blob/main/README.md#try-it)'),
+    ('node', '](robot.md)', '](robot.md)'),
+])
+def test_links_out_of_the_site_lead_to_the_repository(conf, page, link, expected):
+    source = [f'see [it{link}.']
+    conf.link_to_repository(None, page, source)
+    assert source == [f'see [it{expected}.']
+
+
+def test_the_site_has_every_page():
+    index = text_of('docs/index.rst')
+    for page in sorted((ROOT / 'docs').rglob('*.md')):
+        name = str(page.relative_to(ROOT / 'docs').with_suffix(''))
+        if not name.startswith('figures/'):
+            assert f'\n   {name}\n' in index, name
+
+
+def test_rosdoc2_builds_the_site_of_this_folder():
+    parts = list(yaml.safe_load_all(text_of('rosdoc2.yaml')))
+    assert parts[1]['builders'] == [{'sphinx': {
+        'name': 'accel_calib', 'sphinx_sourcedir': 'docs', 'output_dir': ''}}]
+    assert '<rosdoc2>rosdoc2.yaml</rosdoc2>' in text_of('package.xml')

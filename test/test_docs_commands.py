@@ -1,0 +1,139 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The commands of the documentation run.
+
+Every command ``accel-calib`` in a fenced block ``sh`` or ``console`` is run, in the order of the
+page and in one temporary folder. A file that a command reads is one of `FILES`, or the page names
+the sample of ``test/data/logs`` that it is::
+
+    <!-- files: log.csv=esp32/counts.log -->
+
+``<!-- status: 1 -->`` above a block states the exit status of its last command. The commands
+`OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py and test_watch.py run them.
+
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+import re
+import shlex
+import shutil
+
+import accel_calib as ac
+from accel_calib.cli.main import COMMANDS, main
+from accel_calib.files import write_table
+from accel_calib.simulate import model_with, simulate_recording
+from accel_calib.sphere import spread_directions
+import numpy as np
+import pytest
+from test_bag import write_bag
+
+ROOT = Path(__file__).resolve().parents[1]
+LOGS = ROOT / 'test' / 'data' / 'logs'
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (
+    ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')))
+OF_ROS = {'node', 'simulator', 'watch', 'demo'}
+SENSOR = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.005],
+          'cross_axis': [0.004, 0.002, -0.003]}
+LIBRARIES = {'.ulg': 'pyulog', '.bin': 'pymavlink'}
+
+
+@dataclass(frozen=True)
+class Block:
+    """The commands of a block, without the name of the program, and the status of the last."""
+
+    commands: list[list[str]]
+    status: int
+
+
+def blocks_of(text):
+    """Return the files that a page names, by their kind, and its blocks."""
+    files = dict(item.split('=') for found in re.findall(r'<!-- files: (.*?) -->', text)
+                 for item in found.split())
+    blocks = []
+    pattern = r'(?:<!-- status: (\d) -->\s*)?^```(?:sh|console)\n(.*?)^```'
+    for status, body in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+        lines = body.replace('\\\n', ' ').splitlines()
+        commands = [shlex.split(line.removeprefix('$ '), comments=True) for line in lines
+                    if re.match(r'(\$ )?accel-calib ', line)]
+        blocks.append(Block([words[1:] for words in commands], int(status or 0)))
+    return files, blocks
+
+
+def recording(**settings):
+    return ac.simulate(SENSOR, recording=True, mounting=(2.0, -4.0, 0.0), **settings)
+
+
+def poses(seed):
+    return ac.simulate(SENSOR, poses=24, mounting=(2.0, -4.0, 0.0), seed=seed)
+
+
+def bag(path):
+    up = np.vstack([[0.0, 0.0, 1.0], spread_directions(13)])
+    write_bag(path, 'mcap', simulate_recording(
+        model_with(SENSOR), up, np.random.default_rng(7), noise_g=0.003, rate_hz=50.0, dwell=3.0,
+        turn=0.8, temperatures=(24.0, 31.0)))
+
+
+def calibration(seed):
+    return lambda path: ac.fit(poses(seed), flat=1).save(path)
+
+
+FILES = {
+    'recording': bag,
+    'recording.csv': lambda path: write_table(path, recording(poses=14, seed=9)),
+    'poses.csv': lambda path: write_table(path, poses(8)),
+    'other_poses.csv': lambda path: write_table(path, poses(18)),
+    **{f'{name}.yaml': calibration(seed) for seed, name in enumerate(
+        ('calibration', 'monday', 'tuesday', 'wednesday'))},
+}
+"""How to write the files that pages name; the names mean the same in all pages."""
+
+
+def text_of(page):
+    return (ROOT / page).read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize('page', [page for page in PAGES if any(
+    block.commands for block in blocks_of(text_of(page))[1])])
+def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    files, blocks = blocks_of(text_of(page))
+    for name, sample in files.items():
+        if Path(sample).suffix in LIBRARIES:
+            pytest.importorskip(LIBRARIES[Path(sample).suffix])
+        shutil.copy(LOGS / sample, name)
+    for block in blocks:
+        statuses = [run(words) for words in block.commands if words[0] not in OF_ROS]
+        expected = [0] * (len(statuses) - 1) + [block.status] * bool(statuses)
+        assert statuses == expected, (block.commands, capsys.readouterr())
+
+
+def run(words):
+    """Run a command; return its exit status, also where it exits by itself."""
+    for name in set(words) & set(FILES):
+        if words[words.index(name) - 1] not in {'-o', '--output'} and not Path(name).exists():
+            FILES[name](Path(name))
+    try:
+        return main(words)
+    except SystemExit as exit_:
+        return exit_.code
+
+
+def test_every_command_without_ros_is_run_by_a_page():
+    run_ = {words[0] for page in PAGES for block in blocks_of(text_of(page))[1]
+            for words in block.commands}
+    indented = {line.split()[0] for page in PAGES
+                for line in re.findall(r'^ {4,}accel-calib (.*)', text_of(page), re.MULTILINE)}
+    assert set(COMMANDS) - OF_ROS <= run_ | indented
+
+
+def test_commands_are_found_in_blocks_with_prompts_and_continued_lines():
+    files, blocks = blocks_of('<!-- files: a.csv=esp32/a.log b.csv=c/d.log -->\n```console\n'
+                              '$ accel-calib fit \\\n    a.csv  # a comment\noutput\n```\n'
+                              '<!-- status: 1 -->\n\n```sh\npip install x\naccel-calib x "b c"\n'
+                              '```\n```python\naccel-calib no\n```\n')
+    assert files == {'a.csv': 'esp32/a.log', 'b.csv': 'c/d.log'}
+    assert blocks == [Block([['fit', 'a.csv']], 0), Block([['x', 'b c']], 1)]
