@@ -14,6 +14,7 @@ import time
 import tracemalloc
 from typing import Any
 
+import accel_calib as ac
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
@@ -253,7 +254,8 @@ def test_the_serial_monitor_and_plotter_of_arduino_are_read(line: str, tmp_path:
     else:
         text = ''.join(line.format(when, ','.join(row)) + '\n'
                        for when, row in zip(made['time'], rows))
-    log = read_log(write(tmp_path, text))
+    rate = 100.0 if line == 'plot' else None
+    log = read_log(write(tmp_path, text), LogOptions(rate=rate))
     np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-8)
     if line != 'plot':
         np.testing.assert_allclose(np.diff(log.table['time']), np.diff(made['time']), atol=1e-6)
@@ -342,11 +344,6 @@ def test_a_column_of_text_that_looks_like_a_temperature_does_not_stand_in_the_wa
     assert any('temperature=temp' in note for note in log.notes)
 
 
-def test_samples_without_times_are_noted(tmp_path: Path) -> None:
-    log = read_log(write(tmp_path, text_of(rows_of(samples(per_g=G)['reading']), 'ax,ay,az')))
-    assert any('--columns time=NAME' in note for note in log.notes)
-
-
 def test_four_columns_without_header_and_times_are_refused(tmp_path: Path) -> None:
     made = samples(per_g=G)
     with pytest.raises(InputError, match='column 1 does not increase'):
@@ -377,10 +374,10 @@ def test_a_table_without_header_is_read_by_its_number_of_columns(width: int, tmp
     warm = np.linspace(20.0, 30.0, len(made['time']))
     parts = [made['time'], made['reading'], made['rate'], warm]
     rows = rows_of(*(parts[1:2] if width == 3 else parts), digits='.9g')
-    log = read_log(write(tmp_path, text_of([row[:width] for row in rows])))
+    rate = 100.0 if width == 3 else None
+    log = read_log(write(tmp_path, text_of([row[:width] for row in rows])), LogOptions(rate=rate))
     assert 'no header' in log.read_as
     np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-8)
-    assert ('time' in log.table) == (width > 3)
     assert ('rate' in log.table) == (width > 4)
     if width > 4:
         np.testing.assert_allclose(log.table['rate'], made['rate'], rtol=1e-7)
@@ -700,3 +697,26 @@ def test_a_regular_log_is_read_nearly_as_fast_as_numpy_parses_it() -> None:
     reader = min(spent(lambda: read_recording(path)) for _ in range(3))
     numpy = min(spent(lambda: np.loadtxt(path, delimiter=',', skiprows=3)) for _ in range(3))
     assert reader < 2.0 * numpy
+
+
+def test_samples_without_times_need_their_rate(tmp_path):
+    recording = ac.simulate({}, recording=True, poses=8, rate=50.0)
+    path = tmp_path / 'log.csv'
+    np.savetxt(path, recording.reading, delimiter=',', header='ax,ay,az', comments='')
+    with pytest.raises(InputError, match='--rate HZ'):
+        read_log(path)
+    found = read_log(path, LogOptions(rate=50.0))
+    assert isinstance(found.table, Recording)
+    np.testing.assert_allclose(found.table['time'], np.arange(len(recording)) / 50.0)
+    assert '50 Hz (stated)' in found.read_as
+    np.savetxt(path, np.column_stack([recording['time'], recording.reading]), delimiter=',',
+               header='time,ax,ay,az', comments='')
+    with pytest.raises(InputError, match='has times, but --rate is 50'):
+        read_log(path, LogOptions(rate=50.0))
+
+
+def test_many_poses_without_times_are_poses(tmp_path):
+    poses = ac.simulate({}, poses=400)
+    path = tmp_path / 'poses.csv'
+    np.savetxt(path, poses.reading, delimiter=',', header='ax,ay,az', comments='')
+    assert isinstance(read_log(path).table, Poses)

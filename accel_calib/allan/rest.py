@@ -71,7 +71,7 @@ class Rest:
 
     @property
     def samples(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return int(self.values.shape[1])
 
     @property

@@ -59,6 +59,8 @@ def add_log(made: argparse.ArgumentParser) -> None:
                       metavar='OURS=THEIRS,...', help='columns by their name or number in the '
                       'log, such as time=t_ms,ax=accX,ay=accY,az=accZ')
     made.add_argument('--skip-bad', action='store_true', help='skip lines that cannot be read')
+    made.add_argument('--rate', type=positive, metavar='HZ', help='samples per second of a log '
+                      'without times')
     made.add_argument('--topic', default='', help='Imu topic of a bag, or message of a flight '
                       'log, if there are several')
     made.add_argument('--sensor', default='', help='name of the sensor: frame_id of its messages, '
@@ -91,6 +93,7 @@ def log_options(args: argparse.Namespace) -> LogOptions:
     """Return how to read a log, from the options of `add_log`."""
     columns = {ours: theirs for given in args.columns for ours, theirs in given.items()}
     return LogOptions(columns=columns, format=args.format, skip_bad=args.skip_bad,
+                      rate=args.rate,
                       units=args.units, gravity=args.gravity, topic=args.topic,
                       sensor=args.sensor, temperature_topic=args.temperature_topic,
                       supply_topic=args.supply_topic)

@@ -156,8 +156,8 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         shown = {} if effect in LADDER else effect_named(effect).shown(values)
         for own, value in shown.items():
             unit, scale = value_unit(effect, own)
-            yield (f'{effect} {own}', with_sd(value * scale, deviations[f'{effect}.{own}'] * scale),
-                   unit)
+            sd = deviations[f'{effect}.{own}']
+            yield f'{effect} {own}', with_sd(value * scale, sd * scale), unit
 
 
 def _short(value: float | None) -> str:

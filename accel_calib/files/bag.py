@@ -66,7 +66,7 @@ class OpenSamples:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes about topics and about lost messages; complete after the last block."""
+        """Return notes about topics and lost messages; complete after the last block."""
         return tuple(self.found)
 
 

@@ -160,7 +160,7 @@ class ContextTopic:
 
     @property
     def connections(self) -> list[Connection]:
-        """Connections of the topic."""
+        """Return the connections of the topic."""
         return self.bag.connections(self.topic, self.msgtype)
 
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:

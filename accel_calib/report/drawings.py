@@ -55,7 +55,7 @@ class Drawing:
 
     @property
     def figure(self) -> Figure:
-        """The figure."""
+        """Return the figure."""
         return self.chart.figure
 
 

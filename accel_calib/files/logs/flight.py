@@ -100,7 +100,7 @@ class Message:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second; 0 for less than two samples."""
+        """Return the samples per second; 0 for less than two samples."""
         span = float(np.ptp(self.time)) if len(self.time) > 1 else 0.0
         return (len(self.time) - 1) / span if span > 0.0 else 0.0
 

@@ -22,7 +22,7 @@ from .flight import FlightLog
 from .names import OURS, READING
 from .px4 import is_ulg, read_ulg
 from .quantities import decided, Quantities
-from .records import are_samples, Log, LogOptions, OpenLog
+from .records import are_samples, are_untimed_samples, Log, LogOptions, OpenLog
 from .selection import chosen, is_log_header, with_indices
 from .text import Cells, open_text, TextTable
 from ..bag import is_bag, open_samples, together
@@ -33,8 +33,6 @@ from ...units import UnitName, Units, units_of
 
 _Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
 _SHOWN = 12
-_MANY_POSES = 200
-"""A table with more rows than these may well be one of samples."""
 
 
 def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
@@ -115,7 +113,8 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     cells = text.blocks(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
     first = next(cells)
     quantities = decided(columns, first, options)
-    blocks = _converted(path, chain((first,), cells), quantities)
+    blocks = _timed(path, _converted(path, chain((first,), cells), quantities), options.rate)
+    read_as = ', '.join(filter(None, (quantities.read_as, _rate_words(options.rate))))
     sensor = str(text.layout.about.get('sensor', ''))
 
     def noted() -> Sequence[str]:
@@ -127,13 +126,27 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     if are_samples(head[0]):
         recordings = (Recording(*block, name, sensor) for block in chain((head,), blocks))
         return OpenLog(recordings, _samples(path, text, head), quantities.units, sensor,
-                       quantities.read_as, noted=noted)
+                       read_as, noted=noted)
     poses = Poses(*_whole([head, *blocks]), name, sensor)
-    if 'time' not in poses and len(poses) > _MANY_POSES:
-        quantities.notes.append(f'each of the {len(poses)} rows is taken for a pose, because '
-                                'there are no times: samples need --columns time=NAME')
-    return OpenLog(_as_samples(path, poses), len(poses), quantities.units, sensor,
-                   quantities.read_as, poses, noted)
+    if are_untimed_samples(poses.columns):
+        raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples of a '
+                         'recording, expected a column time', 'state the samples per second with '
+                         '--rate HZ, or name the column with --columns time=NAME')
+    return OpenLog(_as_samples(path, poses), len(poses), quantities.units, sensor, read_as, poses,
+                   noted)
+
+
+def _timed(path: Path, blocks: Iterator[_Block], rate_hz: float | None) -> Iterator[_Block]:
+    """Yield blocks, with the times of a stated rate if there is one."""
+    for columns, row in blocks:
+        if rate_hz is not None and 'time' in columns:
+            raise InputError(f'{path} has times, but --rate is {rate_hz:g}', 'remove --rate, or '
+                             'leave the times out with --columns time=')
+        yield columns if rate_hz is None else {**columns, 'time': (row - 1) / rate_hz}, row
+
+
+def _rate_words(rate_hz: float | None) -> str:
+    return '' if rate_hz is None else f'{rate_hz:g} Hz (stated)'
 
 
 def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[_Block]:

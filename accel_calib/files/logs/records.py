@@ -21,6 +21,12 @@ _SAMPLES_APART_S = 0.5
 _MANY_ROWS = 5000
 """More rows than these are samples."""
 
+_FEW_POSES = 200
+"""Fewer rows without times are poses."""
+
+_SAME = 0.1
+"""Successive samples at rest are nearer than this, relative to the spread of the readings."""
+
 
 @dataclass(frozen=True)
 class LogOptions:
@@ -36,6 +42,8 @@ class LogOptions:
         Name of a maker's layout, from `accel_calib.files.logs.formats.NAMES`.
     skip_bad : bool
         Whether lines that cannot be read are skipped, rather than an error.
+    rate : float or None
+        Samples per second of a text log without times [Hz].
     units : {'m/s2', 'g', 'native', ''}
         Unit of the readings.
     gravity : float
@@ -52,6 +60,7 @@ class LogOptions:
     columns: Mapping[str, str] = field(default_factory=dict)
     format: str = ''  # noqa: A003
     skip_bad: bool = False
+    rate: float | None = None
     units: UnitName | Literal[''] = ''
     gravity: float = STANDARD_GRAVITY
     topic: str = ''
@@ -119,7 +128,7 @@ class OpenLog:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is left out; complete once all blocks are read."""
+        """Return what is left out; complete once all blocks are read."""
         return tuple(self.noted())
 
     def watched(self, progress: Callable[[int, int], object]) -> Iterator[Recording]:
@@ -137,3 +146,13 @@ def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
         return False
     apart = float(np.median(np.diff(columns['time'])))
     return apart < _SAMPLES_APART_S or len(columns['time']) > _MANY_ROWS
+
+
+def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
+    """Return whether rows without times are samples: many, and mostly like the row before."""
+    readings = columns['reading']
+    if len(readings) < _FEW_POSES or {'time', 'count', 'orientation'} & set(columns):
+        return False
+    step = np.linalg.norm(np.diff(readings, axis=0), axis=1)
+    spread = np.linalg.norm(readings - np.median(readings, axis=0), axis=1)
+    return bool(np.median(step) < _SAME * np.median(spread))

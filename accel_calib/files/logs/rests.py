@@ -81,7 +81,7 @@ class Rests:
 
     @property
     def unit(self) -> tuple[str, float] | None:
-        """Unit of the readings and the factor to it, or None if it is not a common one."""
+        """Return the unit of the readings and the factor to it; None if it is not common."""
         if self.near(STANDARD_GRAVITY):
             return 'm/s2', 1.0
         if self.near(1.0):
