@@ -203,7 +203,7 @@ _WINDOW = """\
  font-size: {char_height}px; line-height: {line_height}px; font-variant-east-asian: full-width; }}
 .{unique_id}-title {{ font-size: 18px; font-weight: bold; font-family: system-ui, sans-serif; }}
 {styles}
-@keyframes appear {{ from {{ opacity: 0; }} to {{ opacity: 1; }} }}
+@keyframes appear {{ from {{ opacity: 0.3; }} to {{ opacity: 1; }} }}
 .line {{ animation: appear 0.1s both; }}
 @media (prefers-reduced-motion: reduce) {{ .line {{ animation: none; }} }}
 </style>
