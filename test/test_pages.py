@@ -375,7 +375,8 @@ def test_history_command_prints_tables_and_changes(dated, tmp_path, capsys, monk
     assert main(['history', *map(str, paths[::-1]), '--report', str(page_), '--json',
                  str(result)]) == 0
     printed = capsys.readouterr().out
-    assert re.search(r'2026-01-12 .*±.*±.*±', printed)
+    assert re.search(r'2026-01-12 +x .*±.*±', printed)
+    assert max(map(len, printed.splitlines())) <= 60 or str(tmp_path) in printed
     assert 'differ' in printed
     assert page_.exists()
     found = json.loads(result.read_text(encoding='utf-8'))

@@ -40,7 +40,14 @@ def printed(*arguments, encoding='utf-8', columns=80, status=0):
 @pytest.mark.parametrize('columns', [80, 60])
 def test_output_fits_the_width(columns, poses, tmp_path):
     stored = tmp_path / 'c.yaml'
+    rest = tmp_path / 'rest.csv'
+    assert main(['simulate', '-o', str(rest), '--recording', '--poses', '1', '--dwell', '600',
+                 '--rate', '20']) == 0
     text = ''.join([printed('fit', poses, '-o', stored, columns=columns),
+                    printed('calibrate', poses, '-o', tmp_path / 'd.yaml', columns=columns),
+                    printed('history', stored, tmp_path / 'd.yaml', columns=columns),
+                    printed('export', stored, '--to', 'px4', columns=columns),
+                    printed('noise', rest, columns=columns),
                     printed('refine', poses, columns=columns),
                     printed('verify', poses, '-c', stored, columns=columns),
                     printed('compare', stored, stored, columns=columns),

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .terminal import progress
+from .terminal import progress, working
 from ..calibrate import (
     Calibration,
     check_sensor,
@@ -60,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
                                 temperature_topic=args.temperature_topic,
                                 supply_topic=args.supply_topic)
     else:
-        count = _correct_table(args, calibration, left.append, lines)
+        with working('correcting'):
+            count = _correct_table(args, calibration, left.append, lines)
     console = options.console(args)
     for line in (*lines, *(f'note: {each.line}' for each in left)):
         console.print(line)

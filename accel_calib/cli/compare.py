@@ -10,7 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from . import options
+from .terminal import working
 from ..compare import compare, Comparison, LEVEL
 from ..errors import AccelCalibError
 from ..files import read_calibration
@@ -52,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         from ..report import write_comparison_page
 
-        write_comparison_page(args.report, comparison, rating, args.calibrations, calibrations)
+        with working('drawing the page'):
+            write_comparison_page(args.report, comparison, rating, args.calibrations, calibrations)
     options.write_json(args.json, {**_result(args.calibrations, models, comparison),
                                    **options.rated(rating)})
     _show(args, models, comparison)
@@ -98,9 +102,9 @@ def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) ->
     """Return a table that compares each run with the others."""
     from rich.table import Table
 
-    table = Table(title='Corrected |a| minus the mean of the others, over all directions')
-    table.add_column('run')
-    for name in ('model', 'RMS, mg', 'expected, mg', 'largest, mg', 'p'):
+    table = Table(title='Corrected |a| minus the mean of the others [mg]')
+    table.add_column('run', overflow='fold')
+    for name in ('model', 'RMS', 'expected', 'largest', 'p'):
         table.add_column(name, justify='right')
     for number, (path, model, run) in enumerate(zip(paths, models, comparison.runs,
                                                     strict=True), 1):
@@ -113,11 +117,13 @@ def _parameters_table(comparison: Comparison) -> Any:
     """Return a table of the spread of each parameter."""
     from rich.table import Table
 
-    table = Table(title='Spread of the parameters over the runs')
+    table = Table(title='Spread of the parameters over the runs [mg]')
     table.add_column('')
-    for name in ('mean, mg', 'spread, mg', 'stated, mg', 'ratio'):
+    for name in ('mean', 'spread', 'stated', 'ratio'):
         table.add_column(name, justify='right')
     for one in comparison.parameters:
+        if not np.any(one.stated_sd):
+            continue  # not in the model
         stated = float((one.stated_sd ** 2).mean() ** 0.5) * MG
         table.add_row(one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
                       f'{stated:.3g}', '' if one.ratio is None else f'{one.ratio:.2f}')

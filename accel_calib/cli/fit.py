@@ -145,9 +145,10 @@ def _store(fitted: _Fitted, output: Path | None, report: Path | None) -> None:
     if report is not None:
         from ..report import write_calibration_page
 
-        write_calibration_page(report, fitted.calibration, fitted.rating, str(fitted.path),
-                               stored=str(output or 'calibration.yaml'),
-                               notes=fitted.intake.lines)
+        with working('drawing the page'):
+            write_calibration_page(report, fitted.calibration, fitted.rating, str(fitted.path),
+                                   stored=str(output or 'calibration.yaml'),
+                                   notes=fitted.intake.lines)
 
 
 def _in_a_line(result: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from . import options
+from .terminal import working
 from ..compare import History, history_of
 from ..errors import AccelCalibError
 from ..files import read_calibration
@@ -47,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
         raise
     options.write_json(args.json, _result(args.calibrations, history))
     if args.report is not None:
-        write_history_page(args.report, history, args.calibrations, calibrations)
+        with working('drawing the page'):
+            write_history_page(args.report, history, args.calibrations, calibrations)
     _show(args, history)
     return 0
 
@@ -76,16 +78,14 @@ def _result(paths: Sequence[Path], history: History) -> dict[str, Any]:
 def _show(args: argparse.Namespace, history: History) -> None:
     """Print the result."""
     console = options.console(args)
-    for title, names in (('Zero-g offset [mg]', OFFSETS), ('Gain minus 1 [%]', GAINS)):
-        console.print(_table(title, names, history))
-        console.print('')
+    console.print(_table(history))
     for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                      strict=False):
-        console.print(_line(first, second, change), markup=False)
+        console.print(_line(first, second, change))
     for note in history.notes:
-        console.print(f'note: {note}', markup=False)
+        console.print(f'note: {note}')
     if args.report is not None:
-        console.print(f'stored in {args.report}', markup=False)
+        console.print(f'stored in {args.report}')
 
 
 def _line(first: str, second: str, change: Any) -> str:
@@ -98,21 +98,22 @@ def _line(first: str, second: str, change: Any) -> str:
             f'{change.parameter.replace(".", " ")} {most}')
 
 
-def _table(title: str, names: Sequence[str], history: History) -> Table:
-    """Return a table of parameters, one row per calibration."""
+def _table(history: History) -> Table:
+    """Return a table of offset and gain, one row per calibration and axis."""
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False,
-                  pad_edge=False)
-    table.add_column('date', no_wrap=True)
-    found = [each for each in history.parameters if each.name in names]
-    for each in found:
-        table.add_column(each.name.partition('.')[2], justify='right', overflow='fold')
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
+    for name in ('date', ''):
+        table.add_column(name, no_wrap=True)
+    for name in ('offset [mg]', 'gain - 1 [%]'):
+        table.add_column(name, no_wrap=True, justify='right')
+    found = {each.name: each for each in history.parameters}
     for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
-        warm = '' if moment.temperature is None else f'\n{moment.temperature:.0f} °C'
-        cells = (in_words(each.name, each.values[k], each.stated_sd[k]).rpartition(' ')[0]
-                 for each in found)
-        day = label.replace(' ', '\n')
-        table.add_row(f'{day}{warm}', *(cell.replace('−', '-') for cell in cells))
+        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
+        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
+            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
+                     for name in names)
+            table.add_row(begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                 for cell in cells))
     return table

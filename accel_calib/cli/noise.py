@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import options
-from .terminal import progress
+from .terminal import progress, working
 from ..allan import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
 from ..calibrate import Calibration, check_sensor, check_units, of_samples
 from ..errors import counted, InputError
@@ -51,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
     found, lines = _noise(args)
     options.write_json(args.json, {'recording': args.recording, **to_json(found)})
     if args.report is not None:
-        write_noise_page(args.report, found, str(args.recording))
+        with working('drawing the page'):
+            write_noise_page(args.report, found, str(args.recording))
     _show(args, found, lines)
     return 0
 

@@ -135,7 +135,8 @@ def _store(result: Refinement, source: Path, output: Path | None, report: Path |
     """Write the report, the plan and a usable calibration; return the paths written."""
     written = []
     if report is not None:
-        write_page(report, result, str(source))
+        with working('drawing the page'):
+            write_page(report, result, str(source))
         written.append(report)
     if output is not None and not result.refusal:
         write_calibration(output, result.calibration)

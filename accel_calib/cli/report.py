@@ -10,6 +10,7 @@ from pathlib import Path
 
 from . import options
 from .refine import add_inputs, refine_file
+from .terminal import working
 from ..errors import counted
 from ..report import check_matplotlib, write_figures, write_page
 
@@ -33,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
     """Refine, and write the report and the figures."""
     check_matplotlib()
     result = refine_file(args, args.poses)
-    write_page(args.output, result, str(args.poses))
+    with working('drawing the page'):
+        write_page(args.output, result, str(args.poses))
     console = options.console(args)
     console.print(f'{result.verdict}, stored in {args.output}')
     if args.figures is not None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import options
+from .terminal import working
 from ..calibrate import check_units, verify
 from ..errors import AccelCalibError
 from ..rating import rate_verification
@@ -82,8 +83,10 @@ def _verify(args: argparse.Namespace, path: Path, report: Path | None) -> dict[s
     if report is not None:
         from ..report import write_calibration_page
 
-        write_calibration_page(report, calibration, rating, str(path), verification=(found, poses),
-                               stored=str(args.calibration), notes=intake.lines)
+        with working('drawing the page'):
+            write_calibration_page(report, calibration, rating, str(path),
+                                   verification=(found, poses), stored=str(args.calibration),
+                                   notes=intake.lines)
     return {'file': path, 'poses': len(poses), **asdict(found), **options.rated(rating),
             'read_lines': intake.lines, 'rating_lines': rating.lines}
 
