@@ -147,7 +147,7 @@ def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -
     other = stored('other.yaml', sensor='another').read_text()
     for text, words in ((good.replace('version: 2', 'version: 999'), 'version 999'),
                         (other, "belongs to sensor 'another'"), ('', 'not a calibration'),
-                        (good.replace('readings: m/s2', 'readings: g'), 'in g')):
+                        (good.replace('readings: m/s2', 'readings: native'), 'native')):
         path.write_text(text)
         answer = bench.call('load')
         assert not answer.success
