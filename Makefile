@@ -39,8 +39,7 @@ demo: $(VENV)/package
 	@$(BIN)/accel-calib demo
 
 test: $(VENV)/extra-test $(VENV)/package $(VENV)/tf2_msgs
-	@PATH="$(CURDIR)/$(BIN):$$PATH" ROS_LOG_DIR="$${ROS_LOG_DIR:-$(CURDIR)/$(VENV)/log}" \
-		$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@test/run $(BIN)/python $(PYTEST_ARGS)
 
 lint: $(VENV)/extra-dev
 	@$(BIN)/ruff check --quiet $(PYTHON_SOURCES)

@@ -52,7 +52,7 @@ setup(
         'completion': ['argcomplete'],
         'docs': ['sphinx', 'myst-parser', 'sphinx-rtd-theme'],
         'test': ['allantools', 'argcomplete', 'imucal', 'matplotlib>=3.6', 'pandas', 'pymavlink',
-                 'pytest', 'pyulog', 'setuptools'],
+                 'pytest', 'pytest-xdist', 'pyulog', 'setuptools'],
         'dev': [
             'flake8',
             'flake8-builtins',

@@ -46,12 +46,9 @@ class Intake:
         return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', *self.notes)))
 
 
-def _silent(done: int, count: int) -> None:
-    """Report no progress."""
-
-
 def poses_of(path: Path, options: LogOptions = LogOptions(),
-             settings: Mapping[str, Any] = {}, progress: Progress = _silent) -> Intake:
+             settings: Mapping[str, Any] = {},
+             progress: Progress = lambda done, count: None) -> Intake:
     """
     Return the poses of any log; a recording is captured.
 

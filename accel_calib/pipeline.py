@@ -13,9 +13,10 @@ from .effects import PROCESSES
 from .errors import RefusedFitError
 from .rating import rate, Rating
 from .refine import refine, Refinement
+from .significant import short
 from .table import Poses
 from .units import Units
-from .words import now, short
+from .words import now
 
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""

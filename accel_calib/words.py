@@ -12,6 +12,7 @@ import numpy as np
 
 from .effects import effect_named, EMPIRICAL, empirical_parts
 from .errors import counted
+from .significant import short
 from .table import COLUMNS
 from .units import MG
 
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from .refine import Refinement, Step
 
 _LEAST_P = 1e-16
-_ZERO = 1e-12
-"""Values below are zero but for rounding."""
 _IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
 _WITHOUT_UNIT = ('of_sensor', 'form')
 """Constants of a shape that select one of two forms."""
@@ -69,11 +68,6 @@ def base_words(result: Refinement) -> str:
     return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
-def short(value: float) -> str:
-    """Return a number with three significant digits."""
-    return f'{value:.3g}'
-
-
 def chance(p_value: float) -> str:
     """Return the probability that noise alone explains a step."""
     return f'p < {_LEAST_P:.0e}' if p_value < _LEAST_P else f'p = {p_value:.1g}'
@@ -116,16 +110,3 @@ def _shape_unit(name: str, curve: str) -> str:
 def unit_of(column: str) -> str:
     """Return the unit of a quantity of the context, with readings in g."""
     return 'g' if column == 'std' else COLUMNS[column].unit
-
-
-def with_sd(value: float, sd: float) -> str:
-    """
-    Return ``value ± sd`` with two significant digits of the standard deviation.
-
-    A value without a standard deviation has six significant digits.
-
-    """
-    if not sd > 0.0:
-        return '0' if abs(value) < _ZERO else f'{value:.6g}'
-    decimals = max(0, 1 - int(np.floor(np.log10(sd))))
-    return f'{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}'

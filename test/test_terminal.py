@@ -12,7 +12,7 @@ import sys
 from accel_calib.cli.characters import in_one_line, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.terminal import Output
-from accel_calib.words import with_sd
+from accel_calib.significant import with_sd
 import numpy as np
 import pytest
 

@@ -20,6 +20,7 @@ from ..effects import AXES, Context
 from ..errors import InputError, StoredCalibrationError
 from ..html_table import table
 from ..model import correct, force_slope, Model, parameter_names, predict
+from ..significant import with_sd
 from ..table import Floats, Poses, Table
 from ..thermal import acting_temperature, rate_at, ThermalStream
 from ..units import STANDARD_GRAVITY, UnitName, Units
@@ -158,7 +159,8 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         """Return offset and gain as a table, for notebooks."""
-        rows = [[axis, *(f'{value:.6g} ± {sd:.1g}' for value, sd in zip(values, deviations))]
+        rows = [[axis, *(with_sd(value, sd) if value or sd else ''
+                         for value, sd in zip(values, deviations))]
                 for axis, values, deviations in zip(
                     AXES, np.column_stack([self.offset, self.gain]),
                     np.column_stack([self.offset_sd, self.gain_sd]))]

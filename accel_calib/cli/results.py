@@ -15,9 +15,10 @@ from ..calibrate import Calibration, GyroBias, Outlook, outlook
 from ..effects import effect_named, LADDER
 from ..errors import counted
 from ..estimate.closed_form import sensing_axes
+from ..significant import short, with_sd
 from ..table import Floats
 from ..units import MG
-from ..words import base_words, chance, short, value_unit, with_sd
+from ..words import base_words, chance, value_unit
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -16,7 +16,7 @@ from .terminal import working
 from ..calibrate import check_units, verify
 from ..errors import AccelCalibError
 from ..rating import rate_verification
-from ..words import short
+from ..significant import short
 
 _EXAMPLE = ('accel-calib verify other_log.csv -c calibration.yaml --max 5\n'
             'exit status:\n'

@@ -61,6 +61,7 @@ NORM_MODELS = ('4', '7', '10')
 """Models for poses of unknown orientation; the smallest model is first."""
 
 _NEAR = np.cos(np.radians(45.0))
+_COVERAGE_DIRECTIONS = 500
 _SAME = np.cos(np.radians(5.0))
 _SINGULAR, _NOTHING = 1e-6, 1e-14
 
@@ -206,8 +207,13 @@ def _pairs_over_the_sphere(name: str) -> Floats:
 
 def coverage(directions: Floats) -> float:
     """Return the share of the sphere within 45° of a pose, for (n, 3) unit vectors."""
-    near = np.max(spread_directions(500) @ directions.T, axis=1)
-    return float(np.mean(near >= _NEAR))
+    return 1.0 - len(uncovered(directions)) / _COVERAGE_DIRECTIONS
+
+
+def uncovered(directions: Floats) -> Floats:
+    """Return the directions of an even grid that are not within 45° of a pose, (m, 3)."""
+    grid = spread_directions(_COVERAGE_DIRECTIONS)
+    return grid[np.max(grid @ directions.T, axis=1) < _NEAR]
 
 
 def distinct(directions: Floats) -> int:

@@ -37,9 +37,10 @@ from ..effects import (
 from ..errors import counted
 from ..estimate.geometry import coverage
 from ..model import with_vector
+from ..significant import short, with_sd
 from ..table import Floats
 from ..units import MG
-from ..words import short, value_unit, with_sd
+from ..words import value_unit
 
 if TYPE_CHECKING:
     from ..calibrate import Verification

@@ -40,7 +40,7 @@ from .style import (
     styled,
 )
 from .variables import Variable
-from ..sphere import spread_directions
+from ..estimate.geometry import uncovered
 from ..table import Floats
 
 _HEIGHT_INCHES = 3.3
@@ -50,8 +50,6 @@ _INK_PER_POSE = 3500.0
 HALVES = ('down', 'up')
 """Names of the markers of the hemispheres -z and +z."""
 
-_NEAR = np.cos(np.radians(45.0))
-"""Cosine of the angle within which a pose covers the sphere, as in `Quality.coverage`."""
 
 _LEAST_MG = 1e-3
 """Smallest residual of a logarithmic axis [mg]."""
@@ -207,8 +205,7 @@ def draw_coverage(title: str, force: Floats, next_pose: Floats | None,
         Text of each pose.
 
     """
-    grid = spread_directions(500)  # as in `coverage`
-    open_ = grid[np.max(grid @ force.T, axis=1) < _NEAR]
+    open_ = uncovered(force)
     hover = {}
     with styled():
         figure = new_figure(_HEIGHT_INCHES)

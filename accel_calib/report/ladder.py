@@ -10,7 +10,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .style import ACCENT, AFTER, Chart, FAINT, new_figure, PAPER, styled
-from ..words import base_words, short
+from ..significant import short
+from ..words import base_words
 
 if TYPE_CHECKING:
     from ..refine import Refinement

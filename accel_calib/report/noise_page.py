@@ -23,7 +23,7 @@ from .style import ACCENT, AFTER, Chart, Mark, new_figure, save, styled, THIRD
 from .. import __version__
 from ..allan import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
 from ..files.atomic import write_atomically
-from ..words import with_sd
+from ..significant import with_sd
 
 _COLOURS = {'x': AFTER, 'y': ACCENT, 'z': THIRD}
 _HEIGHT_INCHES = 4.0

@@ -16,7 +16,8 @@ from .residuals import Residuals, residuals_of_refinement
 from .sheet import code, figures, paragraph, scroll_table, section
 from ..effects import effect_named
 from ..refine.plan_words import percent
-from ..words import chance, short, values_of, verdict_words
+from ..significant import short
+from ..words import chance, values_of, verdict_words
 
 if TYPE_CHECKING:
     from ..refine import Refinement, Step

@@ -32,9 +32,10 @@ from .style import (
 )
 from ..compare import Comparison, History
 from ..compare.comparison import Parameter
+from ..significant import with_sd
 from ..table import Floats
 from ..units import MG
-from ..words import value_unit, with_sd
+from ..words import value_unit
 
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
 _BAND = 1.96

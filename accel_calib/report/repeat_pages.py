@@ -17,7 +17,7 @@ from .sheet import figures, heading, HINT, listing, scroll_table, section, sheet
 from .. import __version__
 from ..files.atomic import write_atomically
 from ..rating import rate_comparison
-from ..words import short
+from ..significant import short
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration
