@@ -62,7 +62,6 @@ def _flat(text: str) -> Flat:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, store, write the page, and print the verdict."""
-    options.check_folder('-o', args.output)
     try:
         intake = options.intake(args, args.log)
         with working('fitting'):

@@ -54,7 +54,6 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Capture and write the poses, and print their number."""
-    options.check_folder('-o', args.output)
     with (open_log(args.recording, options.log_options(args)) as log,
           progress('samples') as moved):
         captured = capture(_checked(log, moved), log.units, _settings(args, log.units))

@@ -43,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
         from ..report import check_matplotlib
 
         check_matplotlib()
-        options.check_folder('--report', args.report)
     try:
         calibrations = [read_calibration(path) for path in args.calibrations]
         comparison = compare(calibrations)

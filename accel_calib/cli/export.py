@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 from . import options
+from .targets import check_one, Target
 from .terminal import Output
 from ..errors import InputError
 from ..files.atomic import write_atomically
@@ -87,10 +88,7 @@ def _target(args: argparse.Namespace, made: Exported) -> Path | None:
         target = args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')
     else:
         target = Path(args.output)
-        options.check_folder('-o', target)
-    if target.exists() and target.samefile(args.calibration):
-        raise InputError(f'{target} is the calibration itself, expected another file',
-                         'choose another name with -o')
+    check_one(Target('-o', target, 'export'), [args.calibration], force=args.force)
     return target
 
 

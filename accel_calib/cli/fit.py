@@ -71,9 +71,6 @@ def run(args: argparse.Namespace) -> int:
         from ..report import check_matplotlib
 
         check_matplotlib()
-    for option, path in (('-o', args.output), ('--report', args.report)):
-        if path is not None:
-            options.check_folder(option, path, len(args.poses))
     if len(args.poses) == 1:
         return _run_one(args)
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)

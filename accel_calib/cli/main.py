@@ -14,12 +14,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
+import errno
 from importlib import import_module
 import os
 import re
 import sys
 from typing import NoReturn
 
+from . import targets
 from .characters import in_one_line, use_plain_characters
 from .. import __version__
 from ..errors import AccelCalibError
@@ -92,6 +94,7 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> _Parser:
                                    description=f'{summary[0].upper()}{summary[1:]}.')
         if name in wanted:
             import_module(f'.{_MODULES.get(name, name)}', __package__).add_to(made)
+            targets.add_force(made)
     return top
 
 
@@ -121,13 +124,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     args.for_ros = for_ros
     try:
+        if args.command:
+            targets.check(args)
         status: int = args.run(args)
     except AccelCalibError as err:
         return _refuse(args.command, str(err))
     except OSError as err:
         name = f'{err.filename}: ' if err.filename else ''
-        reason = err.strerror or err
-        return _refuse(args.command, f'{name}{reason}; check the name and the permissions')
+        full = err.errno in (errno.ENOSPC, errno.EDQUOT)
+        advice = 'free space on the disk' if full else 'check the name and the permissions'
+        return _refuse(args.command, f'{name}{err.strerror or err}; {advice}')
     except KeyboardInterrupt:
         return INTERRUPTED
     return status

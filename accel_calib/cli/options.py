@@ -131,24 +131,6 @@ def rated(rating: Rating) -> dict[str, str]:
     return {'rating': rating.name, 'rating_reason': rating.reason}
 
 
-def check_folder(option: str, path: Path, count: int = 1) -> None:
-    """
-    Check before the work that the folder of an output exists.
-
-    Raises
-    ------
-    InputError
-        If the path is not a folder for several outputs, or is not in a folder.
-
-    """
-    if count > 1 and not path.is_dir():
-        raise InputError(f'{option} {path} is not a folder, expected a folder for {count} tables',
-                         'use an existing folder')
-    if count == 1 and not path.parent.is_dir():
-        raise InputError(f'{option} {path}: {path.parent} is not a folder, expected a folder',
-                         'choose a file in an existing folder')
-
-
 def add_json(made: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
     made.add_argument('--json', metavar='FILE', help='JSON file to write with the result; - for '

@@ -62,10 +62,6 @@ def run(args: argparse.Namespace) -> int:
     """Refine and store, and print the result."""
     if args.report is not None:
         check_matplotlib()
-    for option, path in (('-o', args.output), ('--report', args.report),
-                         ('--plan', args.plan)):
-        if path is not None:
-            options.check_folder(option, path, len(args.poses))
     if len(args.poses) == 1:
         return _run_one(args)
     results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)

@@ -52,7 +52,6 @@ def run(args: argparse.Namespace) -> int:
         from ..report import check_matplotlib
 
         check_matplotlib()
-        options.check_folder('--report', args.report, len(args.poses))
     if len(args.poses) == 1:
         result = _verify(args, args.poses[0], args.report)
         options.write_json(args.json, result)

@@ -1,18 +1,36 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writing of files that are either complete or unchanged."""
+"""
+Writing of files that are either complete or unchanged.
+
+Only regular files are replaced, through links to their target. A file keeps its permissions and,
+as far as the user may set them, its owner. Temporary files have names that cannot be predicted,
+and are created exclusively.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 import glob
 import os
 from pathlib import Path
+import secrets
 import shutil
-from typing import TextIO
+import stat
+import time
+from typing import BinaryIO, TextIO
+
+from ..errors import InputError
 
 _SUFFIX = '.tmp'
+_STALE_S = 3600.0
+"""Age of a temporary file that no process writes any more [s]."""
+
+_LONGEST_NAME = 200
+_WRITABLE = 0o222
 
 
 def previous(path: Path) -> Path:
@@ -28,7 +46,7 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     Parameters
     ----------
     path : Path
-        The file; its folder must exist.
+        The file; its folder must exist. The target of a link is replaced, not the link.
     write : callable
         Function that writes the content to an open file.
     keep_before : bool
@@ -36,44 +54,83 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
 
     Raises
     ------
+    InputError
+        If the path is no regular file, or is write-protected.
     OSError
         If the folder is missing or cannot be written. The file is then unchanged.
 
     """
-    temporary = _temporary(path)
-    try:
-        with temporary.open('w', encoding='utf-8', newline='') as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        if keep_before and path.exists():
-            copy_atomically(path, previous(path))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _flush_folder(path.parent)
+    target = Path(os.path.realpath(path))
+    with _replacing(target) as file, open(os.dup(file.fileno()), 'w', encoding='utf-8',
+                                          newline='') as text:
+        write(text)
+        text.flush()
+        os.fsync(file.fileno())
+        if keep_before and target.exists():
+            copy_atomically(target, previous(target))
+    _flush_folder(target.parent)
+    _remove(target, older_than=_STALE_S)
 
 
 def copy_atomically(path: Path, target: Path) -> None:
     """Copy a file within its folder, completely or not at all; raise OSError if it fails."""
-    temporary = _temporary(target)
+    with path.open('rb') as source, _replacing(target) as file:
+        shutil.copyfileobj(source, file)
+        file.flush()
+        state = os.fstat(source.fileno())
+        os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode))
+        os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
+
+
+@contextmanager
+def _replacing(target: Path) -> Iterator[BinaryIO]:
+    """Yield a new file that replaces the target at the end; it is removed after an error."""
+    old = _replaceable(target)
+    temporary = target.with_name(
+        f'.{target.name[:_LONGEST_NAME]}.{secrets.token_hex(8)}{_SUFFIX}')
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
     try:
-        shutil.copy2(path, temporary)
+        with open(handle, 'wb') as file:
+            if old is not None:
+                with suppress(PermissionError):  # the owner stays, if the user may set it
+                    os.fchown(handle, old.st_uid, old.st_gid)
+                os.fchmod(handle, stat.S_IMODE(old.st_mode))
+            yield file
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 
 
+def _replaceable(path: Path) -> os.stat_result | None:
+    """Return the state of a file that may be replaced; None if there is no file."""
+    try:
+        old = path.lstat()
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISREG(old.st_mode):
+        raise InputError(f'{path} is not a regular file, expected one that can be replaced',
+                         'choose another name')
+    if not old.st_mode & _WRITABLE:
+        raise InputError(f'{path} is write-protected, expected a file that may be replaced',
+                         'choose another name, or allow writing with chmod u+w')
+    return old
+
+
 def remove_leftovers(path: Path) -> list[Path]:
     """Remove temporary files that killed processes left beside a file; return their paths."""
-    found = sorted(path.parent.glob(f'.{glob.escape(path.name)}.*{_SUFFIX}'))
-    for each in found:
-        each.unlink(missing_ok=True)
+    return _remove(path)
+
+
+def _remove(path: Path, older_than: float = 0.0) -> list[Path]:
+    """Remove temporary files of a file of at least this age [s]; return their paths."""
+    name = glob.escape(path.name[:_LONGEST_NAME])
+    found = []
+    for each in sorted(path.parent.glob(f'.{name}.*{_SUFFIX}')):
+        with suppress(FileNotFoundError):  # another process was faster
+            if time.time() - each.stat().st_mtime >= older_than:
+                each.unlink()
+                found.append(each)
     return found
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f'.{path.name}.{os.getpid()}{_SUFFIX}')
 
 
 def _flush_folder(folder: Path) -> None:
