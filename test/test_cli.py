@@ -4,6 +4,8 @@
 """The command line: results, JSON, and one line for invalid input."""
 
 import json
+import os
+from pathlib import Path
 import subprocess
 import sys
 
@@ -16,6 +18,7 @@ from accel_calib.simulate import parse_effect
 import numpy as np
 import pytest
 
+ROOT = Path(__file__).parents[1]
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']
 FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_sd', 'covariance',
@@ -316,3 +319,19 @@ def test_outlier_is_reported_with_its_row(poses, capsys):
     _, result = run_json(capsys, 'fit', poses)
     assert [rejected['row'] for rejected in result['poses_rejected']] == [7]
     assert 'outlier' in result['poses_rejected'][0]['reason']
+
+
+@pytest.mark.parametrize('jobs', [1, 2])
+def test_files_of_the_current_folder_are_never_run(jobs, tmp_path, monkeypatch, capsys):
+    for name in ('one.csv', 'two.csv'):
+        run('simulate', '-o', tmp_path / name)
+    for name in ('pickle', 'numpy', 'multiprocessing', 'select', 'queue', 'accel_calib'):
+        (tmp_path / f'{name}.py').write_text('open("run", "w").close()\nraise SystemExit(9)\n')
+    code = ('import sys; sys.path[:] = filter(None, sys.path)\n'
+            'from accel_calib.cli.main import main; sys.exit(main())')
+    done = subprocess.run([sys.executable, '-c', code, 'fit', 'one.csv', 'two.csv', '--jobs',
+                           str(jobs), '--json', '-'], cwd=tmp_path, capture_output=True, text=True,
+                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert done.returncode == 0, done.stderr
+    assert [each['rating'] for each in json.loads(done.stdout)] == ['GOOD', 'GOOD']
+    assert not (tmp_path / 'run').exists()

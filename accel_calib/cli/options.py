@@ -202,9 +202,26 @@ def in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
     """Return the results of a function for each item, in order; `jobs` processes are used."""
     if jobs <= 1 or len(items) <= 1:
         return [function(item) for item in items]
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
+    from concurrent.futures import ThreadPoolExecutor
+    from queue import SimpleQueue
 
-    # A fork of a process with threads, such as those of numpy, may hang.
-    with ProcessPoolExecutor(min(jobs, len(items)), get_context('spawn')) as pool:
-        return list(pool.map(function, items))
+    from ..session.worker_process import WorkerProcess
+
+    workers = [WorkerProcess(idle=False) for _ in range(min(jobs, len(items)))]
+    free: SimpleQueue[WorkerProcess] = SimpleQueue()
+    for worker in workers:
+        free.put(worker)
+
+    def one(item: Any) -> Any:
+        worker = free.get()
+        try:
+            return worker.call(function, item)
+        finally:
+            free.put(worker)
+
+    with ThreadPoolExecutor(len(workers)) as pool:
+        try:
+            return list(pool.map(one, items))
+        finally:
+            for worker in workers:
+                worker.close()

@@ -94,7 +94,8 @@ def _too_large(expected: Expected) -> Iterator[Shortcoming]:
     if own > BAD_ERROR.value:
         yield Shortcoming('BAD', f'the error in new orientations is {mg(own)}, expected at most '
                           f'{mg(BAD_ERROR.value)}', _remedy(expected))
-    elif calibrated and before is not None and own > before and not expected.is_partial:
+    elif calibrated and before is not None and own > max(before, MATTERS.value) and (
+            not expected.is_partial):
         name: RatingName = 'BAD' if own > WORST_ERROR.value else 'USABLE'
         yield Shortcoming(name, f'the error in new orientations is {mg(own)}, and '
                           f'{mg(before)} without the calibration', _remedy(expected))

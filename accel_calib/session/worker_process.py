@@ -46,19 +46,32 @@ _IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.spec
 """Modules imported at the start, so that the first fit is as fast as later ones."""
 
 
-class WorkerProcess:
-    """The interface of the node to the process; for one thread at a time."""
+_START = ('import sys; sys.path[:] = filter(None, sys.path); '
+          f'from {__name__} import main; main()')
+"""Code of the process. The current folder is not searched for modules: it may hold any file."""
 
-    def __init__(self) -> None:
+
+class WorkerProcess:
+    """
+    The interface of the node to the process; for one thread at a time.
+
+    Parameters
+    ----------
+    idle : bool
+        Run only while the processor is idle.
+
+    """
+
+    def __init__(self, *, idle: bool = True) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
-        self._idle = True
+        self._idle = idle
 
     def start(self) -> None:
         """Start the process unless it is running, without waiting for it."""
         if self._closed or (self._process is not None and self._process.poll() is None):
             return
-        command = [sys.executable, '-m', __name__, *([_IDLE] if self._idle else [])]
+        command = [sys.executable, '-c', _START, *([_IDLE] if self._idle else [])]
         path = os.pathsep.join(filter(None, sys.path))
         environment = {**os.environ, 'PYTHONPATH': path, **dict.fromkeys(_ONE_THREAD, '1')}
         try:
@@ -159,7 +172,3 @@ def _answer(call: Any) -> tuple[bool, Any]:
         return True, function(*given)
     except Exception as error:  # raised again in the node, by `call`
         return False, error
-
-
-if __name__ == '__main__':
-    main()
