@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Fixtures for the tests of the nodes.
+Fixtures, most of them for the tests of the nodes.
 
 `bench` runs nodes as processes, with a separate DDS domain per test. The clock of the calibrator
 are the header stamps, so that a test can publish a minute of readings in a second. Each wait has a
@@ -230,6 +230,15 @@ class Bench:
 
 def _yaml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@pytest.fixture(autouse=True)
+def defects_are_failures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let an exception that nobody expected fail a test, instead of the command's last resort."""
+    def fail(error: BaseException) -> str:
+        raise error
+
+    monkeypatch.setattr('accel_calib.cli.main.crash_words', fail)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import sys
 from accel_calib.cli.main import main, parser
 from accel_calib.cli.options import plain
 from accel_calib.cli.terminal import progress
+from accel_calib.crash import crash_words
 from accel_calib.files import read_calibration, read_poses, write_table
 from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import parse_effect
@@ -335,3 +336,19 @@ def test_files_of_the_current_folder_are_never_run(jobs, tmp_path, monkeypatch, 
     assert done.returncode == 0, done.stderr
     assert [each['rating'] for each in json.loads(done.stdout)] == ['GOOD', 'GOOD']
     assert not (tmp_path / 'run').exists()
+
+
+def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, capsys):
+    def break_(*given, **options):
+        raise ValueError('of two\nlines')
+
+    monkeypatch.setattr('accel_calib.cli.main.crash_words', crash_words)
+    monkeypatch.setattr('accel_calib.cli.simulate.simulate', break_)
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    assert run('simulate', '-o', tmp_path / 'x.csv') == 2
+    error = capsys.readouterr().err
+    assert error.startswith('accel-calib simulate: internal error: ValueError: of two lines; ')
+    assert error.count('\n') == 1
+    details, = tmp_path.glob('accel_calib-*.txt')
+    assert str(details) in error
+    assert 'Traceback' in details.read_text(encoding='utf-8')

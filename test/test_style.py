@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    ('errors', 'html_table', 'significant', 'units'),
+    ('crash', 'errors', 'html_table', 'significant', 'units'),
     ('table',),
     ('sphere', 'rotations', 'thermal'),
     ('effects',),

@@ -24,6 +24,7 @@ from typing import NoReturn
 from . import targets
 from .characters import in_one_line, use_plain_characters
 from .. import __version__
+from ..crash import crash_words
 from ..errors import AccelCalibError
 
 BAD_INPUT = 2
@@ -110,8 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0; 1 if a requested check fails; 2 for invalid input, with one line on
-        standard error.
+        Exit status: 0; 1 if a requested check fails; 2 for invalid input or an internal error,
+        with one line on standard error.
 
     """
     use_plain_characters()
@@ -136,6 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(args.command, f'{name}{err.strerror or err}; {advice}')
     except KeyboardInterrupt:
         return INTERRUPTED
+    except Exception as err:  # a defect of this program, which no user should see as a traceback
+        return _refuse(args.command, crash_words(err))
     return status
 
 
