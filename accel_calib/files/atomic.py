@@ -97,6 +97,9 @@ def _replacing(target: Path) -> Iterator[BinaryIO]:
                 os.fchmod(handle, stat.S_IMODE(old.st_mode))
             yield file
         temporary.replace(target)
+    except OSError as err:
+        err.filename = err.filename or str(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -138,5 +141,8 @@ def _flush_folder(folder: Path) -> None:
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as err:
+        err.filename = str(folder)
+        raise
     finally:
         os.close(handle)
