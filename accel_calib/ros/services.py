@@ -57,6 +57,7 @@ class Worker:
         self._pool = ThreadPoolExecutor(1, 'accel_calib')
         self._done: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._process = WorkerProcess()
+        self._closed = False
 
     def run(self, job: Job, answer: Answer) -> None:
         """Run a job in the thread, finish it in the executor, and call `answer`."""
@@ -72,6 +73,8 @@ class Worker:
 
     def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
         """Finish a job and call `answer`; unexpected errors are logged, and the node continues."""
+        if self._closed:
+            return  # publishers and services may be destroyed already, which rclpy does not survive
         try:
             words, success = job.finish(done.result()), True
         except AccelCalibError as error:
@@ -88,6 +91,7 @@ class Worker:
 
     def close(self) -> None:
         """Stop the computation, and finish writing."""
+        self._closed = True
         self._process.close()
         self._pool.shutdown(wait=True)
 
