@@ -24,7 +24,7 @@ unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 endif
 
-.PHONY: help demo test lint docs bench clean
+.PHONY: help demo test lint docs faults bench clean
 .NOTPARALLEL:
 
 help:
@@ -32,6 +32,7 @@ help:
 	@echo 'make test   the tests; PYTEST_ARGS="-k name" for some of them'
 	@echo 'make lint   linter and type check'
 	@echo 'make docs   the documentation site, in build/docs'
+	@echo 'make faults many damaged files and failed writes; half an hour'
 	@echo 'make bench  measures speed, beside what it is compared to, and writes it to the docs'
 	@echo 'make clean  removes .venv and what was built'
 
@@ -50,6 +51,11 @@ lint: $(VENV)/extra-dev
 
 docs: $(VENV)/extra-docs
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
+
+faults: $(VENV)/extra-test $(VENV)/package
+	@$(BIN)/python -m pytest test/faults test/test_targets.py test/test_*damage*.py test/test_bombs.py
+	@for seed in 1 2 3 4 5; do \
+		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package

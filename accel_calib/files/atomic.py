@@ -62,7 +62,7 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     """
     target = Path(os.path.realpath(path))
     with _replacing(target) as file, open(os.dup(file.fileno()), 'w', encoding='utf-8',
-                                          newline='') as text:
+                                          errors='backslashreplace', newline='') as text:
         write(text)
         text.flush()
         os.fsync(file.fileno())

@@ -74,7 +74,7 @@ class Worker:
     def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
         """Finish a job and call `answer`; unexpected errors are logged, and the node continues."""
         if self._closed:
-            return  # publishers and services may be destroyed already, which rclpy does not survive
+            return  # publishers may be destroyed already, which rclpy does not survive
         try:
             words, success = job.finish(done.result()), True
         except AccelCalibError as error:

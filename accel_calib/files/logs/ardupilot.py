@@ -58,6 +58,7 @@ _MAGIC = b'\xa3\x95\x80'
 
 _TEXT = re.compile(r'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
 _HEAD = 8192
+_MOST_SENSORS = 255
 _NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
 _CALIBRATED = re.compile(r'INS_ACC\d?(OFFS|SCAL)_[XYZ]')
 _STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
@@ -86,6 +87,7 @@ def _kind(path: Path) -> Literal['binary', 'text', '']:
     return 'text' if _TEXT.search(head.decode('latin-1')) else ''
 
 
+@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
 def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of an ArduPilot log.
@@ -145,14 +147,21 @@ def _messages(tables: Mapping[str, _Table]) -> list[Message]:
         needed = _RATES if name.startswith('GYR') else _READING
         if not match or not stamp or not set(needed) <= set(table):
             continue
-        number = max(int(match[2] or 1) - 1, 0)
-        instances = table.get('I', np.full(len(table[stamp]), number)).astype(int)
+        instances = _instances(table, len(table[stamp]), max(int(match[2] or 1) - 1, 0))
         for instance in np.unique(instances).tolist():
             of = instances == instance
             time = table[stamp][of].astype(float) * _STAMPS[stamp]
             found.append(Message(match[1], instance, {key: values[of] for key, values
                                                       in table.items()}, time))
     return found
+
+
+def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
+    """Return the number of the sensor of each message; damaged numbers are 0."""
+    stated = table.get('I', np.full(count, number))
+    if stated.dtype.kind not in 'iuf':
+        return np.full(count, number)
+    return np.clip(np.nan_to_num(stated.astype(float)), 0.0, _MOST_SENSORS).astype(np.int64)
 
 
 def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:

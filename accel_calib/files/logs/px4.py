@@ -65,6 +65,7 @@ def _has_magic(path: Path) -> bool:
         return file.read(len(MAGIC)) == MAGIC
 
 
+@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
 def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of a PX4 log.
