@@ -22,7 +22,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', *(
+PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', *(
     str(path.relative_to(ROOT)) for path in sorted((ROOT / 'docs').rglob('*.md')))]
 OWN_PAGES = [page for page in PAGES if 'figures' not in page]
 EFFECTS = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
