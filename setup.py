@@ -36,7 +36,7 @@ setup(
     python_requires='>=3.10',
     # The upper bounds exclude what no test has run with; CONTRIBUTING.md has the rule.
     install_requires=['numpy>=1.26,<2.5', 'scipy>=1.11,<1.18', 'PyYAML>=6.0.1,<7',
-                      'rosbags<0.12', 'rich>=13.7.1,<16'],
+                      'rosbags>=0.11.9,<0.12', 'rich>=13.7.1,<16'],
     extras_require={
         # ROS itself, where there is no ROS installation.
         'ros': [

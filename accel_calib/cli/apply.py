@@ -6,24 +6,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from . import options
-from .terminal import progress, working
+from .terminal import progress
 from ..calibrate import (
     Calibration,
     check_sensor,
     check_units,
+    joined_ranges,
     of_samples,
     Outside,
     outside,
+    thermal_stream,
 )
 from ..effects import Context
 from ..errors import counted, InputError
-from ..files import correct_bag, is_bag, Log, LogOptions, read_log, write_table
+from ..files import correct_bag, is_bag, LogOptions, open_log, OpenLog, write_blocks
 from ..table import Poses, Recording
 from ..units import UnitName
 
@@ -60,8 +62,7 @@ def run(args: argparse.Namespace) -> int:
                                 temperature_topic=args.temperature_topic,
                                 supply_topic=args.supply_topic)
     else:
-        with working('correcting'):
-            count = _correct_table(args, calibration, left.append, lines)
+        count = _correct_table(args, calibration, left.append, lines)
     console = options.console(args)
     for line in (*lines, *(f'note: {each.line}' for each in left)):
         console.print(line)
@@ -76,27 +77,51 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration,
     if out.exists() and out.samefile(path):
         raise InputError(f'{out} is the recording itself, expected another file',
                          'choose another name')
-    log = _log_for(calibration, path, options.log_options(args))
-    lines += [f'read as: {log.read_as}'] if log.read_as else []
-    lines += [f'note: {line}' for line in log.notes]
-    calibration = calibration.in_units(log.units)
-    check_units(log.table, calibration.units)
-    check_sensor(calibration, log.table.sensor)
-    known = of_samples(log.table.columns, len(log.table), calibration.model)
-    for each in outside(calibration, known).values():
+    with (_open_for(calibration, path, options.log_options(args)) as log,
+          progress('samples') as moved):
+        calibration = calibration.in_units(log.units)
+        check_sensor(calibration, log.sensor)
+        correction = _Correction(calibration)
+        blocks = log.watched(moved) if log.poses is None else (log.poses,)
+        count = write_blocks(out, map(correction, blocks))
+        lines += [f'read as: {log.read_as}'] if log.read_as else []
+        lines += [f'note: {line}' for line in log.notes]
+    for each in correction.outside.values():
         if each.count:
             report(each)
-    write_table(out, _corrected(log.table, calibration, known))
-    return len(log.table)
+    return count
 
 
-def _log_for(calibration: Calibration, path: Path, asked: LogOptions) -> Log:
-    """Return a log; without a stated unit, it is native if the calibration is native."""
-    if calibration.units.name == 'native' and not asked.units:
-        # If this fails because the log states a unit, the calibration refuses that unit below.
-        with suppress(InputError):
-            return read_log(path, replace(asked, units='native'))
-    return read_log(path, asked)
+@contextmanager
+def _open_for(calibration: Calibration, path: Path, asked: LogOptions) -> Iterator[OpenLog]:
+    """Open a log; without a stated unit, it is native if the calibration is native."""
+    with ExitStack() as stack:
+        log = None
+        if calibration.units.name == 'native' and not asked.units:
+            # If this fails because the log states a unit, the calibration refuses that unit.
+            with suppress(InputError):
+                log = stack.enter_context(open_log(path, replace(asked, units='native')))
+        yield log or stack.enter_context(open_log(path, asked))
+
+
+class _Correction:
+    """The correction of the blocks of a log, in order."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self._thermal = thermal_stream(calibration.model)
+        self._started = False
+        self.outside: dict[str, Outside] = {}
+
+    def __call__(self, block: Poses | Recording) -> Poses | Recording:
+        """Return a corrected block; check the unit of the first one."""
+        calibration = self._calibration
+        if not self._started:
+            check_units(block, calibration.units)
+        self._started = True
+        known = of_samples(block.columns, len(block), calibration.model, self._thermal)
+        self.outside = joined_ranges(self.outside, outside(calibration, known))
+        return _corrected(block, calibration, known)
 
 
 def _corrected(table: Poses | Recording, calibration: Calibration, known: Context

@@ -13,8 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import contextmanager
+import glob
 from pathlib import Path
 import shutil
+from tempfile import mkdtemp
+import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +59,10 @@ Note = Callable[[str], object]
 
 LEAST_M_S2 = 3.0
 """A recording with a smaller median length is not in m/s²; it is probably in g."""
+
+_PARTIAL = '.partial'
+_STALE_S = 86400.0
+"""Age of an unfinished copy that no process writes any more [s]."""
 
 _NO_HASH = 'RIHS01_' + 64 * '0'
 """Hash of a type whose definition is neither in the bag nor in Jazzy."""
@@ -166,11 +173,12 @@ def _needed(bag: Bag, calibration: Calibration, context: Context) -> Context:
 
 @contextmanager
 def _new(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder next to the target, and remove it at the end."""
-    folder = out.with_name(f'.{out.name}.partial')
-    if folder.exists():
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
+    """Yield a new folder next to the target, and remove it and old leftovers of others."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for each in out.parent.glob(f'.{glob.escape(out.name)}.*{_PARTIAL}'):
+        if not each.is_symlink() and time.time() - each.stat().st_mtime > _STALE_S:
+            shutil.rmtree(each)
+    folder = Path(mkdtemp(_PARTIAL, f'.{out.name}.', out.parent))
     try:
         yield folder
     finally:
@@ -210,6 +218,7 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
     count = bag.count(correction.topic)
     imu = {id(connection) for connection in bag.connections(correction.topic)}
+    written = 0
     writer = _writer(bag, target, out.suffix)
     with writer:
         with damage_as_input_error(bag.path):
@@ -221,9 +230,25 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
             with damage_as_input_error(bag.path):  # a stamp can be out of range
                 for k, (connection, stamp, raw) in enumerate(block):
                     writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
+            written += len(block)
             progress(correction.done, count)
+    _check_copy(bag, target, written)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
     return correction.done
+
+
+def _check_copy(bag: Bag, target: Path, written: int) -> None:
+    """Check that a copy can be read back, and that its files hold all messages."""
+    try:
+        with open_bag(target) as copy:
+            found = copy.stored
+    except InputError as err:
+        what = err.message.removeprefix(f'{target} ')
+        raise InputError(f'{bag.path} cannot be copied: the copy {what}', 'use a bag whose topics '
+                         'have valid names, types and formats') from err
+    if found != written:
+        raise InputError(f'{bag.path}: the copy holds {found} of {written} messages, expected '
+                         'all', 'check the disk, and try again')
 
 
 def _writer(bag: Bag, target: Path, suffix: str) -> Any:

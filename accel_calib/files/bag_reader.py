@@ -25,6 +25,7 @@ import sqlite3
 from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
+from .regular import check_regular
 from ..errors import InputError, listed
 from ..messages.layout import IMU_DOUBLES, joined, Messages
 
@@ -38,10 +39,17 @@ SUFFIXES = ('.bag', '.mcap', '.db3')
 BLOCK = 4096
 """Number of messages per block; a block fits in the cache of the processor."""
 
+_BLOCK_BYTES = 1 << 24
+_AT_ONCE = 64
+"""Number of bytes above which a block ends, and of messages after which they are counted."""
+
 Received = tuple['Connection', int, bytes]
 """Connection, time of receipt [ns] and serialized message."""
 
 _JOURNALS = ('-wal', '-journal')
+_LONGEST_REASON = 400
+"""Longest reason that is shown [characters]; damaged files have names of any length."""
+
 _IN_URI = {'?', '#', '%'}
 """Letters that `rosbags` does not escape when it opens a db3 file by its URI."""
 
@@ -89,6 +97,13 @@ class Bag:
         """Return the number of Imu messages of a topic, according to the index of the bag."""
         return sum(connection.msgcount for connection in self.connections(topic))
 
+    @property
+    def stored(self) -> int:
+        """Return the number of all messages, according to the files rather than metadata.yaml."""
+        storage = getattr(self.reader, 'storage', self.reader)
+        return sum(connection.msgcount for file in getattr(storage, 'storages', [storage])
+                   for connection in file.connections)
+
     def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
                ) -> Iterator[list[Received]]:
         """
@@ -99,7 +114,7 @@ class Bag:
         connections : sequence of Connection
             Connections to read; by default all.
         size : int
-            Largest number of messages in a block.
+            Largest number of messages in a block; large messages make it shorter.
 
         Yields
         ------
@@ -116,8 +131,7 @@ class Bag:
             messages = self.reader.messages(connections)
         while True:
             with damage_as_input_error(self.path):
-                block = list(islice(messages, size))
-                _check_messages(block)
+                block = _next_block(messages, size)
             if not block:
                 return
             yield block
@@ -149,15 +163,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
         If the file is missing.
 
     """
-    from rosbags import rosbag1, rosbag2
+    from .bounded_bags import Reader1, Reader2
 
-    if not path.exists():
-        raise FileNotFoundError(2, 'No such file or directory', str(path))
+    if not path.is_dir():
+        check_regular(path)
     ros2 = path.suffix != '.bag'
     with ExitStack() as stack:
         with damage_as_input_error(path):
             source, notes = _source(path, stack)
-            reader = (rosbag2.Reader if ros2 else rosbag1.Reader)(source)
+            reader = (Reader2 if ros2 else Reader1)(source)
             reader.open()
             stack.callback(_close, path, reader)
             _check_files(reader)
@@ -191,7 +205,7 @@ def damage_as_input_error(path: Path) -> Iterator[None]:
 
 
 def _not_whole(path: Path, err: Exception) -> InputError:
-    words = ' '.join(str(err).split())
+    words = ' '.join(str(err)[:_LONGEST_REASON].split())
     what = words if ' ' in words else f'{type(err).__name__} {words}'.strip()
     inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
     return InputError(f'{path} is damaged or not a bag ({what}), expected a rosbag2 folder, '
@@ -215,6 +229,20 @@ def _check_connections(connections: Sequence[Any]) -> None:
             raise ValueError(f'topic {each.topic} has {each.msgcount!r} messages')
 
 
+def _next_block(messages: Iterator[Received], size: int) -> list[Received]:
+    """Return the next messages: at most `size`, and not many more bytes than `_BLOCK_BYTES`."""
+    block: list[Received] = []
+    left = _BLOCK_BYTES
+    while left > 0 and len(block) < size:
+        part = list(islice(messages, min(_AT_ONCE, size - len(block))))
+        _check_messages(part)
+        if not part:
+            break
+        block += part
+        left -= sum(len(raw) for _, _, raw in part)
+    return block
+
+
 def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
     """Check the types of messages, which SQLite returns as stored."""
     for kinds, position, what in (((int,), 1, 'time of receipt'),
@@ -232,6 +260,9 @@ def _source(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
     if not path.is_dir():
         return (_copies([path], stack)[0] if _needs_copy(path) else path), _recovered([path])
     stored = sorted(each for each in path.iterdir() if each.suffix in ('.mcap', '.db3'))
+    for each in stored:
+        if each.exists():
+            check_regular(each)
     if (path / 'metadata.yaml').exists():
         notes = [*_not_listed(path, stored), *_recovered(stored)]
         if not any(map(_needs_copy, stored)):
@@ -250,6 +281,7 @@ def _source(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
 
 def _not_listed(path: Path, stored: Sequence[Path]) -> list[str]:
     """Return a note about files of the folder that its metadata do not list."""
+    check_regular(path / 'metadata.yaml')
     text = (path / 'metadata.yaml').read_text(encoding='utf-8', errors='replace')
     lost = [each.name for each in stored if each.name not in text]
     if not 0 < len(lost) < len(stored):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from .atomic import write_atomically
+from .regular import check_regular
 from ..errors import InputError
 from ..refine import PlannedPose, PosePlan
 from ..units import STANDARD_GRAVITY
@@ -60,6 +61,7 @@ def read_plan(path: Path) -> tuple[PlannedPose, ...]:
         If the file cannot be read.
 
     """
+    check_regular(path)
     lines = [line for line in path.read_text(encoding='utf-8').splitlines()
              if line.strip() and not line.startswith('#')]
     reader = csv.DictReader(lines)

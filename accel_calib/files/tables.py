@@ -12,6 +12,7 @@ are written as CSV, and read in any dialect (`accel_calib.files.logs`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import csv
 import json
 from pathlib import Path
@@ -56,19 +57,55 @@ def write_table(path: Path, table: Table) -> None:
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    keys = [key for key, column in COLUMNS.items() if key in table and not column.made]
-    names = [name for key in keys for name in COLUMNS[key].names]
-    parts = [_as_text(table[key]) for key in keys]
+    write_blocks(path, (table,))
+
+
+def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
+    """
+    Write poses or samples block by block; the memory needed is that of one block.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    blocks : iterable of Table
+        One or more tables with the same columns, units and sensor.
+
+    Returns
+    -------
+    int
+        Number of rows.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written. An earlier file is then unchanged, as after an error of
+        the iterable.
+
+    """
+    rows = 0
 
     def write(file: TextIO) -> None:
-        for name in _ABOUT:
-            if getattr(table, name):
-                file.write(f'# {name}: {json.dumps(getattr(table, name), ensure_ascii=False)}\n')
+        nonlocal rows
         writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(names)
-        writer.writerows(zip(*(column for part in parts for column in part), strict=True))
+        keys: list[str] = []
+        for block in blocks:
+            if not keys:
+                keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
+                _write_head(file, block)
+                writer.writerow([name for key in keys for name in COLUMNS[key].names])
+            parts = [_as_text(block[key]) for key in keys]
+            writer.writerows(zip(*(column for part in parts for column in part), strict=True))
+            rows += len(block)
 
     write_atomically(path, write)
+    return rows
+
+
+def _write_head(file: TextIO, table: Table) -> None:
+    for name in _ABOUT:
+        if getattr(table, name):
+            file.write(f'# {name}: {json.dumps(getattr(table, name), ensure_ascii=False)}\n')
 
 
 def _as_text(values: NDArray[Any]) -> list[list[str]]:

@@ -25,6 +25,7 @@ from .linear import linearised
 from .plan import plan_poses
 from .records import Refinement, Stage, Step, Verdict
 from .rivals import LEAST, probabilities
+from .sample import sample_words, sampled
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .stored import beside_stored, with_changes, with_stored
@@ -143,6 +144,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     poses_g = with_history(in_g(sound, calibration.units), calibration.model)
     if stored is not None:
         poses_g = beside_stored(poses_g, stored)
+    total, poses_g = len(poses_g), sampled(poses_g)
     model = Model(calibration.model.values)
     try:
         found = search(poses_g, model)
@@ -155,18 +157,20 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
             f'found {counted(len(sound), "pose")} for '
             f'{counted(found.base.linear.onto.shape[1], "parameter")} of the base, expected more '
             'poses to find an effect', 'take 24 poses or more')
-    given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound))
+    note = (sample_words(len(poses_g), total),) if len(poses_g) < total else ()
+    given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
 
 
 @dataclass(frozen=True)
 class _Given:
-    """The input poses, all poses used [g], whether the base is stored, and rejected rows."""
+    """The input poses, those used [g], whether the base is stored, rejected rows, and notes."""
 
     poses: Poses
     poses_g: Poses
     stored: bool
     rejected: tuple[Rejected, ...]
+    notes: tuple[str, ...]
 
     @property
     def joint(self) -> bool:
@@ -384,7 +388,7 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
         base, model=Model(model.values, base.model.rotation),
         covariance=matrix @ final.fit.covariance @ matrix.T,
         quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
-        rejected=rejected, warnings=tuple(warnings), method='ml',
+        rejected=rejected, warnings=(*given.notes, *warnings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
     try:
         return _determined(gated(with_rest_noise(refined, given.poses)), final)

@@ -35,6 +35,7 @@ from .made import (
     Options,
     plain_text,
 )
+from ..regular import check_regular
 from ... import __version__
 from ...calibrate import Calibration
 from ...errors import InputError
@@ -305,6 +306,7 @@ def read_noise(path: Path) -> Noise:
         If the file cannot be read.
 
     """
+    check_regular(path)
     try:
         content = json.loads(path.read_text(encoding='utf-8'))
     except ValueError as err:

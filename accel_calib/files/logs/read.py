@@ -26,6 +26,7 @@ from .records import are_samples, are_untimed_samples, Log, LogOptions, OpenLog
 from .selection import chosen, is_log_header, with_indices
 from .text import Cells, open_text, TextTable
 from ..bag import is_bag, open_samples, together
+from ..regular import check_regular
 from ...calibrate import check_units
 from ...errors import InputError
 from ...table import check_values, COLUMNS, Poses, present, Recording
@@ -77,6 +78,8 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
         If the file cannot be read.
 
     """
+    if not path.is_dir():
+        check_regular(path)
     if is_bag(path):
         with open_samples(path, options.topic, options.sensor,
                           temperature_topic=options.temperature_topic,
@@ -226,6 +229,7 @@ def open_own(path: Path, needed: Sequence[str]) -> Iterator[OwnTable]:
         If the file cannot be read.
 
     """
+    check_regular(path)
     expected = ','.join(name for key in needed for name in COLUMNS[key].names)
     with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
                    expected=expected) as text:
