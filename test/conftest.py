@@ -239,6 +239,7 @@ def defects_are_failures(monkeypatch: pytest.MonkeyPatch) -> None:
         raise error
 
     monkeypatch.setattr('accel_calib.cli.main.crash_words', fail)
+    monkeypatch.setattr('accel_calib.session.store.crash_words', fail)
 
 
 @pytest.fixture

@@ -646,7 +646,7 @@ def test_the_name_of_the_function_comes_from_the_file_or_the_option(stored, tmp_
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    (['--to', 'c', '-o', 'calibration.yaml'], 'is the calibration itself'),
+    (['--to', 'c', '-o', 'calibration.yaml'], 'is an input'),
     (['--to', 'c', '-o', 'none/imu.h'], 'is not a folder'),
     (['--to', 'json', '-o', '-', '--json', '-'], 'are both -'),
     (['--to', 'kalibr'], '--noise is not given'),

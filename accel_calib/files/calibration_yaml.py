@@ -5,9 +5,10 @@
 Stored calibrations: readable, versioned YAML.
 
 `format_calibration` and `parse_calibration` convert text. Only `write_calibration` and
-`read_calibration` access the disk. The reader checks every value, and the calibration then passes
-the same gate as a fit (`accel_calib.calibrate.gate`). The last line of a file is a checksum of the
-text before it; it reveals a file that was edited by hand.
+`read_calibration` access the disk. The reader bounds size and nesting (`.plain_yaml`) and checks
+every value, and the calibration then passes the same gate as a fit (`accel_calib.calibrate.gate`).
+The last line of a file is a checksum of the text before it; it reveals a file that was edited by
+hand.
 
 """
 
@@ -20,9 +21,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 import yaml
 
 from .atomic import write_atomically
+from .plain_yaml import (
+    array_at,
+    choice_at,
+    list_at,
+    mapping_at,
+    MOST_BYTES,
+    MOST_VALUES,
+    number_at,
+    read_plain,
+    shown,
+    text_at,
+    whole_at,
+)
+from .regular import check_regular
 from .. import __version__
 from ..calibrate import (
     Calibration,
@@ -39,17 +55,22 @@ from ..calibrate import (
 )
 from ..calibrate.mounting import mounting_figures
 from ..effects import CHANGES, Effect, effect_named, is_effect, PROCESSES
-from ..errors import DamagedCalibrationError, RefusedFitError, StoredCalibrationError
+from ..errors import (
+    AccelCalibError,
+    DamagedCalibrationError,
+    InputError,
+    RefusedFitError,
+    StoredCalibrationError,
+)
 from ..estimate.fit import judge
 from ..model import Model
-from ..table import COLUMNS, Floats, Poses
+from ..table import check_values, COLUMNS, Floats, Poses
 from ..units import UNIT_NAMES, Units
 
 try:  # eight times as fast, but not in every build of PyYAML
     from yaml import CSafeDumper as SafeDumper
-    from yaml import CSafeLoader as SafeLoader
 except ImportError:
-    from yaml import SafeDumper, SafeLoader  # type: ignore[assignment]
+    from yaml import SafeDumper  # type: ignore[assignment]
 
 FORMAT = 'accel_calib calibration'
 _FIRST_LINE = f'format: {FORMAT}'
@@ -67,6 +88,30 @@ _SAME = 1e-9
 
 _CHECKSUM = '\nchecksum: sha256 '
 _NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
+
+_OTHERS = 10_000
+"""More values than a calibration has beside its poses."""
+
+_LARGEST = 1e30
+"""Largest magnitude of the values of effects and of their covariance; far beyond all sensors."""
+
+_LONGEST_NAME = 4096
+"""Longest name of an effect, a sensor or a topic, which messages repeat."""
+
+_ABOUT_EFFECT = ('what', 'unit')
+_KEYS: Mapping[str, tuple[str, ...]] = {
+    '': ('format', 'version', 'package_version', 'equation', 'sensor', 'stream', 'date', 'units',
+         'model', 'method', 'reason', 'effects', 'frame', 'rotation', 'mounting', 'correction',
+         'covariance', 'quality', 'gyro_bias', 'noise', 'rejected', 'warnings', 'poses',
+         'checksum'),
+    'units': ('readings', 'per_g'),
+    'quality': tuple(each.name for each in fields(Quality)),
+    'gyro_bias': ('unit', *(each.name for each in fields(GyroBias))),
+    'noise': ('what', *(each.name for each in fields(SampleNoise))),
+    'correction': ('equation', 'matrix', 'offset'),
+    'poses': ('row', *(key for key, column in COLUMNS.items() if not column.made)),
+}
+"""Keys of a file, and of the mappings in it."""
 
 
 def format_calibration(calibration: Calibration) -> str:
@@ -159,32 +204,48 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
     """
     if not text.startswith(_FIRST_LINE):
-        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
-                                     f'first line "{_FIRST_LINE}"', 'use a file that fit wrote')
+        raise _other_file(name)
     try:
-        content = yaml.load(text, Loader=SafeLoader)
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as err:
-        raise _damaged(name, 'it is not YAML') from err
+        content = read_plain(text)
+    except ValueError as err:
+        raise _damaged(name, str(err)) from err
     _check_version(content, name)
-    try:
-        calibration = _calibration(content)
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
-        what = f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err)
-        raise _damaged(name, what) from err
-    try:
-        calibration = gated(calibration)
-    except RefusedFitError as err:
-        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
-                                      err.advice) from err
-    if content['version'] == 1:
-        return calibration
+    calibration = _checked(content, name)
     body, found, digest = text.rpartition(_CHECKSUM)
+    if not found and content['version'] == 1:
+        return calibration
     if not found:
         raise _damaged(name, 'its last line, the checksum, is missing')
     if digest.strip() == _digest(body.rstrip()):
         return calibration
     other = _other_correction(content, calibration, name)
+    _check_keys(content, name)
     return replace(calibration, warnings=(*calibration.warnings, EDITED, *other))
+
+
+def _checked(content: Mapping[str, Any], name: str) -> Calibration:
+    """Return the calibration with the content of a file, after all checks."""
+    try:
+        with np.errstate(all='ignore'):  # the checks refuse what is not finite
+            return gated(_calibration(content))
+    except RefusedFitError as err:
+        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
+                                      err.advice) from err
+    except AccelCalibError as err:
+        raise _damaged(name, err.message) from err
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
+        what = f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err)
+        raise _damaged(name, what) from err
+
+
+def _check_keys(content: Mapping[str, Any], name: str) -> None:
+    """Refuse unknown keys in a file that was changed: a damaged key would be passed over."""
+    for place, known in _KEYS.items():
+        found = content.get(place) if place else content
+        for key in found if isinstance(found, Mapping) else ():
+            if key not in known:
+                raise _damaged(name, f'the key {shown(key)} {f"of {place} " if place else ""}is '
+                                     f'not known, expected one of {", ".join(known)}')
 
 
 def _other_correction(content: Mapping[str, Any], calibration: Calibration, name: str
@@ -193,9 +254,9 @@ def _other_correction(content: Mapping[str, Any], calibration: Calibration, name
     if content.get('correction') is None:
         return ()
     try:
-        stated = _mapping(content, 'correction')
-        pairs = ((_array(stated, 'offset', (3,)), calibration.offset, calibration.units.per_g),
-                 (_array(stated, 'matrix', (3, 3)), calibration.matrix,
+        stated = mapping_at(content, 'correction')
+        pairs = ((array_at(stated, 'offset', (3,)), calibration.offset, calibration.units.per_g),
+                 (array_at(stated, 'matrix', (3, 3)), calibration.matrix,
                   float(np.max(np.abs(calibration.matrix)))))
     except (KeyError, TypeError, ValueError) as err:
         raise _damaged(name, f'correction: {err}') from err
@@ -215,7 +276,7 @@ def _check_version(content: Any, name: str) -> None:
         raise _damaged(name, 'it is not a YAML mapping')
     version = content.get('version')
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise _damaged(name, f'its version is {version!r}')
+        raise _damaged(name, f'its version is {shown(version)}')
     if version > VERSION:
         raise StoredCalibrationError(f'{name} has version {version}, expected {VERSION} or less',
                                      'update accel_calib, or fit again')
@@ -223,23 +284,28 @@ def _check_version(content: Any, name: str) -> None:
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Return the record with the content of a file; raise ValueError for an unexpected value."""
-    values = {str(name): _values(effect_named(name), effect)
+    values = {name: _values(effect_named(name), effect)
               for name, effect in _known_effects(content).items()}
-    model = Model(values, _array(content, 'rotation', (3, 3)))
+    model = Model(values, array_at(content, 'rotation', (3, 3)))
     size = int(np.sum(model.stated))
-    units = _mapping(content, 'units')
-    rejected = [Rejected(_whole(each, 'row'), _text(each, 'reason'))
-                for each in _list(content, 'rejected')]
+    units = mapping_at(content, 'units')
+    rejected = [mapping_at({'rejected': each}, 'rejected')
+                for each in list_at(content, 'rejected')]
     calibration = Calibration(
-        name=_one_of(content, 'model', _NAMES), method=_one_of(content, 'method', STORED_METHODS),
-        model=model,
-        units=Units(_one_of(units, 'readings', UNIT_NAMES), _number(units, 'per_g')),
-        sensor=_text(content, 'sensor'), stream=str(content.get('stream', '')),
-        frame=_one_of(content, 'frame', FRAMES), date=_text(content, 'date'),
-        covariance=_array(content, 'covariance', (size, size), finite=False),
-        quality=_quality(_mapping(content, 'quality')), poses=_poses(_mapping(content, 'poses')),
-        rejected=tuple(rejected), reason=_text(content, 'reason'),
-        warnings=tuple(_text({'warning': line}, 'warning') for line in _list(content, 'warnings')),
+        name=choice_at(content, 'model', _NAMES),
+        method=choice_at(content, 'method', STORED_METHODS), model=model,
+        units=Units(choice_at(units, 'readings', UNIT_NAMES), number_at(units, 'per_g')),
+        sensor=text_at(content, 'sensor', _LONGEST_NAME),
+        stream=text_at({'stream': '', **content}, 'stream', _LONGEST_NAME),
+        frame=choice_at(content, 'frame', FRAMES), date=text_at(content, 'date', _LONGEST_NAME),
+        covariance=array_at(content, 'covariance', (size, size), finite=False, most=_LARGEST),
+        quality=_quality(mapping_at(content, 'quality')),
+        poses=_poses(mapping_at(content, 'poses')),
+        rejected=tuple(Rejected(whole_at(each, 'row'), text_at(each, 'reason'))
+                       for each in rejected),
+        reason=text_at(content, 'reason'),
+        warnings=tuple(text_at({'warning': line}, 'warning')
+                       for line in list_at(content, 'warnings')),
         gyro=_gyro_bias(content), noise=_sample_noise(content))
     return _from_version_1(calibration) if content['version'] == 1 else calibration
 
@@ -247,7 +313,11 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
 def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
     """Return the values of an effect; shape constants that are not stated are the usual ones."""
     known = {**dict(zip(effect.shape, effect.usual)), **stated}
-    return np.array([_number(known, part) for part in effect.values])
+    for key in stated:
+        if key not in effect.values and key not in _ABOUT_EFFECT:
+            raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
+                             f'{", ".join(effect.values)}')
+    return np.array([number_at(known, part, _LARGEST) for part in effect.values])
 
 
 def _from_version_1(calibration: Calibration) -> Calibration:
@@ -259,12 +329,13 @@ def _from_version_1(calibration: Calibration) -> Calibration:
 
 
 def _known_effects(content: Mapping[str, Any]) -> Mapping[str, Any]:
-    effects = _mapping(content, 'effects')
+    effects = mapping_at(content, 'effects')
     for name, effect in effects.items():
-        if not is_effect(str(name)) or name in CHANGES or name in PROCESSES:
-            raise ValueError(f'effect {name!r} is not in the catalogue')
+        if (len(name) > _LONGEST_NAME or not is_effect(name) or name in CHANGES
+                or name in PROCESSES):
+            raise ValueError(f'effect {shown(name)} is not in the catalogue')
         if not isinstance(effect, Mapping):
-            raise ValueError(f'effect {name} is {_short(effect)}, expected names with values')
+            raise ValueError(f'effect {name} is {shown(effect)}, expected names with values')
     return effects
 
 
@@ -272,7 +343,7 @@ def _quality(content: Mapping[str, Any]) -> Quality:
     optional = ('held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof')
     figures: dict[str, Any] = {
         each.name: None if each.name in optional and content[each.name] is None
-        else _number(content, each.name) for each in fields(Quality)}
+        else number_at(content, each.name) for each in fields(Quality)}
     return Quality(**figures)
 
 
@@ -280,87 +351,46 @@ def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
     """Return the gyro bias; None for files without it, such as those of earlier releases."""
     if content.get('gyro_bias') is None:
         return None
-    known = _mapping(content, 'gyro_bias')
-    bias, sd, slope = (_array(known, key, (3,)) for key in ('bias', 'sd', 'slope'))
-    temperature = np.nan if known['temperature'] is None else _number(known, 'temperature')
-    limits = tuple(_number({'temperatures': each}, 'temperatures')
-                   for each in _list(known, 'temperatures'))
-    return GyroBias(bias, sd, _whole(known, 'rests'), float(temperature), slope, limits)
+    known = mapping_at(content, 'gyro_bias')
+    bias, sd, slope = (array_at(known, key, (3,)) for key in ('bias', 'sd', 'slope'))
+    temperature = np.nan if known['temperature'] is None else number_at(known, 'temperature')
+    limits = tuple(number_at({'temperatures': each}, 'temperatures')
+                   for each in list_at(known, 'temperatures'))
+    return GyroBias(bias, sd, whole_at(known, 'rests'), float(temperature), slope, limits)
 
 
 def _sample_noise(content: Mapping[str, Any]) -> SampleNoise | None:
     """Return the noise of a sample; None for files without it."""
     if content.get('noise') is None:
         return None
-    known = _mapping(content, 'noise')
-    return SampleNoise(*(_array(known, key, (3,), finite=False) for key in ('force', 'rate')))
+    known = mapping_at(content, 'noise')
+    return SampleNoise(*(array_at(known, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
 def _poses(content: Mapping[str, Any]) -> Poses:
-    rows = np.array([_whole({'row': row}, 'row') for row in _list(content, 'row')], np.int64)
+    rows = np.array([whole_at({'row': row}, 'row') for row in list_at(content, 'row')], np.int64)
     columns: dict[str, Any] = {}
     for key, column in COLUMNS.items():
         if key in content and not column.made:
             width = len(column.names)
             shape = (len(rows),) if width == 1 else (len(rows), width)
-            columns[key] = (np.array([str(each) for each in _list(content, key)], dtype=str)
-                            if key == 'label' else _array(content, key, shape))
+            columns[key] = (_labels(content) if key == 'label'
+                            else array_at(content, key, shape))
+    check_values(columns, 'poses')
     return Poses(columns, rows)
 
 
-def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    if not isinstance(content[key], Mapping):
-        raise ValueError(f'{key} is {_short(content[key])}, expected names with values')
-    return content[key]
-
-
-def _list(content: Mapping[str, Any], key: str) -> list[Any]:
-    if not isinstance(content[key], list):
-        raise ValueError(f'{key} is {_short(content[key])}, expected a list')
-    return content[key]
-
-
-def _text(content: Mapping[str, Any], key: str) -> str:
-    if not isinstance(content[key], str):
-        raise ValueError(f'{key} is {_short(content[key])}, expected text')
-    return content[key]
-
-
-def _one_of(content: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> Any:
-    if content[key] not in choices:
-        raise ValueError(f'{key} is {_short(content[key])}, expected one of {", ".join(choices)}')
-    return content[key]
-
-
-def _number(content: Mapping[str, Any], key: str) -> float:
-    value = content[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ValueError(f'{key} is {_short(value)}, expected a finite number')
-    return float(value)
-
-
-def _whole(content: Mapping[str, Any], key: str) -> int:
-    value = content[key]
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f'{key} is {_short(value)}, expected a whole number')
-    return value
-
-
-def _array(content: Mapping[str, Any], key: str, shape: tuple[int, ...], *, finite: bool = True
-           ) -> Floats:
-    """Return nested lists of numbers as an array of this shape."""
-    values = _list(content, key)
-    array = np.array(values, float).reshape(shape) if not values else np.array(values, float)
-    if array.shape != shape:
-        raise ValueError(f'{key} has shape {array.shape}, expected {shape}')
-    if finite and not np.all(np.isfinite(array)):
-        raise ValueError(f'{key} contains a number that is not finite')
-    return array
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) < 60 else f'{text[:60]}…'
+def _labels(content: Mapping[str, Any]) -> NDArray[Any]:
+    """Return the labels; all take as much memory as the longest one."""
+    labels = list_at(content, 'label')
+    for label in labels:
+        if isinstance(label, list | Mapping):
+            raise ValueError(f'label contains {shown(label)}, expected text')
+    texts = [str(label) for label in labels]
+    if len(texts) * max(map(len, texts), default=0) > MOST_BYTES:
+        raise ValueError(f'the longest label has {max(map(len, texts))} characters, expected '
+                         f'{MOST_BYTES // len(texts)} or less')
+    return np.array(texts, dtype=str)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -369,18 +399,34 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises
     ------
+    InputError
+        If the path is a folder, a pipe, a socket or a device.
     StoredCalibrationError
         If the file is damaged, is newer than this package, or has implausible values.
     OSError
         If the file cannot be read.
 
     """
+    check_regular(path)
+    with path.open('rb') as file:
+        data = file.read(MOST_BYTES + 1)
+    if not data.strip(b'\0 \t\r\n'):
+        raise _damaged(str(path), 'it is empty')
+    if not data.startswith(_FIRST_LINE.encode()):
+        raise _other_file(str(path))
+    if len(data) > MOST_BYTES:
+        raise _damaged(str(path), f'it has more than {MOST_BYTES} bytes')
     try:
-        text = path.read_text(encoding='utf-8')
+        text = data.decode()
     except UnicodeDecodeError as err:
-        raise StoredCalibrationError(f'{path} is not a text file, expected a calibration (YAML)',
-                                     'use a file that fit wrote') from err
-    return parse_calibration(text, str(path))
+        line = 1 + data.count(b'\n', 0, err.start)
+        raise _damaged(str(path), f'line {line} is not text in UTF-8') from err
+    return parse_calibration(text.replace('\r\n', '\n').replace('\r', '\n'), str(path))
+
+
+def _other_file(name: str) -> StoredCalibrationError:
+    return StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
+                                  f'first line "{_FIRST_LINE}"', 'use a file that fit wrote')
 
 
 def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
@@ -391,9 +437,21 @@ def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool
     ------
     RefusedFitError
         If the calibration is not plausible.
+    InputError
+        If it has more poses than a file can hold.
     OSError
         If the file cannot be written. The stored file is then unchanged.
 
     """
     text = format_calibration(gated(calibration))
+    if len(text.encode()) > MOST_BYTES or _values_in(calibration) > MOST_VALUES:
+        raise InputError(f'the calibration has {len(calibration.poses)} poses, which is more than '
+                         'its file can hold', 'fit fewer poses')
     write_atomically(path, lambda file: file.write(text), keep_before=keep_before)
+
+
+def _values_in(calibration: Calibration) -> int:
+    """Return an upper limit of the number of values and keys in the file of a calibration."""
+    poses = calibration.poses
+    cells = sum(1 + len(column.names) for key, column in COLUMNS.items() if key in poses)
+    return _OTHERS + (1 + cells) * len(poses) + 5 * len(calibration.rejected)

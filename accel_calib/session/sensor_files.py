@@ -10,12 +10,17 @@ A lock on the files is held until it is released or the process ends.
 
 from __future__ import annotations
 
+from contextlib import suppress
 import fcntl
 import os
+import stat
 
 from .settings import CalibratorSettings
 from .store import Identity, Store, store_of
 from ..errors import AccelCalibError, InputError
+
+_TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+"""A link is not followed, because the lock would empty its target; a pipe does not block."""
 
 
 class StoreInUseError(AccelCalibError):
@@ -43,9 +48,12 @@ class Lock:
         path = store.calibration.with_name(f'{store.calibration.stem}.lock')
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self._handle = os.open(path, _TO_LOCK, 0o644)
         except OSError:
             return  # the folder cannot be written, so there is nothing to protect
+        if not stat.S_ISREG(os.fstat(self._handle).st_mode):
+            self.release()
+            return
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -55,8 +63,12 @@ class Lock:
                 f'{store.calibration} is used by the node with process id {holder or "unknown"}',
                 'stop that node, or restart this node with another calibration_file or sensor'
             ) from None
-        os.ftruncate(self._handle, 0)
-        os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
+        except OSError:
+            self.release()  # this file system has no locks
+            return
+        with suppress(OSError):  # without space on the disk, the lock does not name its holder
+            os.ftruncate(self._handle, 0)
+            os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
 
     def release(self) -> None:
         """Release the lock."""

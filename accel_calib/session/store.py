@@ -6,7 +6,9 @@ The files of a sensor: calibration and poses.
 
 A sensor is identified by its topic (with namespace) and the frame_id of its messages, or by a name
 that the user sets. Each sensor has its own files. Stored data are never lost: files that cannot be
-used, or that belong to another sensor, are renamed and never overwritten.
+used, or that belong to another sensor, are renamed and never overwritten. So are folders with such
+a name, pipes, sockets and links to nothing. Devices, and folders without a suffix in their name,
+are left where they are: the node then works without storing.
 
 """
 
@@ -20,8 +22,12 @@ import itertools
 import os
 from pathlib import Path
 import re
+import stat
+
+import numpy as np
 
 from ..calibrate import Calibration, check_sensor
+from ..crash import crash_words
 from ..errors import AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError
 from ..files import (
     copy_atomically,
@@ -31,6 +37,7 @@ from ..files import (
     write_calibration,
     write_table,
 )
+from ..files.regular import check_regular
 from ..table import Poses
 from ..units import UnitName
 
@@ -39,9 +46,22 @@ _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
 _UNSAFE_OF_VERSION_1 = re.compile(r'[^A-Za-z0-9._-]+')
 _NAMELESS = 'imu'
 _LONGEST = 120
+_NUMBER = re.compile('[1-9][0-9]{0,17}')
 
 MOST_STEPS = 100
 """Number of earlier calibrations that are kept for ~/undo; older ones are removed."""
+
+_OTHER_PLACE = (errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP)
+"""Errors of a path that no file can have."""
+
+_UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENOENT, errno.ELOOP)
+"""Errors of a file that later attempts cannot read either; it is renamed before writing."""
+
+_LARGEST = 1e30
+"""Largest magnitude of a number of the pose table; larger ones overflow in the fit."""
+
+_LARGEST_TABLE = 32 * 2**20
+"""Largest pose table of a store: 100,000 poses have half of it [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +140,13 @@ class Store:
         StoredCalibrationError
             If it is damaged, newer than this package, or for another sensor, or if its unit
             cannot be converted.
+        InputError
+            If it is not a regular file.
         OSError
             If the file cannot be read.
 
         """
-        return self._read(self.calibration) if self.calibration.exists() else None
+        return self._read(self.calibration) if _exists(self.calibration) else None
 
     def _read(self, path: Path) -> Calibration:
         """Read a calibration for this sensor, and convert it to the unit of the readings."""
@@ -145,16 +167,22 @@ class Store:
         Raises
         ------
         InputError
-            If the table is damaged.
+            If the table is damaged, too large, or not a regular file.
         StoredCalibrationError
             If the table is for another sensor or unit.
         OSError
             If the file cannot be read.
 
         """
-        if not self.poses.exists():
+        if not _exists(self.poses):
             return None
+        check_regular(self.poses)
+        size = self.poses.stat().st_size
+        if size > _LARGEST_TABLE:
+            raise InputError(f'{self.poses} has {size} bytes, expected at most {_LARGEST_TABLE}',
+                             'new poses start a new table')
         poses = read_poses(self.poses)
+        _check_sizes(poses, self.poses)
         for what, found, expected in (('sensor', poses.sensor, self.identity.sensor),
                                       ('units', poses.units, self.units)):
             if found and found != expected and expected:
@@ -182,14 +210,17 @@ class Store:
             The step.
 
         """
-        if self.calibration.exists():
-            try:
-                self.load_calibration()
-            except AccelCalibError:
-                aside(self.calibration, 'other')
+        try:
+            self.load_calibration()
+        except AccelCalibError:
+            aside(self.calibration, 'other')
+        except OSError as error:
+            if error.errno not in _UNREADABLE:
+                raise
+            aside(self.calibration, 'other')
         steps = self.steps()
-        step = self._step(1 + max(steps, default=0))
-        if self.calibration.exists():
+        step = self._step(1 + max(self._numbers(), default=0))
+        if _exists(self.calibration):
             copy_atomically(self.calibration, step)
         else:
             step.touch()
@@ -199,9 +230,13 @@ class Store:
 
     def steps(self) -> list[int]:
         """Return the numbers of the kept steps, oldest first."""
+        return [number for number in self._numbers() if self._step(number).is_file()]
+
+    def _numbers(self) -> list[int]:
+        """Return the numbers that are in use, also by what is not a file, in order."""
         names = self.calibration.parent.glob(f'{glob.escape(self.calibration.name)}.before*')
         numbers = (path.name.removeprefix(f'{self.calibration.name}.before') for path in names)
-        return sorted(int(number) for number in numbers if number.isdecimal())
+        return sorted(int(number) for number in numbers if _NUMBER.fullmatch(number))
 
     def _step(self, number: int) -> Path:
         return self.calibration.with_name(f'{self.calibration.name}.before{number}')
@@ -223,8 +258,13 @@ class Store:
 
         """
         step = self._last_step()
-        before = self._read(step) if step.stat().st_size else None
-        if self.calibration.exists():
+        try:
+            before = self._read(step) if step.stat().st_size else None
+        except DamagedCalibrationError as error:
+            raise StoredCalibrationError(f'{error.message}; it is kept as '
+                                         f'{aside(step, "damaged")}', 'try again for the '
+                                         'calibration before it') from error
+        if _exists(self.calibration):
             copy_atomically(self.calibration, free_name(self.calibration, 'undone'))
         if before is not None:
             step.replace(self.calibration)
@@ -235,7 +275,10 @@ class Store:
 
     def _last_step(self) -> Path:
         """Return the last step that differs from the file; equal ones come from failed writes."""
-        now = self.calibration.read_bytes() if self.calibration.exists() else b''
+        now = b''
+        if _exists(self.calibration):
+            check_regular(self.calibration)
+            now = self.calibration.read_bytes()
         for step in map(self._step, reversed(self.steps())):
             if step.read_bytes() != now:
                 return step
@@ -252,16 +295,17 @@ class Store:
 
     def set_aside(self) -> list[Path]:
         """Rename both files, and return the new paths; raise OSError if it fails."""
-        if self.calibration.exists():
+        if _exists(self.calibration):
             self._keep_step()
-        return [aside(path, 'reset') for path in (self.calibration, self.poses) if path.exists()]
+        return [aside(path, 'reset') for path in (self.calibration, self.poses) if _exists(path)]
 
     def is_writable(self) -> bool:
         """Return whether the files can be written, or their folder created."""
         folder = self.calibration.parent
-        while not folder.exists():
+        while not os.path.lexists(folder):
             folder = folder.parent
-        return os.access(folder, os.W_OK)
+        rights = os.W_OK | os.X_OK
+        return folder.is_dir() and os.access(folder, rights, effective_ids=True)
 
 
 @dataclass(frozen=True)
@@ -287,25 +331,68 @@ class Loaded:
 
 
 def load(store: Store) -> Loaded:
-    """Read a store; damaged files are renamed."""
-    notes = take_over(store)
-    for path in (store.calibration, store.poses):
-        remove_leftovers(path)
+    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
+    notes = _tidied(store)
     calibration, poses, problem = None, None, ''
     try:
         calibration = store.load_calibration()
-    except (AccelCalibError, OSError) as error:
-        problem = str(error)
-        if isinstance(error, DamagedCalibrationError):
-            problem = f'{problem}; {_renamed(store.calibration)}'
+    except Exception as error:  # the node starts in any case
+        problem = f'{_words(error)}; {_after(store.calibration, error)}'
     if calibration is not None and calibration.stream not in ('', store.identity.topic):
         notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
                      f'{store.identity.topic}')
     try:
         poses = store.load_poses()
-    except (AccelCalibError, OSError) as error:
-        notes.append(f'{error}; {_renamed(store.poses)}')
+    except Exception as error:
+        notes.append(f'{_words(error)}; {_renamed(store.poses)}')
     return Loaded(calibration, poses, problem, tuple(notes))
+
+
+def _tidied(store: Store) -> list[str]:
+    """Take over files of version 0.1, and remove leftovers; return log lines about it."""
+    notes = []
+    try:
+        notes = take_over(store)
+        for path in (store.calibration, store.poses):
+            remove_leftovers(path)
+    except OSError as error:
+        notes.append(f'the folder {store.calibration.parent} could not be tidied: {error}; '
+                     f'{writing_advice(error)}')
+    return notes
+
+
+def _after(path: Path, error: Exception) -> str:
+    """Return what happens to a calibration that cannot be used; a damaged one is renamed."""
+    sound = isinstance(error, OSError | StoredCalibrationError)
+    if sound and not isinstance(error, DamagedCalibrationError):
+        return 'it is renamed when the next calibration is stored'
+    return _renamed(path)
+
+
+def _words(error: Exception) -> str:
+    """Return one line about an error, also about one that nobody expected."""
+    return str(error) if isinstance(error, AccelCalibError | OSError) else crash_words(error)
+
+
+def _exists(path: Path) -> bool:
+    """Return whether something has this path, also a link to nothing; OSError if not known."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def _check_sizes(poses: Poses, path: Path) -> None:
+    """Refuse numbers that no sensor has, and that overflow when they are squared."""
+    for key, values in poses.columns.items():
+        if key == 'label':
+            continue
+        size = np.abs(values).reshape(len(poses), -1)
+        bad = np.any((size > _LARGEST) | ((key == 'count') & (size < 1.0 / _LARGEST)), axis=1)
+        if np.any(bad):
+            raise InputError(f'{path}: row {int(np.argmax(bad)) + 1} has an impossible {key}, '
+                             f'expected less than {_LARGEST:g}', 'new poses start a new table')
 
 
 def _renamed(path: Path) -> str:
@@ -329,9 +416,19 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
     units : {'m/s2', 'g', 'native'}
         Unit of the readings.
 
+    Raises
+    ------
+    InputError
+        If the home folder is not known.
+
     """
     if calibration_file:
-        return Store(Path(calibration_file).expanduser().absolute(), identity, units)
+        try:
+            path = Path(calibration_file).expanduser()
+        except RuntimeError as error:
+            raise InputError(f'calibration_file is {calibration_file}, but this user has no home '
+                             'folder', 'state the whole path') from error
+        return Store(path.absolute(), identity, units)
     return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units)
 
 
@@ -348,7 +445,7 @@ def take_over(store: Store) -> list[str]:
     former = replace(store, calibration=store.calibration.with_name(f'{name}.yaml'))
     own = ros_home() / 'accel_calib' / store.identity.file_name
     if (store.calibration != own or former.calibration == store.calibration
-            or store.calibration.exists() or store.poses.exists()):
+            or _exists(store.calibration) or _exists(store.poses)):
         return []
     try:
         found = former.load_calibration()
@@ -364,7 +461,19 @@ def take_over(store: Store) -> list[str]:
 
 
 def aside(path: Path, word: str) -> Path:
-    """Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path."""
+    """
+    Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path.
+
+    Raises
+    ------
+    OSError
+        If it cannot be renamed, or is a device, or a folder that does not have the name of a file.
+
+    """
+    mode = path.lstat().st_mode
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or (stat.S_ISDIR(mode) and not path.suffix):
+        kind = 'folder' if stat.S_ISDIR(mode) else 'device'
+        raise OSError(errno.EEXIST, f'there is a {kind} in place of the file', str(path))
     free = free_name(path, word)
     path.replace(free)
     return free
@@ -373,13 +482,15 @@ def aside(path: Path, word: str) -> Path:
 def free_name(path: Path, word: str) -> Path:
     """Return ``<name>.<word><k>`` with the first free k."""
     names = (path.with_name(f'{path.name}.{word}{k}') for k in itertools.count(1))
-    return next(name for name in names if not name.exists())
+    return next(name for name in names if not _exists(name))
 
 
 def writing_advice(error: OSError) -> str:
     """Return what to do about a file that cannot be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return 'free space on the disk'
+    if error.errno in _OTHER_PLACE:
+        return 'restart the node with another calibration_file'
     if error.errno == errno.EROFS:
         return 'mount the file system for writing, or restart the node with calibration_file'
     return 'correct the permissions, or restart the node with another calibration_file'

@@ -1,0 +1,452 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whatever is in place of the stored files, the calibrator starts, says so, and works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import errno
+import os
+from pathlib import Path
+import resource
+import shutil
+import signal
+import stat
+import tempfile
+from typing import Any
+
+from accel_calib.calibrate import fit_poses
+from accel_calib.crash import crash_words
+from accel_calib.errors import InputError, StoredCalibrationError
+from accel_calib.files import read_calibration, read_poses, write_calibration
+from accel_calib.files.plain_yaml import MOST_BYTES
+from accel_calib.session.sensor_files import Lock
+from accel_calib.session.store import aside, Identity, load, Store, store_of, writing_advice
+from accel_calib.simulate import model_with, simulate_poses
+from accel_calib.sphere import spread_directions
+from accel_calib.units import units_of
+import numpy as np
+import pytest
+from test_session import Driver
+
+SECONDS = 30
+NOBODY = 65534
+FORMAT = b'format: accel_calib calibration\n'
+EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]),
+           'axis_gain': np.array([0.012, -0.015, 0.008])}
+IDENTITY = Identity('imu_link', '/imu/data_raw')
+
+Readings = Callable[..., Any]
+
+
+@pytest.fixture(autouse=True)
+def in_time() -> Iterator[None]:
+    """End a test that hangs, such as one that reads a pipe."""
+    def end(*_: object) -> None:
+        raise AssertionError(f'not ready within {SECONDS} s')
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(SECONDS)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    return tmp_path / 'home' / 'accel_calib'
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """Yield a folder of a user who cannot read everything, unlike root."""
+    made = Path(tempfile.mkdtemp())
+    as_root = os.geteuid() == 0
+    if as_root:
+        os.chown(made, NOBODY, NOBODY)
+        os.seteuid(NOBODY)
+    yield made
+    if as_root:
+        os.seteuid(0)
+    made.chmod(0o700)
+    shutil.rmtree(made)
+
+
+@pytest.fixture(autouse=True)
+def expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise the errors that nobody expected, instead of a line about them."""
+    def fail(error: BaseException) -> str:
+        raise AssertionError('the last resort was reached') from error
+
+    monkeypatch.setattr('accel_calib.session.store.crash_words', fail)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:len(path.read_bytes()) // 2])
+
+
+def spoil_a_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] = 0xff
+    path.write_bytes(bytes(data))
+
+
+def append(text: bytes) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(path.read_bytes() + text)
+
+
+def replace_by(make: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Return a function that removes a file and makes something else in its place."""
+    def replaced(path: Path) -> None:
+        path.unlink()
+        make(path)
+
+    return replaced
+
+
+def fill_folder(path: Path) -> None:
+    path.mkdir()
+    (path / 'mine').write_text('kept')
+
+
+def lengthen(path: Path) -> None:
+    with path.open('r+b') as file:
+        file.truncate(MOST_BYTES + 1)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    'empty': lambda path: path.write_bytes(b''),
+    'zeros': lambda path: path.write_bytes(bytes(4096)),
+    'cut': cut,
+    'byte': spoil_a_byte,
+    'too_long': lengthen,
+    'folder': replace_by(Path.mkdir),
+    'full_folder': replace_by(fill_folder),
+    'pipe': replace_by(os.mkfifo),
+    'socket': replace_by(lambda path: os.mknod(path, stat.S_IFSOCK | 0o600)),
+    'link_to_nothing': replace_by(lambda path: path.symlink_to('nothing')),
+    'link_to_itself': replace_by(lambda path: path.symlink_to(path.name)),
+    'link_to_folder': replace_by(lambda path: path.symlink_to('.')),
+    'link_to_device': replace_by(lambda path: path.symlink_to('/dev/null')),
+}
+OF_CALIBRATION: dict[str, Callable[[Path], object]] = {
+    **DAMAGE,
+    'nested': append(b'x: ' + b'[' * 100_000 + b'\n'),
+    'aliases': append(b''.join(b'x%d: &x%d [%s]\n' % (k, k, b'1' if not k else b', '.join(
+        [b'*x%d' % (k - 1)] * 9)) for k in range(9))),
+    'other_text': lambda path: path.write_bytes(b'alias ll="ls -l"\n'),
+    'newer': lambda path: path.write_bytes(FORMAT + b'version: 99\n'),
+}
+OF_POSES: dict[str, Callable[[Path], object]] = {
+    **{name: make for name, make in DAMAGE.items() if name not in ('cut', 'byte')},
+    'header_alone': lambda path: path.write_text('ax,ay,az\n'),
+    'words': lambda path: path.write_text('ax,ay,az\n1,2,words\n'),
+    'short_row': lambda path: path.write_text('ax,ay,az\n0.1,0.2,9.8\n1,2\n'),
+    'not_finite': lambda path: path.write_text('ax,ay,az\n1,2,nan\n'),
+    'binary': lambda path: path.write_bytes(np.random.default_rng(1).bytes(4096)),
+}
+
+
+@pytest.fixture(scope='module')
+def files() -> dict[str, bytes]:
+    """Return the files of a store with a calibration and 12 poses, by name."""
+    model, units, rng = model_with(EFFECTS), units_of('m/s2'), np.random.default_rng(3)
+    poses = simulate_poses(model, spread_directions(12), rng, noise_g=0.0005)
+    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(Path(folder) / 'known.yaml', IDENTITY, 'm/s2')
+        store.save_poses(poses)
+        write_calibration(store.calibration, fit_poses(poses, units, sensor='imu_link',
+                                                       date='2026-01-01T00:00:00+00:00'))
+        return {path.name: path.read_bytes() for path in (store.calibration, store.poses)}
+
+
+@pytest.fixture
+def store(tmp_path: Path, files: dict[str, bytes]) -> Store:
+    """Return a store with a calibration and 12 poses."""
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    return Store(tmp_path / 'known.yaml', IDENTITY, 'm/s2')
+
+
+def kept(path: Path) -> str:
+    """Return what is stored at a path, without following a link."""
+    mode = path.lstat().st_mode
+    if stat.S_ISLNK(mode):
+        return f'link to {os.readlink(path)}'
+    if stat.S_ISDIR(mode):
+        return f'folder of {sorted(each.name for each in path.iterdir())}'
+    if stat.S_ISREG(mode):
+        return f'{path.stat().st_size} bytes: {path.read_bytes()[:9999]!r}'
+    return f'kind {stat.S_IFMT(mode)}'
+
+
+def works(path: Path, readings: Readings) -> None:
+    """Check that a calibrator starts, fits and stores, and that the next one uses the result."""
+    driver = Driver(calibration_file=str(path))
+    driver.feed(readings(spread_directions(10)))
+    assert 'stored in' in driver.done(driver.session.commands.fit())
+    driver.session.close()
+    after = Driver(calibration_file=str(path))
+    after.feed(readings([[0, 0, 1]])[:10])
+    assert after.session.active.calibration is not None
+    assert len(after.session.live.book.poses()) >= 10
+    assert not after.logged()
+    after.session.close()
+
+
+@pytest.mark.parametrize('damage', OF_CALIBRATION)
+def test_whatever_is_in_place_of_the_calibration_is_kept_and_replaced(
+        damage: str, store: Store, readings: Readings) -> None:
+    OF_CALIBRATION[damage](store.calibration)
+    found = kept(store.calibration)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert driver.session.active.calibration is None
+    assert store.calibration.name in driver.logged()
+    assert 'kept as' in driver.logged() or 'is renamed when' in driver.logged()
+    assert len(driver.session.live.book.poses()) == 12
+    driver.session.close()
+    works(store.calibration, readings)
+    assert found in [kept(each) for each in store.calibration.parent.iterdir()]
+
+
+@pytest.mark.parametrize('damage', OF_POSES)
+def test_whatever_is_in_place_of_the_poses_is_kept_and_replaced(
+        damage: str, store: Store, readings: Readings) -> None:
+    OF_POSES[damage](store.poses)
+    found = kept(store.poses)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert driver.session.active.calibration is not None
+    assert store.poses.name in driver.logged()
+    assert 'kept as' in driver.logged()
+    assert len(driver.session.live.book.poses()) == 0
+    driver.session.close()
+    works(store.calibration, readings)
+    assert found in [kept(each) for each in store.calibration.parent.iterdir()]
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_the_calibrator_starts_with_files_of_which_bytes_were_changed(
+        seed: int, store: Store) -> None:
+    rng = np.random.default_rng(seed)
+    for path in (store.calibration, store.poses):
+        data = bytearray(path.read_bytes())
+        for place in rng.integers(len(data), size=rng.integers(1, 4)):
+            data[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(data))
+    driver = Driver(calibration_file=str(store.calibration))
+    driver.feed(np.tile([0.0, 0.0, 9.8], (20, 1)))
+    used = driver.session.active.calibration
+    assert (used is None) == ('known.yaml' in driver.logged())
+    assert used is None or any('edited by hand' in line for line in used.warnings)
+    driver.session.close()
+
+
+HUGE = ['1e300,0,0', '0,-1e308,1e308', '1e-320,0,0', '0,0,0', '9e99,9e99,9e99']
+LARGE = ['1e29,0,0', '0,-1e30,0', '1e-320,0,0', '0,0,0', '0,0,9e15']
+
+
+@pytest.mark.parametrize(('largest', 'most'), [(HUGE, 1e300), (LARGE, 1e29)])
+def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
+        largest: list[str], most: float, store: Store, readings: Readings) -> None:
+    rows = [f'{reading},{std},{std},{std},{count}\n' for reading in largest
+            for std, count in ((0, 1), (most, 1.0 / most), (1.0 / most, most))]
+    store.poses.write_text('ax,ay,az,std_x,std_y,std_z,count\n' + ''.join(rows))
+    assert bool(load(store).notes) is (most > 1e30)
+    works(store.calibration, readings)
+
+
+def test_a_device_is_never_renamed_or_replaced(tmp_path: Path, readings: Readings) -> None:
+    path = tmp_path / 'null'
+    try:
+        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip('only root makes devices')
+    refuses(path, 'a character device', readings)
+    assert stat.S_ISCHR(path.lstat().st_mode)
+
+
+def test_a_folder_that_does_not_look_like_a_file_is_never_renamed(tmp_path: Path,
+                                                                  readings: Readings) -> None:
+    path = tmp_path / 'documents'
+    fill_folder(path)
+    refuses(path, 'a folder', readings)
+    assert (path / 'mine').read_text() == 'kept'
+
+
+def refuses(path: Path, kind: str, readings: Readings) -> None:
+    """Check that a calibrator works without storing."""
+    driver = Driver(calibration_file=str(path))
+    assert f'{path} is {kind}' in driver.logged()
+    driver.feed(readings(spread_directions(10)))
+    with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
+        driver.done(driver.session.commands.fit())
+    assert driver.session.active.calibration is not None
+    driver.session.close()
+
+
+# Rights
+
+
+def test_files_that_nobody_may_read_are_kept_and_replaced(folder: Path, readings: Readings
+                                                          ) -> None:
+    store = Store(folder / 'imu.yaml', IDENTITY, 'm/s2')
+    for path in (store.calibration, store.poses):
+        path.write_text('secret')
+        path.chmod(0)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert driver.logged().count('Permission denied') == 2
+    driver.session.close()
+    works(store.calibration, readings)
+    others = sorted(each.name for each in folder.iterdir() if not each.stat().st_mode & 0o777)
+    assert others == ['imu.yaml.other1', 'imu_poses.csv.damaged1']
+
+
+@pytest.mark.parametrize('mode', [0, 0o500, 0o600])
+def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
+        mode: int, folder: Path, readings: Readings) -> None:
+    inner = folder / 'inner'
+    inner.mkdir()
+    (inner / '.imu.yaml.123.tmp').write_text('left behind')
+    (inner / 'imu_poses.csv').write_text('ax,ay,az\n1,2,words\n')
+    inner.chmod(mode)
+    driver = Driver(calibration_file=str(inner / 'imu.yaml'))
+    assert 'Permission denied' in driver.logged()
+    driver.feed(readings(spread_directions(10)))
+    assert driver.session.health().writable is False
+    with pytest.raises(InputError, match='in use but could not be stored'):
+        driver.done(driver.session.commands.fit())
+    assert driver.session.active.calibration is not None
+    driver.session.close()
+    inner.chmod(0o700)
+    assert (inner / 'imu_poses.csv').read_text() == 'ax,ay,az\n1,2,words\n'
+
+
+def test_a_full_disk_is_reported_and_leaves_the_files_as_they_are(store: Store,
+                                                                  readings: Readings) -> None:
+    before = {path: path.read_bytes() for path in (store.calibration, store.poses)}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))  # every write fails
+    try:
+        driver = Driver(calibration_file=str(store.calibration))
+        loaded = driver.session.active.calibration
+        driver.feed(readings(spread_directions(10)))
+        with pytest.raises(InputError, match='in use but could not be stored'):
+            driver.done(driver.session.commands.fit())
+        driver.session.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert loaded is not None
+    assert 'poses could not be stored' in driver.logged()
+    assert {path: path.read_bytes() for path in before} == before
+    works(store.calibration, readings)
+
+
+# Places
+
+
+@pytest.mark.parametrize('name', ['file/imu.yaml', f'{"x" * 300}.yaml', 'loop/imu.yaml'])
+def test_a_path_that_no_file_can_have_is_reported(name: str, tmp_path: Path, readings: Readings
+                                                  ) -> None:
+    (tmp_path / 'file').touch()
+    (tmp_path / 'loop').symlink_to('loop')
+    driver = Driver(calibration_file=str(tmp_path / name))
+    driver.feed(readings(spread_directions(10)))
+    assert driver.session.health().writable is (name[0] == 'x')
+    with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
+        driver.done(driver.session.commands.fit())
+    driver.session.close()
+
+
+def test_a_home_that_is_not_known_is_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match='has no home folder; state the whole path'):
+        store_of('~nobody_has_this_name/imu.yaml', IDENTITY, 'm/s2')
+
+
+def test_advice_about_a_path_that_no_file_can_have_is_another_path() -> None:
+    assert 'another calibration_file' in writing_advice(OSError(errno.ENAMETOOLONG, 'long'))
+
+
+def test_leftovers_are_removed_and_one_that_cannot_be_does_not_matter(store: Store) -> None:
+    left = [store.calibration.with_name(f'.{path.name}.{number}.tmp') for number in (1, 2)
+            for path in (store.calibration, store.poses)]
+    for path in left:
+        path.write_text('half')
+    assert load(store).notes == ()
+    assert not any(path.exists() for path in left)
+    left[0].mkdir()
+    loaded = load(store)
+    assert loaded.calibration is not None
+    assert len(loaded.poses) == 12
+    assert 'could not be tidied' in loaded.notes[0]
+
+
+# Lock and steps
+
+
+@pytest.mark.parametrize('make', [
+    Path.mkdir, os.mkfifo, lambda path: path.symlink_to(path.with_name('precious')),
+    lambda path: os.mknod(path, stat.S_IFSOCK | 0o600)])
+def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
+        make: Callable[[Path], object], store: Store) -> None:
+    precious = store.calibration.with_name('precious')
+    precious.write_text('kept')
+    lock = store.calibration.with_name('known.lock')
+    make(lock)
+    before = kept(lock)
+    Lock(store).release()
+    assert kept(lock) == before
+    assert precious.read_text() == 'kept'
+    assert Driver(calibration_file=str(store.calibration)).session.active.calibration
+
+
+def test_undo_passes_over_what_is_not_a_step(store: Store) -> None:
+    text = store.calibration.read_text()
+    step = store.calibration.with_name('known.yaml.before1')
+    step.write_text(text.replace('date: ', 'date: 2025 # '))
+    with pytest.raises(StoredCalibrationError, match='before1 is damaged .*before1.damaged1; try'):
+        store.step_back()
+    step.write_text(text.replace("date: '2026", "date: '2025"))
+    os.mkfifo(step.with_name('known.yaml.before2'))
+    step.with_name('known.yaml.before3').mkdir()
+    step.with_name('known.yaml.before٤').write_text('not a number of ours')
+    step.with_name('known.yaml.before05').write_text('nor this one')
+    assert store.steps() == [1]
+    back = store.step_back()
+    assert back is not None
+    assert back.date.startswith('2025')
+    store.save_calibration(read_calibration(store.calibration.with_name('known.yaml.undone1')))
+    assert store.steps() == [4]
+
+
+@pytest.mark.parametrize('name', ['read_calibration', 'read_poses'])
+def test_an_error_that_nobody_expected_does_not_stop_the_calibrator(
+        name: str, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path) -> None:
+        raise ZeroDivisionError(path.name)
+
+    monkeypatch.setattr(f'accel_calib.session.store.{name}', fail)
+    monkeypatch.setattr('accel_calib.session.store.crash_words', crash_words)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert 'internal error: ZeroDivisionError: known' in driver.logged()
+    assert 'kept as' in driver.logged()
+    file = driver.logged().split('with the file ')[1].split(';')[0]
+    assert 'Traceback' in Path(file).read_text()
+    Path(file).unlink()
+
+
+def test_things_are_renamed_without_replacing_others(tmp_path: Path) -> None:
+    (tmp_path / 'a.yaml').write_text('new')
+    (tmp_path / 'a.yaml.damaged1').symlink_to('nothing')
+    assert aside(tmp_path / 'a.yaml', 'damaged').name == 'a.yaml.damaged2'
+    assert (tmp_path / 'a.yaml.damaged1').is_symlink()
+    with pytest.raises(FileNotFoundError):
+        aside(tmp_path / 'a.yaml', 'damaged')
+
+
+def test_poses_are_read_from_a_store_whose_calibration_is_a_pipe(store: Store) -> None:
+    store.calibration.unlink()
+    os.mkfifo(store.calibration)
+    assert len(load(store).poses) == len(read_poses(store.poses)) == 12
