@@ -62,8 +62,9 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def folder() -> Iterator[Path]:
     """Yield a folder of a user who cannot read everything, unlike root."""
-    made = Path(tempfile.mkdtemp())
     as_root = os.geteuid() == 0
+    # TMPDIR may be a folder of root alone.
+    made = Path(tempfile.mkdtemp(dir='/tmp' if as_root else None))
     if as_root:
         os.chown(made, NOBODY, NOBODY)
         os.seteuid(NOBODY)
