@@ -19,7 +19,7 @@ from accel_calib.session.store import Identity, Store
 import pytest
 
 HERE = Path(__file__).parent
-ERRORS = ('eio', 'enospc', 'edquot')
+ERRORS = ('eio', 'enospc')
 TASKS = ('fit', 'capture', 'apply', 'export', 'save', 'step_back')
 
 

@@ -25,8 +25,7 @@ from accel_calib.cli.main import main as command
 from accel_calib.files import read_calibration, read_poses
 from accel_calib.session.store import Identity, Store
 
-KINDS = {'kill': (1, 0), 'torn': (2, 0), 'eio': (3, errno.EIO), 'enospc': (3, errno.ENOSPC),
-         'edquot': (3, errno.EDQUOT)}
+KINDS = {'kill': (1, 0), 'torn': (2, 0), 'eio': (3, errno.EIO), 'enospc': (3, errno.ENOSPC)}
 _MOST = 10_000
 
 
