@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import csv
 from datetime import datetime, timezone
 import io
@@ -18,14 +17,12 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.files import read_recording
 from accel_calib.files.logs import LogOptions, open_log, read_log
 from accel_calib.files.logs.names import meaning, unit_of, UNITS, WORDS
 from accel_calib.sphere import spread_directions
 from accel_calib.table import Poses, Recording
 import numpy as np
 import pytest
-from shared import data
 
 G = 9.80665
 RATE_HZ = 100.0
@@ -684,19 +681,6 @@ def test_a_log_is_read_the_same_in_blocks_and_at_once(tmp_path: Path) -> None:
                                   log.table.reading)
     assert log.table['time'][-1] == pytest.approx((len(rows) - 1) * 0.01)
     assert log.table.row[-1] == len(rows)
-
-
-def test_a_regular_log_is_read_nearly_as_fast_as_numpy_parses_it() -> None:
-    path = data('xsens_mti_counts.csv')
-
-    def spent(read: Callable[[], object]) -> float:
-        before = time.process_time()
-        read()
-        return time.process_time() - before
-
-    reader = min(spent(lambda: read_recording(path)) for _ in range(3))
-    numpy = min(spent(lambda: np.loadtxt(path, delimiter=',', skiprows=3)) for _ in range(3))
-    assert reader < 2.0 * numpy
 
 
 def test_samples_without_times_need_their_rate(tmp_path):
