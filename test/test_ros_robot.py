@@ -374,9 +374,7 @@ def test_undo_goes_back_step_by_step_also_after_a_restart(
     path = bench.home / 'accel_calib' / 'arm.yaml'
     assert bench.call('fit').success
     fitted = path.read_text()
-    bench.feed(readings([[0.0, 0.0, 1.0]], dwell=5.0)[:-20])
-    bench.spin(lambda: still[-1].data)
-    answer = bench.call('set_level')
+    answer = bench.call_while('set_level', rest(bench, still, readings([[0.0, 0.0, 1.0]])[-1]))
     assert answer.success, answer.message
     assert 'changes offset by (+0.00, +0.00, +0.00) mg' in answer.message
     assert read_calibration(path).is_levelled
