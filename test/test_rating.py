@@ -205,6 +205,18 @@ def test_a_refused_refinement_is_bad_with_the_reason_of_the_gate():
     assert 'fit again' in rating.next
 
 
+def test_a_fit_beside_a_refused_refinement_is_not_bad():
+    table = poses_of({'offset': [0.02, 0.0, 0.0], 'quadratic': [0.005, 0.004, -0.005]}, poses=60)
+    result = ac.refine(table)
+    assert result.steps
+    refused = replace(result, refusal=('the poses do not determine it', 'take more poses'))
+    rating = rate(ac.fit(table), refinement=refused)
+    assert rating.name == 'USABLE'
+    assert 'quadratic is missing' in rating.reason
+    assert 'take more poses' in rating.next
+    assert rate_refinement(refused).name == 'BAD'
+
+
 def test_many_knocked_poses_are_usable_and_one_of_many_is_good():
     table = poses_of(poses=24)
     one = moved(table, [7], 0.3)

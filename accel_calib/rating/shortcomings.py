@@ -53,14 +53,14 @@ def shortcomings(expected: Expected, refinement: Refinement | None) -> list[Shor
     """Return the shortcomings of a calibration; the most informative of each name is first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
-    return [*_refused(refinement), *_wrong_axes(expected), *_too_large(expected),
+    return [*_refused(expected, refinement), *_wrong_axes(expected), *_too_large(expected),
             *_limited(expected), *_unchecked(expected), *named, *_inexact(expected, error),
             *_left_out(expected)]
 
 
-def _refused(refinement: Refinement | None) -> Iterator[Shortcoming]:
-    """Yield the reason why the gate refuses a refined calibration."""
-    if refinement is not None and refinement.refusal:
+def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Shortcoming]:
+    """Yield the reason why the gate refuses the calibration, if it is the refined one."""
+    if refinement is not None and refinement.refusal and _has(expected, refinement):
         message, advice = refinement.refusal
         yield Shortcoming('BAD', message, advice)
 
@@ -159,6 +159,7 @@ def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator
     elif refinement.steps and not _has(expected, refinement):
         names = ', '.join(step.effect for step in refinement.steps)
         yield Shortcoming('USABLE', f'{begin}: {names} is missing in the model',
+                          refinement.refusal[1] if refinement.refusal else
                           'use the refined calibration')
     elif any(step.effect == WANDER for step in refinement.steps):
         yield Shortcoming('USABLE', f'{begin}: the offset changed slowly with time ({WANDER})',

@@ -92,11 +92,8 @@ def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
     """
     hover = {}
     with styled():
-        figure = new_figure(_HEIGHT_INCHES)
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-        discs = figure.subplots(1, 2)
+        figure, discs = _two_discs(title)
         for disc, up in zip(discs, (True, False), strict=True):
-            draw_disc(disc, up=up)
             here = np.flatnonzero((force[:, 2] >= 0.0) == up)
             here = here[np.argsort(np.abs(residual_mg[here]))]
             drawn = _draw_poses(disc, force[here], residual_mg[here], limit_mg, signed,
@@ -208,11 +205,8 @@ def draw_coverage(title: str, force: Floats, next_pose: Floats | None,
     open_ = uncovered(force)
     hover = {}
     with styled():
-        figure = new_figure(_HEIGHT_INCHES)
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-        discs = figure.subplots(1, 2)
+        figure, discs = _two_discs(title)
         for disc, up in zip(discs, (True, False), strict=True):
-            draw_disc(disc, up=up)
             disc.plot(*equal_area(open_[(open_[:, 2] >= 0.0) == up]).T, 'x', color=ACCENT,
                       markersize=3.5, label='not covered', zorder=2)
             here = np.flatnonzero((force[:, 2] >= 0.0) == up)
@@ -225,6 +219,16 @@ def draw_coverage(title: str, force: Floats, next_pose: Floats | None,
                           label='next pose', zorder=4)
         figure.legend(*discs[0].get_legend_handles_labels(), loc='outside lower center', ncols=3)
     return Chart(figure, hover)
+
+
+def _two_discs(title: str) -> tuple[Any, Any]:
+    """Return a new figure, and its discs of the hemispheres +z and -z."""
+    figure = new_figure(_HEIGHT_INCHES)
+    figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+    discs = figure.subplots(1, 2)
+    for disc, up in zip(discs, (True, False), strict=True):
+        draw_disc(disc, up=up)
+    return figure, discs
 
 
 def draw_before_after(title: str, rows: Sequence[int], before_mg: Floats, after_mg: Floats,
