@@ -9,6 +9,7 @@ Each message has three parts: what was found, what was expected, and what to do.
 """
 
 from collections.abc import Sequence
+import errno
 
 
 class AccelCalibError(Exception):
@@ -48,6 +49,21 @@ class StoredCalibrationError(AccelCalibError):
 class DamagedCalibrationError(StoredCalibrationError):
     """A stored calibration is damaged, or has values that are not plausible."""
 
+
+def is_full(error: OSError) -> bool:
+    """Return whether an error of the system is that of a full disk."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def system_error(error: OSError) -> InputError:
+    """Return an error of the system, with the name of its file and what to do."""
+    name = f'{error.filename}: ' if error.filename else ''
+    return InputError(f'{name}{error.strerror or error}', FREE_SPACE if is_full(error) else
+                      'check the name and the permissions')
+
+
+FREE_SPACE = 'free space on the disk'
+"""Advice for a full disk."""
 
 TAKE_ALL_SIDES = 'take poses with each side of the sensor up and down, and some edges'
 """Advice for poses that do not determine a calibration."""

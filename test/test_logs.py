@@ -144,7 +144,7 @@ def test_boot_messages_are_passed_over_and_noted(tmp_path: Path) -> None:
         log = read_log(write(tmp_path, boot + text.encode()))
         np.testing.assert_allclose(log.table['time'], samples()['time'], atol=1e-9)
         assert len(log.notes) == 1
-        assert 'passed over 6 lines before the table' in log.notes[0]
+        assert 'skipped 6 lines before the table' in log.notes[0]
         assert 'ets Jul 29 2019' in log.notes[0]
 
 

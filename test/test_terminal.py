@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 from accel_calib.cli.characters import in_one_line, shown
+from accel_calib.cli.demo import _table as demo_table
 from accel_calib.cli.main import main
 from accel_calib.cli.terminal import Output
 from accel_calib.significant import with_sd
@@ -90,6 +91,16 @@ def test_parameters_that_the_model_lacks_are_absent(poses):
     assert 'gain x ' in text
     assert 'gain xy' not in text
     assert 'gain xy' in printed('fit', poses, '--model', '10')
+
+
+def test_brackets_in_a_table_are_shown_as_they_are():
+    outcome = {f'{name}_{when}_{unit}': 1.0 for name, unit in (
+        ('rms', 'mg'), ('max', 'mg'), ('tilt', 'deg')) for when in ('before', 'after')}
+    output = Output()
+    output.file = io.StringIO()
+    output.print(demo_table({**outcome, 'rests': 5, 'seconds': 30.0}))
+    assert 'RMS [mg]' in output.file.getvalue()
+    assert '\\' not in output.file.getvalue()
 
 
 def test_control_characters_are_escaped():

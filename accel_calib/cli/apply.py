@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, ExitStack, suppress
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +23,8 @@ from ..calibrate import (
     thermal_stream,
 )
 from ..effects import Context
-from ..errors import counted, InputError
-from ..files import correct_bag, is_bag, LogOptions, open_log, OpenLog, write_blocks
+from ..errors import counted
+from ..files import correct_bag, is_bag, open_log, write_blocks
 from ..table import Poses, Recording
 from ..units import UnitName
 
@@ -74,10 +73,7 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration,
                    report: Callable[[Outside], object], lines: list[str]) -> int:
     """Correct a log that is not a bag; how it was read is added to the lines."""
     path, out = args.recording, args.output
-    if out.exists() and out.samefile(path):
-        raise InputError(f'{out} is the recording itself, expected another file',
-                         'choose another name')
-    with (_open_for(calibration, path, options.log_options(args)) as log,
+    with (open_log(path, options.log_options_for(args, calibration)) as log,
           progress('samples') as moved):
         calibration = calibration.in_units(log.units)
         check_sensor(calibration, log.sensor)
@@ -90,18 +86,6 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration,
         if each.count:
             report(each)
     return count
-
-
-@contextmanager
-def _open_for(calibration: Calibration, path: Path, asked: LogOptions) -> Iterator[OpenLog]:
-    """Open a log; without a stated unit, it is native if the calibration is native."""
-    with ExitStack() as stack:
-        log = None
-        if calibration.units.name == 'native' and not asked.units:
-            # If this fails because the log states a unit, the calibration refuses that unit.
-            with suppress(InputError):
-                log = stack.enter_context(open_log(path, replace(asked, units='native')))
-        yield log or stack.enter_context(open_log(path, asked))
 
 
 class _Correction:

@@ -12,7 +12,6 @@ from . import options
 from .results import calibration_result, refine_result, show_calibration
 from .terminal import working
 from ..calibrate import FRAMES
-from ..errors import AccelCalibError
 from ..files import write_calibration
 from ..intake import Intake
 from ..pipeline import calibrated, Flat, Outcome
@@ -62,16 +61,12 @@ def _flat(text: str) -> Flat:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, store, write the page, and print the verdict."""
-    try:
+    with options.errors_in_json(args.json, file=args.log):
         intake = options.intake(args, args.log)
         with working('fitting'):
             outcome = calibrated(intake.poses, intake.units, flat=args.flat,
                                  nose_down=args.nose_down, frame=args.frame, sensor=args.sensor,
                                  refined=not args.no_refine)
-    except AccelCalibError as err:
-        options.write_json(args.json, {'file': args.log, 'error': err.message,
-                                       'advice': err.advice})
-        raise
     stored = _store(args, intake, outcome)
     options.write_json(args.json, {'file': args.log, **_result(intake, outcome)})
     _show(args, intake, outcome, stored)
@@ -85,7 +80,7 @@ def _store(args: argparse.Namespace, intake: Intake, outcome: Outcome) -> list[s
         write_calibration(args.output, outcome.calibration)
         lines.append(f'stored in {args.output}')
     else:
-        lines.append('not stored; --keep-bad stores it all the same')
+        lines.append('not stored, because it is BAD; to store it, use --keep-bad')
     page = args.output.with_suffix('.html')
     if has_matplotlib():
         with working('drawing the page'):

@@ -15,7 +15,6 @@ import numpy as np
 from . import options
 from .terminal import working
 from ..compare import compare, Comparison, LEVEL
-from ..errors import AccelCalibError
 from ..files import read_calibration
 from ..rating import rate_comparison
 from ..units import MG
@@ -43,12 +42,9 @@ def run(args: argparse.Namespace) -> int:
         from ..report import check_matplotlib
 
         check_matplotlib()
-    try:
+    with options.errors_in_json(args.json):
         calibrations = [read_calibration(path) for path in args.calibrations]
         comparison = compare(calibrations)
-    except AccelCalibError as err:
-        options.write_json(args.json, {'error': err.message, 'advice': err.advice})
-        raise
     models = [calibration.name for calibration in calibrations]
     rating = rate_comparison(comparison)
     if args.report is not None:

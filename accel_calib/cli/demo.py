@@ -81,6 +81,6 @@ def _table(outcome: dict[str, Any]) -> Table:
     for words, name, unit in (('error of |a|, RMS', 'rms', 'mg'),
                               ('error of |a|, largest', 'max', 'mg'),
                               ('error of up, RMS', 'tilt', 'deg')):
-        table.add_row(f'{words} [{unit}]'.replace('[', '\\['),
+        table.add_row(f'{words} [{unit}]',
                       *(f'{outcome[f"{name}_{when}_{unit}"]:.3g}' for when in ('before', 'after')))
     return table

@@ -23,7 +23,6 @@ from ..calibrate import (
     MODEL_NAMES,
     outlook,
 )
-from ..errors import AccelCalibError
 from ..files import write_calibration
 from ..intake import Intake
 from ..rating import rate, Rating
@@ -82,11 +81,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_one(args: argparse.Namespace) -> int:
-    try:
+    with options.errors_in_json(args.json):
         fitted = _fit(args, args.poses[0])
-    except AccelCalibError as err:
-        options.write_json(args.json, {'error': err.message, 'advice': err.advice})
-        raise
     _store(fitted, args.output, args.report)
     options.write_json(args.json, _result(args, fitted))
     _show(args, fitted)
@@ -123,17 +119,13 @@ def _result(args: argparse.Namespace, fitted: _Fitted) -> dict[str, Any]:
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     """Fit one of several logs; an error is returned as the result."""
-    try:
+    def work() -> dict[str, Any]:
         fitted = _fit(args, path)
         _store(fitted, args.output and args.output / f'{path.stem}.yaml',
                args.report and args.report / f'{path.stem}.html')
-    except AccelCalibError as err:
-        return {'file': path, 'error': err.message, 'advice': err.advice}
-    except OSError as err:
-        return {'file': path, 'error': f'{path}: {err.strerror}',
-                'advice': 'check the name and the permissions'}
-    result: dict[str, Any] = options.plain(_result(args, fitted))
-    return result
+        return _result(args, fitted)
+
+    return options.attempted(work, path)
 
 
 def _store(fitted: _Fitted, output: Path | None, report: Path | None) -> None:

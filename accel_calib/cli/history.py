@@ -13,7 +13,6 @@ from typing import Any, TYPE_CHECKING
 from . import options
 from .terminal import working
 from ..compare import History, history_of
-from ..errors import AccelCalibError
 from ..files import read_calibration
 from ..rating import rate_comparison
 from ..report import check_matplotlib, write_history_page
@@ -40,12 +39,9 @@ def run(args: argparse.Namespace) -> int:
     """Sort and compare the calibrations, and print the result."""
     if args.report is not None:
         check_matplotlib()
-    try:
+    with options.errors_in_json(args.json):
         calibrations = [read_calibration(path) for path in args.calibrations]
         history = history_of(calibrations)
-    except AccelCalibError as err:
-        options.write_json(args.json, {'error': err.message, 'advice': err.advice})
-        raise
     options.write_json(args.json, _result(args.calibrations, history))
     if args.report is not None:
         with working('drawing the page'):

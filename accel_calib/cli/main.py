@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
-import errno
 from importlib import import_module
 import os
 import re
@@ -25,7 +24,7 @@ from . import targets
 from .characters import in_one_line, use_plain_characters
 from .. import __version__
 from ..crash import crash_words
-from ..errors import AccelCalibError
+from ..errors import AccelCalibError, system_error
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -131,10 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except AccelCalibError as err:
         return _refuse(args.command, str(err))
     except OSError as err:
-        name = f'{err.filename}: ' if err.filename else ''
-        full = err.errno in (errno.ENOSPC, errno.EDQUOT)
-        advice = 'free space on the disk' if full else 'check the name and the permissions'
-        return _refuse(args.command, f'{name}{err.strerror or err}; {advice}')
+        return _refuse(args.command, str(system_error(err)))
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as err:  # a defect of this program, which no user should see as a traceback

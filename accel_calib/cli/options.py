@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 
 from .terminal import Output, progress
 from ..calibrate import Calibration, EDITED
-from ..errors import InputError
+from ..errors import AccelCalibError, InputError, system_error
 from ..files import LogOptions, read_calibration
 from ..files.atomic import write_atomically
 from ..files.calibration_yaml import OTHER_CORRECTION
@@ -93,10 +93,17 @@ def log_options(args: argparse.Namespace) -> LogOptions:
     """Return how to read a log, from the options of `add_log`."""
     columns = {ours: theirs for given in args.columns for ours, theirs in given.items()}
     return LogOptions(columns=columns, format=args.format, skip_bad=args.skip_bad,
-                      rate=args.rate,
-                      units=args.units, gravity=args.gravity, topic=args.topic,
-                      sensor=args.sensor, temperature_topic=args.temperature_topic,
-                      supply_topic=args.supply_topic)
+                      rate=args.rate, units=args.units, gravity=args.gravity,
+                      topic=args.topic, sensor=args.sensor,
+                      temperature_topic=args.temperature_topic, supply_topic=args.supply_topic)
+
+
+def log_options_for(args: argparse.Namespace, calibration: Calibration) -> LogOptions:
+    """Return how to read a log for a calibration: in its unit, if the log states none."""
+    asked, units = log_options(args), calibration.units
+    if units.name == 'native':  # its readings can look like g
+        return replace(asked, default_units='native')
+    return replace(asked, gravity=units.per_g) if units.name == 'm/s2' else asked
 
 
 def intake(args: argparse.Namespace, path: Path) -> Intake:
@@ -107,13 +114,7 @@ def intake(args: argparse.Namespace, path: Path) -> Intake:
 def intake_for(args: argparse.Namespace, path: Path, calibration: Calibration
                ) -> tuple[Intake, Calibration]:
     """Return the poses of a log, and a calibration in their unit."""
-    asked, units = log_options(args), calibration.units
-    if units.name == 'm/s2':
-        asked = replace(asked, gravity=units.per_g)
-    elif units.name == 'native' and not asked.units:
-        with suppress(InputError):  # a log with a unit is refused below, by `in_units`
-            return _intake(args, path, replace(asked, units='native')), calibration
-    found = _intake(args, path, asked)
+    found = _intake(args, path, log_options_for(args, calibration))
     return found, calibration.in_units(found.units)
 
 
@@ -146,6 +147,31 @@ def write_json(target: str | None, result: object) -> None:
         print(text)
     else:
         write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
+
+
+@contextmanager
+def errors_in_json(target: str | None, **about: object) -> Iterator[None]:
+    """Write an error as JSON, beside what it is about, and raise it again."""
+    try:
+        yield
+    except AccelCalibError as err:
+        write_json(target, {**about, **_of_error(err)})
+        raise
+
+
+def attempted(work: Callable[[], Mapping[str, Any]], path: Path) -> dict[str, Any]:
+    """Return the result of one of several inputs for JSON; an error is a result, too."""
+    try:
+        found: dict[str, Any] = plain(work())
+    except AccelCalibError as err:
+        return {'file': str(path), **_of_error(err)}
+    except OSError as err:
+        return {'file': str(path), **_of_error(system_error(err))}
+    return found
+
+
+def _of_error(error: AccelCalibError) -> dict[str, str]:
+    return {'error': error.message, 'advice': error.advice}
 
 
 def plain(value: object) -> Any:

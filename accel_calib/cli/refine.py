@@ -14,7 +14,7 @@ from . import options
 from .results import in_a_line, refine_result, steps_table
 from .terminal import Output, working
 from ..calibrate import Calibration
-from ..errors import AccelCalibError, listed, RefusedFitError
+from ..errors import listed, RefusedFitError
 from ..files import write_calibration
 from ..files.plan_table import write_plan
 from ..rating import rate_refinement
@@ -74,11 +74,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_one(args: argparse.Namespace) -> int:
     path = args.poses[0]
-    try:
+    with options.errors_in_json(args.json, file=path):
         result = refine_file(args, path)
-    except AccelCalibError as err:
-        options.write_json(args.json, {'file': path, 'error': err.message, 'advice': err.advice})
-        raise
     options.write_json(args.json, _result(path, result))
     stored = _store(result, path, args.output, args.report, args.plan)
     _show(args, result, stored)
@@ -90,21 +87,15 @@ def _run_one(args: argparse.Namespace) -> int:
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     """Refine with one of several tables; an error is returned as the result."""
-    try:
+    def work() -> dict[str, Any]:
         result = refine_file(args, path)
         _store(result, path, args.output and args.output / f'{path.stem}.yaml',
                args.report and args.report / f'{path.stem}.html',
                args.plan and args.plan / f'{path.stem}.csv')
-        if args.output and result.refusal:
-            return options.plain({**_result(path, result), 'error': result.refusal[0],
-                                  'advice': result.refusal[1]})
-    except AccelCalibError as err:
-        return {'file': str(path), 'error': err.message, 'advice': err.advice}
-    except OSError as err:
-        return {'file': str(path), 'error': f'{path}: {err.strerror}',
-                'advice': 'check the name and the permissions'}
-    made: dict[str, Any] = options.plain(_result(path, result))
-    return made
+        refused = dict(zip(('error', 'advice'), result.refusal or ())) if args.output else {}
+        return {**_result(path, result), **refused}
+
+    return options.attempted(work, path)
 
 
 def _result(path: Path, result: Refinement) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from typing import Any
 from . import options
 from .terminal import working
 from ..calibrate import check_units, verify
-from ..errors import AccelCalibError
 from ..rating import rate_verification
 from ..significant import short
 
@@ -53,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
         check_matplotlib()
     if len(args.poses) == 1:
-        result = _verify(args, args.poses[0], args.report)
+        with options.errors_in_json(args.json):
+            result = _verify(args, args.poses[0], args.report)
         options.write_json(args.json, result)
         results = [result]
     else:
@@ -92,13 +92,8 @@ def _verify(args: argparse.Namespace, path: Path, report: Path | None) -> dict[s
 
 def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     """Verify on one of several tables; an error is returned as the result."""
-    try:
-        return _verify(args, path, args.report and args.report / f'{path.stem}.html')
-    except AccelCalibError as err:
-        return {'file': path, 'error': err.message, 'advice': err.advice}
-    except OSError as err:
-        return {'file': path, 'error': f'{err.filename}: {err.strerror}',
-                'advice': 'check the name and the permissions'}
+    return options.attempted(
+        lambda: _verify(args, path, args.report and args.report / f'{path.stem}.html'), path)
 
 
 def _show(args: argparse.Namespace, results: list[dict[str, Any]]) -> None:

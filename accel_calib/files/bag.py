@@ -225,7 +225,7 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
 
 
 def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
-    """Take the blocks whose context is known, and forget the context long before the others."""
+    """Return the blocks whose context is known, and discard context that is too old for others."""
     parts = []
     while waiting and (len(waiting) > _HELD_BACK
                        or all(track.covers(waiting[0]) for track in tracks.values())):

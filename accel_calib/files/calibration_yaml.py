@@ -239,7 +239,7 @@ def _checked(content: Mapping[str, Any], name: str) -> Calibration:
 
 
 def _check_keys(content: Mapping[str, Any], name: str) -> None:
-    """Refuse unknown keys in a file that was changed: a damaged key would be passed over."""
+    """Refuse unknown keys in a file that was changed: a damaged key would be ignored."""
     for place, known in _KEYS.items():
         found = content.get(place) if place else content
         for key in found if isinstance(found, Mapping) else ():

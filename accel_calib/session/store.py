@@ -28,7 +28,14 @@ import numpy as np
 
 from ..calibrate import Calibration, check_sensor
 from ..crash import crash_words
-from ..errors import AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError
+from ..errors import (
+    AccelCalibError,
+    DamagedCalibrationError,
+    FREE_SPACE,
+    InputError,
+    is_full,
+    StoredCalibrationError,
+)
 from ..files import (
     copy_atomically,
     read_calibration,
@@ -487,8 +494,8 @@ def free_name(path: Path, word: str) -> Path:
 
 def writing_advice(error: OSError) -> str:
     """Return what to do about a file that cannot be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return 'free space on the disk'
+    if is_full(error):
+        return FREE_SPACE
     if error.errno in _OTHER_PLACE:
         return 'restart the node with another calibration_file'
     if error.errno == errno.EROFS:

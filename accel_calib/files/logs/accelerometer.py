@@ -81,7 +81,7 @@ def unit_of_reading(columns: Chosen, raw: Floats, options: LogOptions, *, sample
 
     """
     named, factor = _named(columns)
-    stated = _stated(columns, options)
+    stated = _stated(columns, options) or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
     rests = rests_of(raw * factor, samples=samples)

@@ -113,7 +113,7 @@ class Layout:
     about : mapping
         Units and sensor from the comments.
     notes : tuple of str
-        What was passed over before the table.
+        What was skipped before the table.
     sample : tuple of tuple of str
         Cells of the first rows.
 
@@ -384,7 +384,7 @@ def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
     if not lines:
         return ()
     words = short(lines[0])
-    return (f'passed over {counted(len(lines), "line")} before the table'
+    return (f'skipped {counted(len(lines), "line")} before the table'
             + (f': {words!r}' if len(lines) == 1 else f', the first is {words!r}'),)
 
 

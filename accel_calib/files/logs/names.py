@@ -5,7 +5,7 @@
 Names of columns: which quantity, axis and unit the name of a column in a log means.
 
 A name is parted into words at blanks, punctuation, digits and capital letters. `WORDS` lists the
-words for each quantity, and `UNITS` the units. A unit stands in brackets or at the end of the
+words for each quantity, and `UNITS` the units. A unit is in brackets or at the end of the
 name. The remaining words distinguish the sensors of a log. Our own names (`ax`, `time`, …) go
 before all others.
 

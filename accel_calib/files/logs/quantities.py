@@ -4,9 +4,9 @@
 """
 Quantities of a text log: the conversion of its columns to our units.
 
-`decided` looks at the first block of numbers and decides the unit of
-each column: what the user, the file, the maker's layout or the name states, or else what the
-readings at rest and the rate of the samples show. Each assumption is in `Quantities.read_as`.
+`decided` looks at the first block of numbers and decides the unit of each column: what the user,
+the file, the maker's layout or the name states, or else what the readings at rest and the rate of
+the samples show. Each assumption is in `Quantities.read_as`.
 
 """
 
@@ -24,15 +24,12 @@ from .accelerometer import compact, unit_of_reading
 from .columns import FRACTION, unused
 from .dates import has_date, seconds_of
 from .names import RATE, READING, unit_of, ZEROS
-from .records import are_samples, LogOptions
+from .records import are_samples, are_untimed_samples, LogOptions
 from .selection import Chosen
 from .text import Cells
 from ...errors import InputError
 from ...table import COLUMNS, Floats
 from ...units import Units, units_of
-
-_MANY_ROWS = 5000
-"""More rows than these are samples."""
 
 _MOST_BACK = 0.1
 """Share of steps back in time above which a column is no time."""
@@ -248,10 +245,12 @@ def _by_rate(made: Quantities, first: Cells, stamps: Floats) -> bool:
 
 def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
     raw = np.column_stack([made.chosen.numbers(first, name) for name in READING])
-    samples = len(raw) > _MANY_ROWS
+    columns = {'reading': raw, **{key: raw[:, 0] for key in ('count', 'orientation')
+                                  if key in made.chosen.sources}}
     if 'time' in made.chosen.sources:
-        columns = {'time': made._seconds(first), 'reading': raw}
-        samples = 'count' not in made.chosen.sources and are_samples(columns)
+        samples = are_samples({**columns, 'time': made._seconds(first)})
+    else:
+        samples = options.rate is not None or are_untimed_samples(columns)
     found = unit_of_reading(made.chosen, raw, options, samples=samples)
     made.units = units_of(found.name, options.gravity)
     if found.factor != 1.0:

@@ -46,6 +46,8 @@ class LogOptions:
         Samples per second of a text log without times [Hz].
     units : {'m/s2', 'g', 'native', ''}
         Unit of the readings.
+    default_units : {'m/s2', 'g', 'native', ''}
+        Unit of readings whose unit the log does not state, instead of a recognised one.
     gravity : float
         Local gravity [m/s²].
     topic : str
@@ -62,6 +64,7 @@ class LogOptions:
     skip_bad: bool = False
     rate: float | None = None
     units: UnitName | Literal[''] = ''
+    default_units: UnitName | Literal[''] = ''
     gravity: float = STANDARD_GRAVITY
     topic: str = ''
     sensor: str = ''

@@ -153,7 +153,7 @@ class TextTable:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what has been passed over so far."""
+        """Return what has been skipped so far."""
         notes = list(self.layout.notes)
         if self._bad_count:
             notes.append(f'skipped {counted(self._bad_count, "bad line")}'
