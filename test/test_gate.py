@@ -167,6 +167,25 @@ def test_a_mounting_that_is_not_a_rotation_is_refused(rotation, calibration):
         gated(replace(calibration, model=Model(calibration.model.values, rotation)))
 
 
+def test_a_residual_that_is_not_a_number_is_refused(calibration):
+    quality = replace(calibration.quality, rms_after_mg=np.nan)
+    with pytest.raises(RefusedFitError, match='the residual is nan mg'):
+        gated(replace(calibration, quality=quality))
+
+
+@pytest.mark.parametrize('values', [
+    {'offset': [1e308, 1e308, 0.0]}, {'axis_gain': [1e308, -1e308, 1e308]},
+    {'axis_gain': [1.7e308] * 3}, {'cross_axis': [1.7e308] * 3}, {'cross_axis': [1e200] * 3},
+    {'cubic': [1e308] * 3}, {'cubic': [1.7e308, -1.7e308, 0.0]},
+    {'cross_coupling': [1.7e308, -1.7e308, 1e308, 0.0, 1.7e308, 1.0]}])
+def test_values_that_overflow_are_refused(values, calibration):
+    changed = Model({name: np.array(part) for name, part in {**calibration.model.values,
+                                                             **values}.items()})
+    covariance = np.zeros((len(changed.vector),) * 2)
+    with pytest.raises(RefusedFitError):
+        gated(replace(calibration, model=changed, covariance=covariance))
+
+
 def test_a_file_edited_by_hand_is_used_with_a_warning(calibration):
     text = format_calibration(calibration)
     assert EDITED not in parse_calibration(text, 'x.yaml').warnings

@@ -3,12 +3,15 @@
 
 """Properties that hold for any sensor and any poses, tried on random cases."""
 
+import re
+
 import accel_calib as ac
-from accel_calib.calibrate import Calibration, fit_poses, outlook
+from accel_calib.calibrate import Calibration, fit_poses, NOT_LOCATED, outlook, UNCHECKED
 from accel_calib.effects import effect_named, EFFECTS, empirical_name, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate.equations import variance_factor
 from accel_calib.model import correct, Model, predict
+from accel_calib.rating import rate
 from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import OVER_THE_SPHERE, random_directions, spread_directions
@@ -33,7 +36,10 @@ SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_se
 
 SEEDS = st.integers(0, 2 ** 32 - 1)
 COUNTS = st.integers(14, 30)
-"""Number of poses. With 13 or fewer, a fit can leave out a good row instead of a bad one."""
+"""Number of poses of which one can be wrong, and the others show which."""
+
+FEW = st.integers(10, 13)
+"""Number of poses that may show that one of them is wrong, but not which."""
 
 THREE = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 PARTS = st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9)
@@ -263,6 +269,71 @@ def test_a_bad_row_does_not_move_the_result_silently(
     except RefusedFitError:
         return
     assert error_of(found, model_with(errors)) <= SURE * uncertainty_g(found)
+
+
+def is_warned(calibration):
+    """Return whether a fit warns about rows that may be wrong, and is not rated GOOD."""
+    begins = (NOT_LOCATED, UNCHECKED)
+    return (any(line.startswith(begins) for line in calibration.warnings)
+            and rate(calibration).name != 'GOOD')
+
+
+@pytest.mark.parametrize('bad', [*BAD, 'knocked by 1.5 %', 'knocked by -10 %'])
+@pytest.mark.parametrize('model', ['auto', '7', '9', '10', '12'])
+@tried(6)
+@given(errors=ERRORS, count=FEW, seed=SEEDS, angles=ANGLES, place=st.floats(0.0, 0.99))
+def test_a_bad_row_among_few_poses_is_located_or_the_fit_warns(
+        model, bad, errors, count, seed, angles, place):
+    if model == '7':
+        errors = {**errors, 'cross_axis': np.zeros(3)}
+    poses, row = poses_of(errors, count, seed, angles, known=model == '12'), int(place * count)
+    wrong = {**BAD, 'knocked by 1.5 %': lambda reading: 1.015 * reading,
+             'knocked by -10 %': lambda reading: 0.9 * reading}
+    poses.reading[row] = wrong[bad](poses.reading[row])
+    try:
+        found = fit_poses(poses, G, model=model)
+    except RefusedFitError:
+        return
+    error = error_of(found, model_with(errors))
+    assert error <= SURE * uncertainty_g(found) or is_warned(found)
+
+
+@pytest.mark.parametrize('model', ['4', '7', '10'])
+@tried(40)
+@given(errors=ERRORS, count=st.integers(11, 16), seed=SEEDS, angles=ANGLES)
+def test_clean_poses_have_no_doubt_about_an_outlier(model, errors, count, seed, angles):
+    known = {'4': ['offset'], '7': ['offset', 'axis_gain'], '10': list(errors)}[model]
+    poses = poses_of({name: errors[name] for name in known}, count, seed, angles)
+    found = fit_poses(poses, G, model=model)
+    assert not any(line.startswith(NOT_LOCATED) for line in found.warnings)
+
+
+def test_a_good_row_that_is_left_out_is_named_beside_the_bad_row():
+    errors = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array([0.01, -0.02, 0.015]),
+              'cross_axis': np.array([0.01, -0.005, 0.008])}
+    poses = poses_of(errors, 11, 0, (0.3, 0.2, 0.1))
+    poses.reading[5] *= 1.03
+    found = fit_poses(poses, G, model='10')
+    doubt = next(line for line in found.warnings if line.startswith(NOT_LOCATED))
+    assert rows_left_out(found) == {2}
+    assert '6' in re.findall(r'\d+', doubt)
+    assert rate(found).name != 'GOOD'
+    assert error_of(found, model_with(errors)) <= SURE * uncertainty_g(found)
+
+
+@tried(20)
+@given(seed=SEEDS, wrong=st.sampled_from([15, 16]), knock=st.floats(0.02, 0.1))
+def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock):
+    up = np.vstack([np.eye(3), -np.eye(3)])[[0, 1, 2, 3, 4] * 3 + [5, 5]]
+    sensor = model_with({'offset': np.array([0.03, -0.02, 0.04])})
+    poses = simulate_poses(sensor, up, np.random.default_rng(seed), noise_g=1e-3)
+    poses.reading[wrong] *= 1.0 + knock
+    found = fit_poses(poses, G, model='7')
+    doubt = next(line for line in found.warnings if line.startswith(NOT_LOCATED))
+    assert 'row 16' in doubt
+    assert 'row 17' in doubt
+    assert rate(found).name != 'GOOD'
+    assert error_of(found, sensor) <= SURE * uncertainty_g(found)
 
 
 @pytest.mark.parametrize('bad', ['zero', 'huge', 'overflowing', 'doubled', 'in another unit'])

@@ -31,7 +31,7 @@ from .mounting import FrameName, FRAMES
 from .outside import joined_ranges, Outside, outside, USES_LIMIT
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
-from .quality import in_g, Verification, verify
+from .quality import in_g, NOT_LOCATED, UNCHECKED, Verification, verify
 from .rest_noise import (
     gyro_bias_of,
     GyroBias,
@@ -41,9 +41,10 @@ from .rest_noise import (
 )
 from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
 
-__all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR',
-           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FrameName', 'GyroBias', 'Method',
-           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'SampleNoise', 'Verification',
+__all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES',
+           'NOT_LOCATED', 'PRIOR', 'STORED_METHODS', 'UNCHECKED', 'USES_LIMIT', 'Calibration',
+           'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside', 'Quality',
+           'Rejected', 'SampleNoise', 'Verification',
            'carried_words', 'check_sensor', 'check_units', 'converted', 'directions_of',
            'fit_partial', 'fit_poses', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
            'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples', 'outlook',

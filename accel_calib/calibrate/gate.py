@@ -9,6 +9,9 @@ A fit has already converged (`accel_calib.estimate.fit`), and its poses determin
 valid covariance, plausible offset, gain and effects, and a useful uncertainty. The limits are far
 beyond the values of working sensors; only useless calibrations exceed them.
 
+Each limit is written as `not value <= limit`, so that NaN does not pass it. Absurd values may
+overflow on the way; infinity does not pass either.
+
 A calibration without effects, such as a mounting alone, has no residual of a fit to check. The
 uncertainty of a partial fit (`.partial`) is limited by that of common sensors, and its warning
 states it. It has no other limit.
@@ -22,6 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from .calibration import Calibration, Rejected
+from .quality import NOT_LOCATED
 from .unknown_orientation import PRIOR
 from ..effects import LADDER
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
@@ -55,6 +59,7 @@ _UNCERTAIN = 'the uncertainty of |a| is up to'
 _CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
 
 
+@np.errstate(over='ignore', invalid='ignore')
 def gated(calibration: Calibration) -> Calibration:
     """
     Check a calibration, and return it with a warning if its uncertainty is large.
@@ -81,7 +86,7 @@ def gated(calibration: Calibration) -> Calibration:
     _check_gain(calibration)
     _check_effects(calibration)
     residual = calibration.quality.rms_after_mg / MG
-    if calibration.model.effects and residual > LARGEST_RESIDUAL_G:
+    if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
             f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
@@ -90,8 +95,8 @@ def gated(calibration: Calibration) -> Calibration:
 
 def _check_numbers(calibration: Calibration) -> None:
     model = calibration.model
-    for what, values in (('value', model.vector), ('rotation', model.rotation),
-                         ('covariance', calibration.covariance)):
+    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
+                         ('rotation', model.rotation), ('covariance', calibration.covariance)):
         if not np.all(np.isfinite(values)):
             raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
                                   'finite numbers', _CHECK_POSES)
@@ -122,15 +127,15 @@ def _check_covariance(covariance: Floats) -> None:
 def _check_gain(calibration: Calibration) -> None:
     mat_w, vec_v = calibration.model.linear_part
     gains = np.linalg.svd(mat_w, compute_uv=False)
-    if np.linalg.det(mat_w) <= 0.0 and calibration.name != '12':
+    if not np.linalg.det(mat_w) > 0.0 and calibration.name != '12':
         raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
                               _CHECK_POSES)
-    if gains[-1] < GAINS[0] or gains[0] > GAINS[1]:
+    if not GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1]:
         raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
                               f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     offset = float(np.linalg.norm(vec_v))
-    if calibration.units.name != 'native' and offset > LARGEST_OFFSET_G:
+    if calibration.units.name != 'native' and not offset <= LARGEST_OFFSET_G:
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
 
@@ -146,7 +151,7 @@ def _check_effects(calibration: Calibration) -> None:
         if any(key not in used for key in model.needs if key != 'previous'):
             continue
         added = _contribution(model, used, calibration.units)
-        if added > effect.plausible_g:
+        if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)
 
@@ -197,11 +202,12 @@ def _with_warning(calibration: Calibration) -> Calibration:
     if calibration.method == PRIOR:
         return calibration
     uncertain = uncertainty_g(calibration)
-    if uncertain > LARGEST_UNCERTAINTY_G:
+    if not uncertain <= LARGEST_UNCERTAINTY_G:
         raise RefusedFitError(
             f'the poses do not determine the calibration: the uncertainty of |a| is up to '
             f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
-            TAKE_ALL_SIDES)
+            next((line for line in calibration.warnings if line.startswith(NOT_LOCATED)),
+                 TAKE_ALL_SIDES))
     others = tuple(line for line in calibration.warnings if not line.startswith(_UNCERTAIN))
     if uncertain < _WARN_UNCERTAINTY_G:
         return replace(calibration, warnings=others)

@@ -22,7 +22,7 @@ import numpy as np
 
 from .calibration import Calibration, Rejected
 from .pose_planning import determines, refuse_if_unfit
-from .quality import fit_warnings, in_g, quality_of
+from .quality import fit_warnings, in_g, quality_of, rival_warnings
 from .unknown_orientation import (
     calibration_of,
     directions_of,
@@ -33,6 +33,7 @@ from .unknown_orientation import (
 from ..errors import RefusedFitError
 from ..estimate.closed_form import faces, fit_12
 from ..estimate.fit import estimate, Fit
+from ..estimate.mistakes import covariance_with, rivals
 from ..estimate.outliers import outliers
 from ..model import force_slope, MODELS, parameter_basis, sensor_force, with_vector
 from ..sphere import unit
@@ -66,9 +67,12 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     refuse_if_unfit('12', unit(poses['reference']))
     fit, rejected = _fit(in_g(poses, units), method)
     quality = quality_of(fit, units, unit(fit.poses_g['reference']))
-    return Calibration('12', method, fit.model, units, '', 'ros', '', fit.covariance, quality,
-                       poses, rejected, reason,
-                       (*fit_warnings(fit, 0.0), *_placement_warning(fit)))
+    kept = np.flatnonzero(~np.isin(poses.row, [each.row for each in rejected]))
+    unlike = rivals(fit, kept, in_g(poses, units), lambda others: estimate(fit.model, others))
+    return Calibration('12', method, fit.model, units, '', 'ros', '', covariance_with(fit, unlike),
+                       quality, poses, rejected, reason,
+                       (*rival_warnings(unlike, poses.row), *fit_warnings(fit, 0.0),
+                        *_placement_warning(fit)))
 
 
 def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
@@ -121,7 +125,8 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     if np.linalg.det(rotation) < 0.0:  # mirrored axes: only W can show them
         return None
     away = unit(u) - known @ rotation.T
-    if not _is_placement(away, _tangential_variance(found.fit, u), found.fit.variance_dof):
+    variance = _tangential_variance(found.fit, found.covariance, u)
+    if not _is_placement(away, variance, found.fit.variance_dof):
         return None
     angle = np.degrees(np.linalg.norm(away, axis=1))
     words = (f'the known orientations differ by {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) from a '
@@ -157,10 +162,10 @@ def _rotation_onto(directions: Floats, known: Floats) -> Floats:
     return rotation
 
 
-def _tangential_variance(fit: Fit, u: Floats) -> Floats:
+def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
     """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
     moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
-    spread = moved @ fit.covariance @ np.swapaxes(moved, 1, 2)
+    spread = moved @ covariance @ np.swapaxes(moved, 1, 2)
     along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
     own = 2.0 * fit.equations.scale ** 2 * fit.variance
     return own + np.trace(spread, axis1=1, axis2=2) - along

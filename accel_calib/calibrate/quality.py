@@ -17,11 +17,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .calibration import Calibration, check_sensor, Quality
+from ..errors import listed
 from ..estimate.equations import noise_of
 from ..estimate.fit import Fit, judge
 from ..estimate.geometry import coverage, WEAK_DILUTION
+from ..estimate.mistakes import Rival, unseen_mistakes
 from ..model import correct, Model, sensor_force
 from ..sphere import unit
 from ..table import Floats, Poses
@@ -244,6 +247,21 @@ _UNCOVERED = 'the poses leave a region of the sphere uncovered'
 _NO_NOISE = 'the poses have no std and count'
 _TOO_LARGE = 'the residuals are'
 
+NOT_LOCATED = 'which row is the outlier is not certain'
+"""Beginning of the warning about poses that may be wrong instead of those left out."""
+
+UNCHECKED = 'the other poses hardly check'
+"""Beginning of the warning about poses whose mistake does not show."""
+
+_UNSEEN_G = 0.01
+"""Mistakes of such poses that do not show are reported above this size [g]."""
+
+_WHOLE_G = 1.0
+"""Mistakes above this size are all called large [g]."""
+
+_MOST_NAMED = 5
+"""Largest number of rows in a warning."""
+
 _LARGE_CHI2 = 4.0
 """chi² per degree of freedom above which a fit warns."""
 
@@ -264,10 +282,41 @@ def fit_warnings(fit: Fit, dilution: float) -> tuple[str, ...]:
         warnings.append(f'{_TOO_LARGE} {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of the '
                         'pose means: poses repeat worse than the noise of their samples predicts, '
                         'or the model lacks an effect')
-    return tuple(warnings)
+    return (*warnings, *_unchecked_warning(fit))
+
+
+def _unchecked_warning(fit: Fit) -> tuple[str, ...]:
+    """Return a warning about poses whose mistake the other poses do not show, or none."""
+    if fit.dof == 0 or fit.prior is not None:
+        return ()
+    unseen = unseen_mistakes(fit)
+    rows = fit.poses_g.row[unseen > _UNSEEN_G].tolist()
+    if not rows:
+        return ()
+    largest = float(np.max(unseen))
+    size = f'a mistake of {largest * MG:.0f} mg' if largest < _WHOLE_G else 'any mistake'
+    return (f'{UNCHECKED} {listed("row", rows[:_MOST_NAMED])}{_and_more(rows)}: {size} would move '
+            'the result and not show; take one more pose in about the same orientation',)
+
+
+def rival_warnings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> tuple[str, ...]:
+    """Return a warning about poses that may be wrong instead of those left out, or none."""
+    if not found:
+        return ()
+    out, instead = (sorted({int(row[index]) for index in indices}) for indices in
+                    ([each.left_out for each in found], [each.instead for each in found]))
+    return (f'{NOT_LOCATED}: {listed("row", out)} is left out, but the poses agree about as well '
+            f'without {"one of " if len(instead) > 1 else ""}'
+            f'{listed("row", instead[:_MOST_NAMED])}{_and_more(instead)} instead; the '
+            'uncertainty includes both cases; take these poses again, or take more poses',)
+
+
+def _and_more(rows: list[int]) -> str:
+    return f' and {len(rows) - _MOST_NAMED} more' if len(rows) > _MOST_NAMED else ''
 
 
 def other_warnings(warnings: tuple[str, ...]) -> tuple[str, ...]:
     """Return the warnings that do not come from `fit_warnings`."""
     return tuple(line for line in warnings
-                 if not line.startswith((_NO_DOF, _UNCOVERED, _NO_NOISE, _TOO_LARGE)))
+                 if not line.startswith((_NO_DOF, _UNCOVERED, _NO_NOISE, _TOO_LARGE, NOT_LOCATED,
+                                         UNCHECKED)))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, Rejected
 from .pose_planning import refuse_if_unfit, unseen
-from .quality import fit_warnings, in_g, quality_of
+from .quality import fit_warnings, in_g, quality_of, rival_warnings
 from ..errors import listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
 from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Point, solve
@@ -38,6 +38,7 @@ from ..estimate.geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
+from ..estimate.mistakes import covariance_with, Rival, rivals
 from ..estimate.outliers import fit_norm, originals, start_of
 from ..model import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..sphere import unit
@@ -103,6 +104,8 @@ class NormFit:
         Approximate directions of up of the poses kept.
     warnings : tuple of str
         Warnings for the user.
+    rivals : tuple of Rival
+        Poses that may be wrong instead of those left out.
 
     """
 
@@ -113,6 +116,12 @@ class NormFit:
     left_out: NDArray[np.intp]
     directions: Floats
     warnings: tuple[str, ...]
+    rivals: tuple[Rival, ...] = ()
+
+    @property
+    def covariance(self) -> Floats:
+        """Return the covariance, which includes the fits of the rivals."""
+        return covariance_with(self.fit, self.rivals)
 
 
 def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
@@ -127,7 +136,7 @@ def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -
     rejected = _rejections(in_g(poses, units), found)
     quality = quality_of(found.fit, units, found.directions)
     return Calibration(found.name, method, found.fit.model, units, '', 'ros', '',
-                       found.fit.covariance, quality, poses, rejected, found.reason,
+                       found.covariance, quality, poses, rejected, found.reason,
                        found.warnings)
 
 
@@ -182,11 +191,27 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
     fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
     name, reason = ((model, f'model {model} was requested') if model != 'auto'
                     else _choose(fits))
-    warnings = (*copy_warning(original, poses_g), *fit_warnings(fits[name], dilutions[name]))
+    unlike = _rivals(name, fits[name], kept, np.unique(original), poses_g)
+    warnings = (*copy_warning(original, poses_g), *rival_warnings(unlike, poses_g.row),
+                *fit_warnings(fits[name], dilutions[name]))
     if model == 'auto':
         warnings = (*warnings, *unseen(list(dilutions)[-1], used, noise))
     return NormFit(name, reason, fits[name], kept, np.flatnonzero(~np.isin(original, kept)), used,
-                   warnings)
+                   warnings, unlike)
+
+
+def _rivals(name: str, fit: Fit, kept: NDArray[np.intp], distinct: NDArray[np.intp],
+            poses_g: Poses) -> tuple[Rival, ...]:
+    """Return the rivals of a fit to the poses kept, given the indices without copies."""
+    def refit(others: Poses) -> Fit:
+        found = estimate(start_of('10' if name == '9' else name, others.reading), others)
+        return _in_sensing_axes(found.model.linear_part, others) if name == '9' else found
+
+    if len(kept) == len(distinct):
+        return ()
+    found = rivals(fit, np.searchsorted(distinct, kept), poses_g.take(distinct), refit)
+    return tuple(each._replace(left_out=int(distinct[each.left_out]),
+                               instead=int(distinct[each.instead])) for each in found)
 
 
 def copy_warning(original: NDArray[np.intp], poses: Poses) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from .limits import (
     TO_CHECK,
     WORST_ERROR,
 )
-from ..calibrate import Calibration, EDITED, FLAT
+from ..calibrate import Calibration, EDITED, FLAT, NOT_LOCATED, UNCHECKED
 from ..calibrate.checks import axes_of, fault_of
 from ..calibrate.mounting import flat_direction
 from ..effects import EMPIRICAL, WANDER
@@ -54,8 +54,9 @@ def shortcomings(expected: Expected, refinement: Refinement | None) -> list[Shor
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
     return [*_refused(expected, refinement), *_wrong_axes(expected), *_too_large(expected),
-            *_limited(expected), *_unchecked(expected), *named, *_inexact(expected, error),
-            *_left_out(expected)]
+            *_limited(expected), *_warned(expected, NOT_LOCATED), *_unchecked(expected), *named,
+            *_inexact(expected, error),
+            *_left_out(expected), *_warned(expected, UNCHECKED)]
 
 
 def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Shortcoming]:
@@ -112,6 +113,14 @@ def _limited(expected: Expected) -> Iterator[Shortcoming]:
     elif expected.is_partial:
         yield Shortcoming('USABLE', 'the poses lie near one direction: in other orientations the '
                           f'error is up to {mg(expected.worst_mg)}', _more_poses(expected))
+
+
+def _warned(expected: Expected, begin: str) -> Iterator[Shortcoming]:
+    """Yield a shortcoming for each warning of the fit with this beginning."""
+    for line in expected.calibration.warnings:
+        if line.startswith(begin):
+            reason, _, remedy = line.rpartition('; ')
+            yield Shortcoming('USABLE', reason, remedy)
 
 
 def _unchecked(expected: Expected) -> Iterator[Shortcoming]:
