@@ -25,6 +25,9 @@ from .units import Floats, UnitName
 __all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Recording', 'Table', 'check_values',
            'columns_from', 'numbered', 'present']
 
+LARGEST = 1e30
+"""Larger numbers are damage. The products of smaller ones do not overflow."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -230,15 +233,13 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
     Raises
     ------
     InputError
-        If a number is not finite, a count not above 0, or a standard deviation below 0.
+        If a number is not finite or beyond any sensor, a count not above 0, or a standard
+        deviation below 0.
 
     """
     for key, values in columns.items():
-        if key != 'label' and not np.all(np.isfinite(values)):
-            bad = int(np.argmin(np.isfinite(values.reshape(len(values), -1)).all(axis=1)))
-            raise InputError(f'{source}: row {bad + 1} of {", ".join(COLUMNS[key].names)} holds a '
-                             'number that is not finite, expected finite numbers',
-                             'correct the row or remove it')
+        if key != 'label' and not np.all(np.abs(values) < LARGEST):
+            raise _beyond(key, values.reshape(len(values), -1), source)
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
                          'positive numbers', 'enter the number of samples of each pose')
@@ -247,3 +248,13 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
             one, two, three = COLUMNS[key].names
             raise InputError(f'{source}: column {one}, {two} or {three} holds negative numbers, '
                              'expected 0 or more', 'enter standard deviations')
+
+
+def _beyond(key: str, values: NDArray[Any], source: str) -> InputError:
+    """Return the error for a number that is not finite, or beyond any sensor."""
+    sound = np.abs(values) < LARGEST
+    row = int(np.argmin(sound.all(axis=1)))
+    number = float(values[row][~sound[row]][0])
+    what = f'the number {number:.3g}' if np.isfinite(number) else 'a number that is not finite'
+    return InputError(f'{source}: row {row + 1} of {", ".join(COLUMNS[key].names)} holds {what}, '
+                      f'expected finite numbers below {LARGEST:g}', 'correct the row or remove it')

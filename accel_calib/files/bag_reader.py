@@ -53,7 +53,8 @@ _LONGEST_REASON = 400
 _IN_URI = {'?', '#', '%'}
 """Letters that `rosbags` does not escape when it opens a db3 file by its URI."""
 
-_BY_VALUE = (errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG)
+_BY_VALUE = (errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG,
+             errno.ENAMETOOLONG, errno.ENOTDIR)
 """System errors that a damaged size or place in a file causes; others are not about its bytes."""
 
 

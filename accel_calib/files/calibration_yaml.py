@@ -95,6 +95,10 @@ _OTHERS = 10_000
 _LARGEST = 1e30
 """Largest magnitude of the values of effects and of their covariance; far beyond all sensors."""
 
+_PER_G: Mapping[str, tuple[float, float]] = {
+    'm/s2': (0.1, 100.0), 'g': (1.0, 1.0), 'native': (1.0 / _LARGEST, _LARGEST)}
+"""Range of 1 g, by unit; for m/s² gravity on planets and moons."""
+
 _LONGEST_NAME = 4096
 """Longest name of an effect, a sensor or a topic, which messages repeat."""
 
@@ -282,6 +286,16 @@ def _check_version(content: Any, name: str) -> None:
                                      'update accel_calib, or fit again')
 
 
+def _units(content: Mapping[str, Any]) -> Units:
+    """Return the unit of the readings; raise ValueError if 1 g in it is implausible."""
+    name, per_g = choice_at(content, 'readings', UNIT_NAMES), number_at(content, 'per_g')
+    low, high = _PER_G[name]
+    if not low <= per_g <= high:
+        expected = f'{low:g}' if low == high else f'{low:g} to {high:g}'
+        raise ValueError(f'per_g is {shown(per_g)}, expected {expected} for {name}')
+    return Units(name, per_g)
+
+
 def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Return the record with the content of a file; raise ValueError for an unexpected value."""
     values = {name: _values(effect_named(name), effect)
@@ -294,7 +308,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
     calibration = Calibration(
         name=choice_at(content, 'model', _NAMES),
         method=choice_at(content, 'method', STORED_METHODS), model=model,
-        units=Units(choice_at(units, 'readings', UNIT_NAMES), number_at(units, 'per_g')),
+        units=_units(units),
         sensor=text_at(content, 'sensor', _LONGEST_NAME),
         stream=text_at({'stream': '', **content}, 'stream', _LONGEST_NAME),
         frame=choice_at(content, 'frame', FRAMES), date=text_at(content, 'date', _LONGEST_NAME),

@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Seeded damage to files of every kind that is read.
+Seeded damage to files of every kind that is read, and random files.
 
-Each case changes a sound file: bytes flipped, removed, repeated or inserted, numbers replaced by
-extreme ones, the file cut or joined with another one. The reader must end with a result or with an
-error of this package, and within a time limit.
+Most cases change a sound file: bytes flipped, removed, repeated or inserted, numbers replaced by
+others, the file cut or joined with another one. Others are made at random: tables (``table``),
+calibrations with values of wrong types (``tree``), bags of damaged messages (``messages``). The
+reader must end with a result or with an error of this package, print nothing, and keep within a
+time limit. ``command`` runs the command line on files of all kinds. It must end with exit status 0
+or 1, or with 2 and one line.
 
 Run many cases by hand: ``python test/faults/fuzz.py --count 100000 --seed 7 csv yaml``.
 
@@ -17,106 +20,257 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+import io
+import os
 from pathlib import Path
+import re
+import shutil
 import signal
 import sys
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
+import time
+import warnings
 
-import accel_calib as ac
-from accel_calib.errors import AccelCalibError
-from accel_calib.files import read_calibration, read_log, write_calibration, write_table
-from accel_calib.intake import poses_of
-import numpy as np
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-LOGS = Path(__file__).parents[1] / 'data' / 'logs'
-_EXTREME = (b'1e300', b'-1e308', b'nan', b'inf', b'9' * 400, b'0x_', b'', b'"', b"'", b'\x00',
-            b'\x1b[31m', b',', b';', b'\n', b'&a', b'*a', b'1:30', b'2026-01-01', b'\xff\xfe')
+import accel_calib as ac  # noqa: E402
+from accel_calib.cli.main import main as command_line  # noqa: E402
+from accel_calib.errors import AccelCalibError, InputError  # noqa: E402
+from accel_calib.files import LogOptions, read_calibration, read_log, write_table  # noqa: E402
+from accel_calib.intake import poses_of  # noqa: E402
+from faults import inputs  # noqa: E402
+from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
+import numpy as np  # noqa: E402
+
+Rng = np.random.Generator
+Make = Callable[[Rng], Files]
+Read = Callable[[Path, Rng], object]
+
+_NUMBER = re.compile(rb'-?\d+\.?\d*')
+_REFUSAL = re.compile(r'(note: [^\n]*\n(  [^\n]*\n)*)*accel-calib [^\n]*\n')
+"""What a refused command prints: one line, after notes about a calibration edited by hand."""
+
 _LIMIT_S = 20
+_SHOWN_EVERY = 10_000
+_SHOWN = 500
+_MEMORY = Path('/dev/shm')
+_NOT_SHOWN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+"""Warnings that Python does not show to users."""
 
 
-class TooSlowError(Exception):
-    """A case took longer than the limit."""
+class TooSlowError(BaseException):
+    """A case took longer than the limit; not an Exception, which a reader can catch."""
 
 
-def starts(kind: str, folder: Path) -> list[Path]:
-    """Return sound files of a kind."""
-    if kind == 'yaml':
-        poses = ac.simulate({'offset': [0.02, -0.01, 0.03]}, poses=20, seed=1)
-        write_calibration(folder / 'c.yaml', ac.fit(poses))
-        return [folder / 'c.yaml']
-    if kind == 'poses':
-        write_table(folder / 'poses.csv', ac.simulate({}, poses=20, temperature=(20, 30), seed=1))
-        return [folder / 'poses.csv']
-    suffixes = {'csv': ('.csv', '.log', '.txt'), 'ulg': ('.ulg',), 'bin': ('.bin',)}[kind]
-    return sorted(path for path in LOGS.rglob('*') if path.suffix in suffixes)
+class NotAllowedError(Exception):
+    """A command ended in another way than the rules allow."""
 
 
-READERS: dict[str, Callable[[Path], object]] = {
-    'yaml': read_calibration, 'poses': lambda path: ac.fit(poses_of(path).poses),
-    'csv': read_log, 'ulg': read_log, 'bin': read_log}
+# -------------------------------------------------------------------------------------- damage
 
-
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+def damaged(data: bytes, rng: Rng) -> bytes:
     """Return data with one to four changes."""
     for _ in range(int(rng.integers(1, 5))):
         at, length = (int(rng.integers(0, max(len(data), 1))) for _ in range(2))
         span = slice(at, min(len(data), at + 1 + length % 64))
-        how = int(rng.integers(0, 7))
-        extreme = _EXTREME[int(rng.integers(0, len(_EXTREME)))]
-        piece = (rng.bytes(1 + length % 8), extreme, b'', data[span] * 3, extreme,
-                 data[span][::-1], data[at:])[how]
+        how = int(rng.integers(0, 9))
+        extreme = EXTREME[int(rng.integers(0, len(EXTREME)))]
+        number = _NUMBER.search(data, at)
+        if how > 6 and number:
+            other = b'%.9g' % (rng.normal() * 10.0 ** int(rng.integers(-3, 5)))
+            span, piece = slice(*number.span()), (other, extreme)[how - 7]
+        else:
+            piece = (rng.bytes(1 + length % 8), extreme, b'', data[span] * 3, extreme,
+                     data[span][::-1], data[at:])[how % 7]
         data = data[:at] if how == 6 and length % 2 else (
             data[:span.start] + piece + data[span.stop:])
     return data
 
 
+def damage(kind: str) -> Make:
+    """Return the maker of damaged files of a kind."""
+    sound = inputs.sound(kind)
+
+    def make(rng: Rng) -> Files:
+        files = sound[int(rng.integers(0, len(sound)))]
+        name = sorted(files.content)[int(rng.integers(0, len(files.content)))]
+        return Files(files.name, {**files.content, name: damaged(files.content[name], rng)})
+    return make
+
+
+# ------------------------------------------------------------------------------------- readers
+
+def _log(path: Path, rng: Rng) -> object:
+    """Read a log, at times with options."""
+    if rng.random() < 0.7:
+        return read_log(path)
+    units = ('', 'g', 'm/s2', 'native')[int(rng.integers(4))]
+    return read_log(path, LogOptions(skip_bad=bool(rng.integers(2)), units=units,  # type: ignore
+                                     rate=(None, 50.0)[int(rng.integers(2))]))
+
+
+def _fitted(path: Path, rng: Rng) -> object:
+    """Fit the poses of a table, as captured if it holds samples."""
+    return ac.fit(poses_of(path).poses)
+
+
+def _run(path: Path, rng: Rng) -> object:
+    """Run a random command on a file, and check how it ends."""
+    table, calibration, out = (path.parents[1] / name for name in ('poses.csv', 'c.yaml', 'out'))
+    file, good, made, poses = map(str, (path, calibration, out, table))
+    of_yaml = [['verify', poses, '-c', file], ['apply', poses, '-c', file, '-o', made],
+               ['compare', file, good], ['history', file, good],
+               ['export', file, '--to', 'json', '-o', made], ['export', file, '--to', 'px4']]
+    of_log = [['capture', file, '-o', made], ['fit', file, '-o', made, '--json', '-'],
+              ['verify', file, '-c', good], ['apply', file, '-c', good, '-o', made],
+              ['calibrate', file, '-o', made, '--no-refine', '--json', '-'], ['noise', file]]
+    commands = of_yaml if path.suffix == '.yaml' else of_log
+    return checked([*commands[int(rng.integers(len(commands)))]], out)
+
+
+def checked(arguments: list[str], out: Path) -> int:
+    """Run a command, and check its exit status, what it prints and what it leaves."""
+    for each in (out, out.with_suffix('.html')):
+        shutil.rmtree(each) if each.is_dir() else each.unlink(missing_ok=True)
+    before = set(out.parent.iterdir())
+    with redirect_stderr(io.StringIO()) as errors, redirect_stdout(io.StringIO()) as printed:
+        status = command_line(arguments)
+    text, left = errors.getvalue(), set(out.parent.iterdir()) - before
+    if '\x1b' in text + printed.getvalue():
+        raise NotAllowedError(f'{arguments[0]} prints an escape character')
+    if status not in (0, 1, 2) or 'internal error' in text:
+        raise NotAllowedError(f'{arguments[0]} exit status {status}: {text}')
+    if status == 2 and not _REFUSAL.fullmatch(text):
+        raise NotAllowedError(f'{arguments[0]} exit status {status}, prints {text!r}')
+    if status == 2 and left:
+        raise NotAllowedError(f'{arguments[0]} exit status 2, leaves {sorted(left)}')
+    if status == 2:
+        raise InputError(text.splitlines()[-1], '')
+    return status
+
+
+def _of_all() -> Make:
+    """Return the maker of files of all kinds, for the command line."""
+    makes = [KINDS[kind][0]() for kind in KINDS if kind != 'command']
+    return lambda rng: makes[int(rng.integers(len(makes)))](rng)
+
+
+KINDS: dict[str, tuple[Callable[[], Make], Read]] = {
+    'yaml': (lambda: damage('yaml'), lambda path, rng: read_calibration(path)),
+    'poses': (lambda: damage('poses'), _fitted),
+    **{kind: (lambda kind=kind: damage(kind), _log)  # type: ignore[misc]
+       for kind in ('csv', 'ulg', 'bin', *BAGS)},
+    'table': (lambda: inputs.random_table, _log),
+    'tree': (inputs.random_trees, lambda path, rng: read_calibration(path)),
+    'messages': (inputs.random_messages, _log),
+    'command': (_of_all, _run)}
+"""Maker and reader of each kind."""
+
+
+# --------------------------------------------------------------------------------------- cases
+
 def outcomes(kind: str, count: int, seed: int) -> Iterator[tuple[int, str]]:
-    """Yield the number of each case, and how it ended: ``read``, ``refused`` or an error."""
-    with TemporaryDirectory() as name:
+    """Yield the number of each case, and how it ended: ``read``, ``refused`` or a finding."""
+    make, read = KINDS[kind][0](), KINDS[kind][1]
+    with TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else None) as name:
         folder = Path(name)
-        sound = [(path.suffix, path.read_bytes()) for path in starts(kind, folder)]
-        for case in range(count):
-            rng = np.random.default_rng([seed, case])
-            suffix, data = sound[int(rng.integers(0, len(sound)))]
-            path = folder / f'damaged{suffix}'
-            path.write_bytes(damaged(data, rng))
-            yield case, _outcome(READERS[kind], path)
+        inputs.sound('yaml')[0].write(folder)
+        write_table(folder / 'poses.csv', ac.simulate({}, poses=12, seed=1))
+        with _heard() as heard:
+            for case in range(count):
+                rng = np.random.default_rng([seed, case])
+                path = make(rng).write(folder / 'case')
+                outcome = ended(read, path, rng)
+                printed = heard()
+                yield case, f'prints {printed}' if printed else outcome
 
 
-def _outcome(read: Callable[[Path], object], path: Path) -> str:
+def ended(read: Read, path: Path, rng: Rng) -> str:
+    """Read a file; return ``read``, ``refused``, or what no reader should do."""
     def stop(number: int, frame: object) -> None:
         raise TooSlowError(f'more than {_LIMIT_S} s')
 
     signal.signal(signal.SIGALRM, stop)
     signal.alarm(_LIMIT_S)
     try:
-        read(path)
+        read(path, rng)
     except AccelCalibError as err:
         return 'refused' if '\n' not in str(err) else f'of several lines: {err}'
-    except Exception as err:  # any other error is a finding
+    except (Exception, TooSlowError) as err:  # any other error is a finding
         return f'{type(err).__name__}: {err}'
     finally:
         signal.alarm(0)
     return 'read'
 
 
+@contextmanager
+def _heard() -> Iterator[Callable[[], str]]:
+    """Yield a function that returns what was printed or warned of since the last call."""
+    kept = os.dup(2)
+    with (TemporaryFile() as file, os.fdopen(os.dup(file.fileno()), 'w') as errors,
+          warnings.catch_warnings(record=True) as warned):
+        warnings.simplefilter('always')
+        for kind in _NOT_SHOWN:
+            warnings.simplefilter('ignore', kind)
+
+        def heard() -> str:
+            errors.flush()
+            words = [f'{each.category.__name__}: {each.message} ({each.filename}, line '
+                     f'{each.lineno})' for each in warned]
+            warned.clear()
+            if os.fstat(file.fileno()).st_size:
+                words.append(os.pread(file.fileno(), _SHOWN, 0).decode(errors='replace'))
+                os.ftruncate(file.fileno(), 0)
+                os.lseek(file.fileno(), 0, os.SEEK_SET)
+            return '; '.join(words)
+
+        os.dup2(file.fileno(), 2)
+        try:
+            with redirect_stderr(errors):
+                yield heard
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
 def main() -> int:
     """Print the number of each outcome, and the first case of each finding."""
-    parser = argparse.ArgumentParser(description='Read damaged files.')
-    parser.add_argument('kinds', nargs='*', default=list(READERS), choices=list(READERS))
+    parser = argparse.ArgumentParser(description='Read damaged and random files.')
+    parser.add_argument('kinds', nargs='*', default='all', choices=['all', *KINDS])
     parser.add_argument('--count', type=int, default=1000)
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
     found: Counter[str] = Counter()
-    for kind in args.kinds:
-        counts: Counter[str] = Counter()
-        for case, outcome in outcomes(kind, args.count, args.seed):
-            if outcome not in ('read', 'refused') and not found[outcome[:60]]:
-                sys.stdout.write(f'{kind}, case {case}: {outcome[:300]}\n')
-            found[outcome[:60]] += 1
-            counts[outcome if outcome in ('read', 'refused') else 'finding'] += 1
-        sys.stdout.write(f'{kind}: {dict(counts)}\n')
+    for kind in KINDS if 'all' in args.kinds else args.kinds:
+        _show(kind, args.count, args.seed, found)
     return int(bool(set(found) - {'read', 'refused'}))
+
+
+def _show(kind: str, count: int, seed: int, found: Counter[str]) -> None:
+    """Run the cases of a kind, print the outcomes, and add them to those found."""
+    counts: Counter[str] = Counter()
+    start = last = time.monotonic()
+    slowest = (0.0, 0)
+    for case, outcome in outcomes(kind, count, seed):
+        now = time.monotonic()
+        slowest, last = max(slowest, (now - last, case)), now
+        sound = outcome in ('read', 'refused')
+        key = outcome if sound else re.sub(r'[\dxa-f]+', '0', outcome)[:80]
+        if not sound and not found[key]:
+            _say(f'{kind}, case {case}: {outcome[:_SHOWN]}')
+        found[key] += 1
+        counts[outcome if sound else 'finding'] += 1
+        if not (case + 1) % _SHOWN_EVERY:
+            _say(f'{kind}: {case + 1} {dict(counts)}')
+    _say(f'{kind}: {dict(counts)}, {count / (time.monotonic() - start):.0f} per second, the '
+         f'slowest is case {slowest[1]} with {slowest[0]:.2f} s')
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f'{line}\n')
+    sys.stdout.flush()
 
 
 if __name__ == '__main__':

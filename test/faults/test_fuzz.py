@@ -1,20 +1,115 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A part of the seeded damage of fuzz.py: every file ends in a result or in one line."""
+"""A part of the seeded cases of fuzz.py: every file ends in a result or in one line."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from importlib.util import find_spec
+import os
+from pathlib import Path
+import struct
+import warnings
 
-from faults.fuzz import outcomes, READERS
+from accel_calib.errors import DamagedCalibrationError, InputError
+from accel_calib.files import read_calibration, read_log
+from accel_calib.files.logs.px4 import MAGIC
+from faults import inputs
+from faults.fuzz import KINDS, outcomes
+from faults.inputs import Files
 import pytest
 
-_CASES = {'ulg': 60, 'bin': 60}
+_CASES = {'ulg': 60, 'bin': 60, 'sqlite3': 60, 'compressed': 80, 'command': 60}
 _NEEDED = {'ulg': 'pyulog', 'bin': 'pymavlink'}
 
 
-@pytest.mark.parametrize('kind', READERS)
+@pytest.mark.parametrize('kind', KINDS)
 def test_a_damaged_file_ends_in_a_result_or_in_one_line(kind: str) -> None:
     if kind in _NEEDED and find_spec(_NEEDED[kind]) is None:
         pytest.skip(f'{_NEEDED[kind]} is not installed')
-    for case, outcome in outcomes(kind, _CASES.get(kind, 250), seed=5):
+    for case, outcome in outcomes(kind, _CASES.get(kind, 150), seed=5):
         assert outcome in ('read', 'refused'), f'case {case}: {outcome}'
+
+
+@pytest.mark.parametrize(('read', 'finding'), [
+    (lambda path, rng: os.write(2, b'by C'), 'prints by C'),
+    (lambda path, rng: warnings.warn('too large', stacklevel=1), 'prints UserWarning: too'),
+    (lambda path, rng: 1 // 0, 'ZeroDivisionError')])
+def test_the_trials_notice_what_a_reader_prints_and_raises(
+        read: Callable[..., object], finding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, 'bad', (lambda: inputs.random_table, read))
+    assert all(outcome.startswith(finding) for _, outcome in outcomes('bad', 3, seed=1))
+
+
+def test_a_damaged_flight_log_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]
+                                             ) -> None:
+    pytest.importorskip('pymavlink')
+    path, sound = tmp_path / 'log.bin', inputs.sound('bin')[0]
+    data = sound.content[sound.name]
+    path.write_bytes(data[:len(data) // 2] + b'damage' + data[len(data) // 2:])
+    assert 'between messages left out' in ' '.join(read_log(path).notes)
+    assert capfd.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize('number', ['1e200', '-1e30'])
+def test_a_number_beyond_any_sensor_is_refused_with_its_row(number: str, tmp_path: Path) -> None:
+    path = tmp_path / 'poses.csv'
+    path.write_text(f'# units: native\nax,ay,az\n1,0,0\n0,{number},0\n0,0,1\n')
+    with pytest.raises(InputError, match=r'row 2 of ax, ay, az holds the number -?1e\+'):
+        read_log(path)
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_row_that_its_maker_divides_by_zero_is_refused(tmp_path: Path) -> None:
+    files = next(each for each in inputs.sound('csv') if each.name == 'log_vehicle_imu_0.csv')
+    header, first, *rest = files.content[files.name].decode().splitlines()
+    cells = first.split(',')
+    cells[header.split(',').index('delta_velocity_dt')] = '0'
+    path = tmp_path / files.name
+    path.write_text('\n'.join([header, ','.join(cells), *rest, '']))
+    with pytest.raises(InputError, match='row 1 of ax, ay, az'):
+        read_log(path)
+
+
+def test_a_stated_name_that_the_system_refuses_is_damage(tmp_path: Path) -> None:
+    files = next(each for each in inputs.sound('mcap') if each.name == 'bag')
+    path = files.write(tmp_path)
+    about = path / 'metadata.yaml'
+    about.write_text(about.read_text().replace('bag.mcap', f'{"a" * 300}.mcap'))
+    with pytest.raises(InputError, match='is damaged or not a bag'):
+        read_log(path)
+
+
+def test_a_cut_definition_of_a_ulog_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('pyulog')
+    unknown = struct.pack('<HB', 9000, ord('z')) + bytes(9000)
+    cut = struct.pack('<HB', 9000, 0) + bytes(10)
+    log = Files('log.ulg', {'log.ulg': MAGIC + bytes(9) + unknown + cut})
+    monkeypatch.setitem(KINDS, 'cut', (lambda: lambda rng: log, lambda path, rng: read_log(path)))
+    assert dict(outcomes('cut', 1, seed=1)) == {0: 'refused'}
+
+
+def test_a_message_of_a_flight_log_with_a_field_without_name_is_left_out(tmp_path: Path) -> None:
+    pytest.importorskip('pymavlink')
+    sound = next(each for each in inputs.sound('bin') if each.name == 'two_imus.bin')
+    data = sound.content[sound.name]
+    at = data.index(b'TimeUS,I,GyrX')
+    names = data[at:at + 64].replace(b'GyrX', b'', 1).ljust(64, b'\0')
+    path = tmp_path / 'log.bin'
+    path.write_bytes(data[:at] + names + data[at + 64:])
+    with pytest.raises(InputError, match='has none of the messages'):
+        read_log(path)
+
+
+@pytest.mark.parametrize(('before', 'after', 'words'), [
+    ('per_g: 9.80665', 'per_g: 9.8e-36', 'per_g is 9.8e-36, expected 0.1 to 100 for m/s2'),
+    ('readings: m/s2', 'readings: g', 'per_g is 9.80665, expected 1 for g')])
+def test_an_implausible_unit_of_a_calibration_is_refused(
+        before: str, after: str, words: str, tmp_path: Path) -> None:
+    path = inputs.sound('yaml')[0].write(tmp_path)
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(DamagedCalibrationError, match=words):
+        read_calibration(path)

@@ -256,8 +256,8 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
 
 
 def _is_sound(form: Any) -> bool:
-    """Return whether a message has one letter for each field, and no field twice."""
-    return len(form.format) == len(form.columns) == len(set(form.columns))
+    """Return whether a message has one letter for each field, and a name of its own for each."""
+    return all(form.columns) and len(form.format) == len(form.columns) == len(set(form.columns))
 
 
 def _layout(letters: str, names: Sequence[str]) -> np.dtype[Any]:

@@ -16,6 +16,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 import errno
 import io
+import os
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from ...units import UnitName
 AXES = ('ax', 'ay', 'az')
 RATES = ('gx', 'gy', 'gz')
 MICRO = 1e-6
+
+_STANDARD_ERROR = 2
 
 DENSE_HZ = 5.0
 """Samples per second below which another message is preferred."""
@@ -193,7 +196,7 @@ def sound_log(path: Path, expected: str) -> Iterator[None]:
     """
     Turn what a library raises for a damaged log into one error, and drop what it prints.
 
-    Libraries of flight logs raise errors of any class, and print to standard output.
+    Libraries of flight logs raise errors of any class, and print.
 
     Raises
     ------
@@ -204,7 +207,7 @@ def sound_log(path: Path, expected: str) -> Iterator[None]:
 
     """
     try:
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
             yield
     except Exception as err:
         # A seek to before the start of a file, by a damaged length.
@@ -213,6 +216,23 @@ def sound_log(path: Path, expected: str) -> Iterator[None]:
         why = ' '.join(str(err).split()) or type(err).__name__
         raise InputError(f'{path} is damaged ({why}), expected {expected}',
                          'copy it from the vehicle again') from err
+
+
+@contextmanager
+def _silent_c() -> Iterator[None]:
+    """Drop what C code prints to standard error, which Python cannot redirect."""
+    try:
+        kept = os.dup(_STANDARD_ERROR)
+    except OSError:  # standard error is closed, so nothing is printed
+        yield
+        return
+    try:
+        with open(os.devnull, 'wb') as nowhere:
+            os.dup2(nowhere.fileno(), _STANDARD_ERROR)
+            yield
+    finally:
+        os.dup2(kept, _STANDARD_ERROR)
+        os.close(kept)
 
 
 def missing(library: str, what: str, err: ImportError) -> InputError:

@@ -24,6 +24,7 @@ The default profile of PX4 logs `sensor_accel` once a second. It is read if it i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import io
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,23 @@ PREFERRED = ('sensor_accel', 'sensor_combined', 'vehicle_imu', 'vehicle_accelera
 _ALSO = ('sensor_gyro', 'sensor_selection')
 _INVALID = 0x7fffffff
 """Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
+
+
+class _WholeReads(io.BufferedReader):
+    """
+    A file that moves on by as many bytes as were asked for, beyond its end, too.
+
+    `pyulog` goes back by the stated length of a damaged message. If fewer bytes were left, it
+    would go back too far and read the same bytes without end.
+
+    """
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes: at the end of the file fewer than `size`."""
+        data = super().read(size)
+        if size is not None and 0 < len(data) < size:
+            self.seek(size - len(data), io.SEEK_CUR)
+        return data
 
 
 def is_ulg(path: Path) -> bool:
@@ -121,7 +139,7 @@ def _messages(path: Path) -> tuple[list[Message], list[str]]:
     if not _has_magic(path):
         raise InputError(f'{path} does not start as a ULog does, expected a PX4 log (.ulg)',
                          'check that this is the intended file')
-    with path.open('rb') as file, sound_log(path, 'a PX4 log (.ulg)'):
+    with _WholeReads(io.FileIO(path)) as file, sound_log(path, 'a PX4 log (.ulg)'):
         log = ULog(file, [*PREFERRED, *_ALSO])
         found = [Message(data.name, data.multi_id, data.data, _time(data.data))
                  for data in log.data_list if len(data.data['timestamp'])]

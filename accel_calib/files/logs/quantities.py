@@ -200,7 +200,8 @@ def _decide_time(made: Quantities, first: Cells) -> None:
         made.said.append(f'{source.name}: {"times of the day" if of_day else "dates"} -> s')
         return
     stamps = made.chosen.numbers(first, 'time')
-    if not made.chosen.layout.header and np.mean(np.diff(stamps) < 0.0) > _MOST_BACK:
+    back = np.count_nonzero(np.diff(stamps) < 0.0)
+    if not made.chosen.layout.header and back > _MOST_BACK * (len(stamps) - 1):
         raise InputError(f'{made.chosen.layout.path} has no header line, and column '
                          f'{source.name} does not increase, expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')

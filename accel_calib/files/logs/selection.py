@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from . import formats
 from .columns import column, has_reading, MOST, Source, sources
 from .dates import is_clock
@@ -54,7 +56,8 @@ class Chosen:
         divisor = self.sources.get(f'{ours}/')
         if divisor is None:
             return values
-        return values / cells.numbers[:, self.numeric.index(divisor.index)]
+        with np.errstate(all='ignore'):  # a row divided by 0 is refused later, with its number
+            return values / cells.numbers[:, self.numeric.index(divisor.index)]
 
     def texts(self, cells: Cells, ours: str) -> list[str]:
         """Return the texts of a column."""
