@@ -20,7 +20,7 @@ setup(
     project_urls={'Repository': URL, 'Bug Tracker': f'{URL}/issues'},
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
+    package_data={NAME: ['py.typed', 'live/page/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -34,9 +34,12 @@ setup(
     ],
     zip_safe=True,
     python_requires='>=3.10',
-    # The upper bounds exclude what no test has run with; CONTRIBUTING.md has the rule.
+    # The bounds exclude what no test has run with; CONTRIBUTING.md has the rule.
     install_requires=['numpy>=1.26,<2.5', 'scipy>=1.11,<1.18', 'PyYAML>=6.0.1,<7',
-                      'rosbags>=0.11.9,<0.12', 'rich>=13.7.1,<16'],
+                      'rosbags>=0.11.9,<0.12', 'rich>=13.7.1,<16',
+                      # What bags are compressed with and stored in.
+                      'apsw>=3.45.1,<4', 'lz4>=4.0.2,<5',
+                      'backports.zstd>=1.0,<2; python_version < "3.14"'],
     extras_require={
         # ROS itself, where there is no ROS installation.
         'ros': [
@@ -47,15 +50,19 @@ setup(
         # Figures and pages.
         'report': ['matplotlib>=3.6,<3.12'],
         # Flight logs of PX4 and ArduPilot.
-        'logs': ['pyulog<2', 'pymavlink<2.5'],
+        'logs': ['pyulog>=1.1,<2', 'pymavlink>=2.4.41,<2.5'],
         # Allan deviation: accel-calib noise.
-        'noise': ['allantools<2025'],
+        'noise': ['allantools>=2024.4,<2025'],
+        # The live page: its server, the QR code of its link, and serial ports.
+        'live': ['aiohttp>=3.9.1,<4', 'pyserial>=3.5,<4', 'segno>=1.6,<2'],
         # Completion of the command line by the shell.
-        'completion': ['argcomplete<4'],
+        'completion': ['argcomplete>=3.1.4,<4'],
         'docs': ['sphinx<10', 'myst-parser<6', 'sphinx-rtd-theme<4'],
-        'test': ['allantools<2025', 'argcomplete<4', 'hypothesis>=6.100,<7', 'imucal<3',
-                 'matplotlib>=3.6,<3.12', 'pandas<4', 'pymavlink<2.5', 'pytest>=7.4,<10',
-                 'pytest-xdist<4', 'pyulog<2', 'setuptools<85'],
+        'test': ['aiohttp>=3.9.1,<4', 'allantools>=2024.4,<2025', 'argcomplete>=3.1.4,<4',
+                 'hypothesis>=6.100,<7', 'imucal>=2.4,<3', 'matplotlib>=3.6,<3.12',
+                 'pandas>=2.1.4,<4', 'playwright>=1.49,<2', 'pymavlink>=2.4.41,<2.5',
+                 'pyserial>=3.5,<4', 'pytest>=7.4,<10', 'pytest-xdist>=3.4,<4', 'pyulog>=1.1,<2',
+                 'segno>=1.6,<2', 'setuptools>=68.1.2,<85'],
         'dev': [
             'flake8',
             'flake8-builtins',

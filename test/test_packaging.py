@@ -24,8 +24,12 @@ ROOT = Path(__file__).parent.parent
 
 EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
+# pip installs apsw, backports.zstd and lz4 with rosbags.
 ROSDEP_KEYS = {
     'PyYAML': 'python3-yaml',
+    'apsw': 'python3-rosbags-pip',
+    'backports.zstd': 'python3-rosbags-pip',
+    'lz4': 'python3-rosbags-pip',
     'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',
     'pytest': 'python3-pytest',

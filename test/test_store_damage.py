@@ -378,10 +378,16 @@ def test_leftovers_are_removed_and_one_that_cannot_be_does_not_matter(store: Sto
     assert load(store).notes == ()
     assert not any(path.exists() for path in left)
     left[0].mkdir()
+    left[2].mkdir()
+    for path in left[1::2]:
+        path.write_text('half')
     loaded = load(store)
     assert loaded.calibration is not None
     assert len(loaded.poses) == 12
-    assert 'could not be tidied' in loaded.notes[0]
+    assert [path.exists() for path in left] == [True, False, True, False]
+    assert len(loaded.notes) == 2
+    for path, note in zip(left[::2], loaded.notes, strict=True):
+        assert f'{path} could not be removed' in note
 
 
 # Lock and steps

@@ -136,6 +136,17 @@ def test_leftovers_of_killed_processes_are_removed_and_new_ones_are_kept(tmp_pat
     assert young.exists()
 
 
+def test_a_leftover_that_cannot_be_removed_does_not_fail_the_write(tmp_path):
+    folder, old = tmp_path / '.file.1.tmp', tmp_path / '.file.2.tmp'
+    folder.mkdir()
+    old.write_text('half')
+    for path in (folder, old):
+        os.utime(path, (0.0, 0.0))
+    write(tmp_path / 'file')
+    assert folder.exists()
+    assert not old.exists()
+
+
 def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
     path = tmp_path / 'file'
     path.write_text('old\n')

@@ -69,7 +69,8 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
         if keep_before and target.exists():
             copy_atomically(target, previous(target))
     _flush_folder(target.parent)
-    _remove(target, older_than=_STALE_S)
+    # The file is written in any case: a leftover that stays does no harm.
+    remove_leftovers(target, older_than=_STALE_S)
 
 
 def copy_atomically(path: Path, target: Path) -> None:
@@ -119,21 +120,34 @@ def _replaceable(path: Path) -> os.stat_result | None:
     return old
 
 
-def remove_leftovers(path: Path) -> list[Path]:
-    """Remove temporary files that killed processes left beside a file; return their paths."""
-    return _remove(path)
+def remove_leftovers(path: Path, older_than: float = 0.0) -> list[OSError]:
+    """
+    Remove temporary files that killed processes left beside a file.
 
+    Parameters
+    ----------
+    path : Path
+        The file.
+    older_than : float
+        Least age of the temporary files [s].
 
-def _remove(path: Path, older_than: float = 0.0) -> list[Path]:
-    """Remove temporary files of a file of at least this age [s]; return their paths."""
+    Returns
+    -------
+    list of OSError
+        One error per temporary file that could not be removed, with its name.
+
+    """
     name = glob.escape(path.name[:_LONGEST_NAME])
-    found = []
+    failed = []
     for each in sorted(path.parent.glob(f'.{name}.*{_SUFFIX}')):
-        with suppress(FileNotFoundError):  # another process was faster
-            if time.time() - each.stat().st_mtime >= older_than:
-                each.unlink()
-                found.append(each)
-    return found
+        try:
+            if time.time() - each.lstat().st_mtime >= older_than:
+                each.unlink(missing_ok=True)
+        except FileNotFoundError:  # another process was faster
+            continue
+        except OSError as error:
+            failed.append(error)
+    return failed
 
 
 def _flush_folder(folder: Path) -> None:

@@ -31,6 +31,7 @@ from .style import (
     DIVERGING,
     FAINT,
     INK,
+    legend_below,
     Mark,
     new_figure,
     PAPER,
@@ -217,7 +218,7 @@ def draw_coverage(title: str, force: Floats, next_pose: Floats | None,
                 there = next_pose[np.newaxis][[(next_pose[2] >= 0.0) == up]]
                 disc.plot(*equal_area(there).T, '*', color=ACCENT, markersize=14,
                           label='next pose', zorder=4)
-        figure.legend(*discs[0].get_legend_handles_labels(), loc='outside lower center', ncols=3)
+        legend_below(figure, 3, *discs[0].get_legend_handles_labels())
     return Chart(figure, hover)
 
 
@@ -270,5 +271,5 @@ def draw_before_after(title: str, rows: Sequence[int], before_mg: Floats, after_
         panel.margins(y=0.1)
         panel.set(xlabel='row of the pose', ylabel='size of |force| − 1 g [mg]' if signed else
                   residual_label(signed=False))
-        figure.legend(loc='outside lower center', ncols=3)
+        legend_below(figure, 3)
     return Chart(figure, {'before': marks[0], 'after': marks[1]})

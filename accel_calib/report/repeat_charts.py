@@ -23,6 +23,7 @@ from .style import (
     Chart,
     FAINT,
     INK,
+    legend_below,
     Mark,
     new_figure,
     PAPER,
@@ -118,7 +119,7 @@ def _draw_parameters(title: str, found: Sequence[Parameter], labels: Sequence[st
         panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
         panel.set_ylabel(scale_of(found[0].name)[2])
         if len(labels) <= len(_COLOURS):
-            figure.legend(loc='outside lower center', ncols=2)
+            legend_below(figure, 2)
     return Chart(figure, hover)
 
 

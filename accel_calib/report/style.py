@@ -50,6 +50,9 @@ ON_PAGE = {INK: 'ink', AXIS: 'axis', GRID: 'grid', FAINT: 'faint', DISC: 'disc',
 """CSS variable of each colour of a figure on a page."""
 
 _PNG_DPI = 160
+_LEGEND_INCHES, _LEGEND_ROW_INCHES = 0.12, 0.18
+"""Height of the frame and of a row of a legend."""
+
 _STYLE: Any = {
     'font.family': ['sans-serif'], 'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Arial'],
     'font.size': 10.0, 'axes.titlesize': 10.5, 'axes.labelsize': 10.0,
@@ -120,6 +123,15 @@ def new_figure(height_inches: float, width_inches: float = WIDTH_INCHES) -> Figu
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_inches, height_inches), layout='constrained')
+
+
+def legend_below(figure: Figure, columns: int, *entries: Any) -> None:
+    """Draw a legend below the panels; the location 'outside' needs matplotlib 3.7."""
+    legend = figure.legend(*entries, loc='lower center', ncols=columns)
+    rows = -(-len(legend.get_texts()) // columns)
+    part = (_LEGEND_INCHES + _LEGEND_ROW_INCHES * rows) / figure.get_figheight()
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, part, 1.0, 1.0 - part))
 
 
 def residual_label(*, signed: bool) -> str:
