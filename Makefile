@@ -53,7 +53,8 @@ docs: $(VENV)/extra-docs
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
 
 faults: $(VENV)/extra-test $(VENV)/package
-	@$(BIN)/python -m pytest test/faults test/test_targets.py test/test_*damage*.py test/test_bombs.py
+	@ACCEL_CALIB_TRIALS=5 $(BIN)/python -m pytest -s test/faults test/test_targets.py \
+		test/test_*damage*.py test/test_bombs.py
 	@for seed in 1 2 3 4 5; do \
 		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 

@@ -19,6 +19,9 @@ thermometer. If the driver in the namespace publishes the temperature, add
 **Lifecycle.** With ``lifecycle:=true`` the node is a managed node. This file configures and
 activates it once; later transitions are up to you, for example by `ros2 lifecycle set`.
 
+**Live page.** With ``web:=true`` the node serves the live page at port 8080 of this machine, and
+logs its link. For a phone, add ``web_host:=0.0.0.0``.
+
 """
 
 import re
@@ -69,9 +72,13 @@ PARAMETERS = {
     'fill_covariance': (bool, 'Whether to state the measured noise as covariance.'),
     'confirm': (bool, 'Whether a new result waits for ~/save or ~/undo.'),
     'calibration_file': (str, 'File of the calibration.'),
+    'web_host': (str, 'Address of the live page; 0.0.0.0: for the whole network.'),
     'sensor': (str, 'Name of the sensor and of its files.'),
 }
 """Parameters of the node by argument: type and description. A list has three numbers."""
+
+WEB_PORT = 8080
+"""Port of the live page."""
 
 BOOLS = ['true', 'false', 'True', 'False']
 
@@ -93,6 +100,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'lifecycle', default_value='false', choices=BOOLS,
             description='Whether to start the managed node, and configure and activate it.'),
+        DeclareLaunchArgument(
+            'web', default_value='false', choices=BOOLS,
+            description=f'Whether to serve the live page, at port {WEB_PORT}.'),
         OpaqueFunction(function=_calibrator),
     ])
 
@@ -122,6 +132,8 @@ def _overrides(context: LaunchContext) -> list[dict[str, Any]]:
         if text:
             values[name] = (_numbers(name, text) if kind is list
                             else ParameterValue(given, value_type=kind))
+    if IfCondition(LaunchConfiguration('web')).evaluate(context):
+        values['web_port'] = WEB_PORT
     return [values] if values else []
 
 

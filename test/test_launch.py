@@ -271,9 +271,10 @@ GIVEN = {
     'output_frame_id': ('base', 'base'), 'rotate': ('false', False),
     'mounting_rpy': ('[0, 0.5, -1]', [0.0, 0.5, -1.0]), 'base_frame': ('base', 'base'),
     'publish_tf': ('true', True), 'gyro_bias': ('True', True), 'fill_covariance': ('true', True),
-    'confirm': ('true', True), 'calibration_file': ('/x.yaml', '/x.yaml'), 'sensor': ('7', '7')}
+    'confirm': ('true', True), 'calibration_file': ('/x.yaml', '/x.yaml'), 'sensor': ('7', '7'),
+    'web_host': ('0.0.0.0', '0.0.0.0')}
 ARGUMENTS = {'imu', 'output', 'temperature', 'linear_acceleration', 'namespace', 'params_file',
-             'lifecycle', *GIVEN}
+             'lifecycle', 'web', *GIVEN}
 
 
 @pytest.mark.parametrize('name', GIVEN)
@@ -282,6 +283,11 @@ def test_each_parameter_argument_sets_a_parameter_of_its_type(name: str, started
     given = started(**{name: text}).node.values()
     assert given == {name: value}
     assert type(given[name]) is type(DEFAULTS[name])
+
+
+def test_web_serves_the_live_page(started: Any) -> None:
+    assert started(web='true').node.values() == {'web_port': 8080}
+    assert DEFAULTS['web_port'] == 0
 
 
 def test_every_argument_is_described(started: Any) -> None:

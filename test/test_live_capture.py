@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from accel_calib.session import CalibratorSettings
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.work import fitted, plan_for
-from accel_calib.simulate import model_with, simulate_recording
+from accel_calib.simulate import model_with, simulate_poses, simulate_recording
 from accel_calib.sphere import spread_directions
+from accel_calib.table import Poses
 from accel_calib.units import units_of
 import numpy as np
 import pytest
@@ -312,3 +314,12 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     assert not needed.rejected
     assert ('the sensor may have moved during the poses of rows 1, 2, 3'
             in ' '.join(needed.warnings))
+
+
+def test_native_readings_are_never_asked_for_the_same_pose_twice() -> None:
+    poses = simulate_poses(model_with({}), spread_directions(12), np.random.default_rng(1),
+                           noise_g=0.001)
+    counts = Poses({**poses.columns, 'reading': 16384.0 * poses.reading + 900.0}, poses.row)
+    asked = [plan_for(counts.take(slice(0, count)), units_of('native'), 'auto').asked.direction
+             for count in range(4)]
+    assert not any(np.allclose(one, other) for one, other in combinations(asked, 2))

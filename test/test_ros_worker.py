@@ -16,9 +16,10 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.files import read_calibration, write_table
-from accel_calib.ros.services import Services, Worker
-from accel_calib.session import CalibratorSettings, Job
+from accel_calib.ros.services import in_executor, Services
+from accel_calib.session import CalibratorSettings, Job, Log
 from accel_calib.session.work import fitted
+from accel_calib.session.worker import Worker
 from accel_calib.session.worker_process import WorkerProcess
 import numpy as np
 import pytest
@@ -47,8 +48,9 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
     def on_events() -> None:
         events[0] += 1
 
-    worker = Worker(node, on_events)
-    services = Services(node, worker, on_events)
+    logged: list[Log] = []
+    worker = Worker(in_executor(node), on_events, pytest.fail)
+    services = Services(node, worker, logged.append)
 
     def finish(found: str) -> str:
         threads.add(threading.current_thread())
@@ -84,6 +86,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         assert (answer.success, answer.message) == (False, 'no such thing; try another')
         assert bench.call('save').message == 'at once'
         assert events[0] >= 3
+        assert [line.severity for line in logged] == ['info', 'warning', 'info']
     finally:
         over.set_result(None)
         spinner.join()

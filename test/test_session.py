@@ -59,7 +59,7 @@ class Driver:
 
     def done(self, job: Job | str) -> str:
         """Return the answer of a command."""
-        if isinstance(job, Job):
+        while isinstance(job, Job):
             job = job.finish(job.run(lambda function, *given: function(*given)))
         if self.session is not None:
             self.handle()

@@ -28,6 +28,7 @@ LAYERS = (
     ('rating',),
     ('intake', 'pipeline', 'report'),
     ('api', 'session'),
+    ('live',),
     ('ros',),
     ('cli',),
 )

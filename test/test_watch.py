@@ -63,13 +63,17 @@ def row(shown: str, label: str) -> str:
 
 
 @pytest.mark.parametrize('progress', [*STEPS, FITTED, replace(
-    START, still=False, stillness=math.nan, accuracy=math.nan, advice='')])
+    START, still=False, stillness=math.nan, accuracy=math.nan, advice=''), replace(
+    START, up=(0.6, 0.0, 0.8), length=1.0213, corrected=1.0002, temperature=-3.5)])
 def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
     figures = dict(progress.figures())
     found = Progress.from_figures({**figures, 'a figure of a later version': '1'})
     assert dict(found.figures()) == figures
     assert found.direction == pytest.approx(progress.direction, abs=1e-4)
+    assert found.up == pytest.approx(progress.up, abs=1e-4)
     assert found.accuracy == pytest.approx(progress.accuracy, rel=0.01, nan_ok=True)
+    assert (found.length, found.corrected, found.temperature) == pytest.approx(
+        (progress.length, progress.corrected, progress.temperature), nan_ok=True)
     assert (found.still, found.poses, found.total, found.advice) == (
         progress.still, progress.poses, progress.total, progress.advice)
 
@@ -134,6 +138,16 @@ def test_every_next_pose_is_shown_in_large_words(signs: Any) -> None:
     assert all(len(line) == 40 for line in narrow.splitlines())
 
 
+def test_lengths_and_temperature_are_shown_if_they_are_known() -> None:
+    before = drawn(screen(NODE, START))
+    assert 'not known' in row(before, '|a|')
+    assert 'temperature' not in before
+    fitted = drawn(screen(NODE, replace(START, length=1.0213, corrected=1.0002,
+                                        temperature=-3.5)))
+    assert '1.0213 g, corrected 1.0002 g' in row(fitted, '|a|')
+    assert '-3.5 °C' in row(fitted, 'temperature')
+
+
 def test_large_words_are_drawn_pixel_by_pixel() -> None:
     progress = replace(START, direction=(0.0, 1.0, 0.0), advice='now the left side points up')
     letters = ['██      ██████  ██████  ██████',
@@ -142,8 +156,8 @@ def test_large_words_are_drawn_pixel_by_pixel() -> None:
                '██      ██      ██        ██',
                '██████  ██████  ██        ██']
     lines = [line.strip('│ ') for line in drawn(screen(NODE, progress)).splitlines()]
-    assert lines[7:12] == letters
-    assert '█   █▀▀ █▀▀ ▀█▀' in drawn(screen(NODE, progress), height=18)
+    assert lines[8:13] == letters
+    assert '█   █▀▀ █▀▀ ▀█▀' in drawn(screen(NODE, progress), height=19)
 
 
 def test_terminal_without_unicode_gets_ascii() -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..capture import CaptureSettings, StillDetector
+from ..capture import CaptureSettings, samples_of, StillDetector
 from ..errors import counted, InputError
 from ..table import Floats, numbered, Recording
 from ..units import Units
@@ -128,33 +128,11 @@ def _least(step: Floats) -> float:
 def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:
     """Return first and last stamp of each rest."""
     detector = StillDetector(CaptureSettings(), units, keep=None)
-    for block in _blocks(recording):
-        detector.push(block)
+    count = len(recording)
+    detector.add(samples_of(recording, first, min(first + _BLOCK, count))
+                 for first in range(0, count, _BLOCK))
     detector.close()
     return [(dwell.start, dwell.end) for dwell in detector.dwells()]
-
-
-def _blocks(recording: Recording) -> Iterator[Floats]:
-    """
-    Yield samples as the detector expects them.
-
-    Raises
-    ------
-    InputError
-        If a time or a reading is not finite.
-
-    """
-    for first in range(0, len(recording), _BLOCK):
-        part = recording.take(slice(first, first + _BLOCK))
-        rows = np.full((len(part), 9), np.nan)
-        rows[:, 0], rows[:, 1:4] = part['time'], part.reading
-        bad = np.flatnonzero(~np.isfinite(rows[:, :4]).all(axis=1))
-        if len(bad):
-            raise InputError(f'row {part.row[bad[0]]} holds a time or reading that is not finite, '
-                             'expected finite numbers', 'remove that row, or repair the recording')
-        if 'rate' in part:
-            rows[:, 4:7] = part['rate']
-        yield rows
 
 
 def _regular(rest: Recording, units: Units, recorded: float) -> Rest:

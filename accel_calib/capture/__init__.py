@@ -13,8 +13,8 @@ the pose table.
 
 from .detector import StillDetector
 from .dwell import Dwell
-from .poses import capture, Captured, poses_from, select
+from .poses import capture, Captured, poses_from, samples_of, select
 from .settings import CaptureSettings, REPEATED, Repeated, settings_from
 
 __all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated', 'StillDetector',
-           'capture', 'poses_from', 'select', 'settings_from']
+           'capture', 'poses_from', 'samples_of', 'select', 'settings_from']

@@ -320,6 +320,11 @@ class Chunker:
         self._pending = self._bounded(pending)
         return done
 
+    @property
+    def fresh(self) -> bool:
+        """Whether the present segment has no chunk yet."""
+        return self._fresh
+
     def restart(self) -> None:
         """Start a new segment with the next sample."""
         self._pending = _NONE

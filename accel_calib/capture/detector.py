@@ -326,6 +326,8 @@ class StillDetector:
             found += self._tracker.feed(verdict)
             self._still = bool(verdict.still[-1])
             self._mean = chunks.origin
+        if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
+            found += self._leave()
         return found
 
     def _leave(self) -> list[OngoingDwell]:

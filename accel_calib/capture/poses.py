@@ -100,7 +100,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     for part in [recording] if isinstance(recording, Recording) else recording:
         for start in range(0, len(part), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(part))
-            detector.add(_block(part, first, min(first + _BLOCK, stop))
+            detector.add(samples_of(part, first, min(first + _BLOCK, stop))
                          for first in range(start, stop, _BLOCK))
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
@@ -115,8 +115,16 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                     interruptions, recorded)
 
 
-def _block(recording: Recording, start: int, stop: int) -> Floats:
-    """Return the columns of samples start to stop as rows, without missing columns at the end."""
+def samples_of(recording: Recording, start: int, stop: int) -> Floats:
+    """
+    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
+
+    Raises
+    ------
+    InputError
+        If a time or a reading is not finite.
+
+    """
     which = slice(start, stop)
     time = recording['time'][which]
     samples = np.empty((_width(recording), len(time)))

@@ -34,7 +34,7 @@ _SCALE = 2.0
 _WORDS = 30
 """Width of the words beside the bars, so that the bars keep their length."""
 
-_OTHER_ROWS = 14
+_OTHER_ROWS = 16
 """Rows of the screen besides the large words."""
 
 _LETTERS = {
@@ -119,7 +119,9 @@ def _rows(progress: Progress) -> list[_Row]:
         _Row('dwell', _dwell(now), now.dwell / now.min_dwell, style),
         _Row('poses', _count(now), share),
         _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
-        _Row('accuracy', _accuracy(now))]
+        _Row('accuracy', _accuracy(now)), _Row('|a|', _length(now)),
+        *([] if math.isnan(now.temperature) else [
+            _Row('temperature', f'{now.temperature:.1f} °C')])]
 
 
 def _stillness(progress: Progress) -> str:
@@ -147,6 +149,13 @@ def _accuracy(progress: Progress) -> str:
     if math.isinf(progress.accuracy):
         return 'not determined by these poses'
     return f'{progress.accuracy * MG:.2g} mg expected'
+
+
+def _length(progress: Progress) -> str:
+    if math.isnan(progress.corrected):
+        return 'not known' if math.isnan(progress.length) else f'{progress.length:.4f} g'
+    raw = '' if math.isnan(progress.length) else f'{progress.length:.4f} g, '
+    return f'{raw}corrected {progress.corrected:.4f} g'
 
 
 def _is_enough(progress: Progress) -> bool:

@@ -18,7 +18,8 @@ frame_id            `output_frame`
 ==================  ======================================================================
 
 A calibration without a mounting (`Calibration.in_sensor_frame`) leaves the frame unchanged. Then
-only the acceleration and its covariance differ from the raw message. The stamp never changes.
+only the acceleration and its covariance differ from the raw message, and a covariance that is not
+finite. The stamp never changes.
 
 The conventions for covariances are kept: a first element of -1 means no data, and all zero means
 unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
@@ -104,6 +105,9 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         result[present, ORIENTATION] = np.array(
             _product(x, y, z, w, *quaternion_of(rotation))).T
         _transform(result, ORIENTATION_COVARIANCE, rotation.T)
+    else:
+        for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
+            _transform(result, part, np.eye(3))
     stated = _transform(result, ACCELERATION_COVARIANCE,
                         rotation.T @ np.linalg.inv(calibration.gain))
     if np.any(stated):
@@ -272,15 +276,19 @@ class Rewriter:
 
     def _unturned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration, in the frame of the sensor."""
-        p, q, r, spread = given[5:9]
+        x, y, z, t, orientation_spread, p, q, r, spread = given[:9]
         if spread != self._seen_rate:
             self._see_rate(spread)
+        if orientation_spread != self._seen_orientation:
+            self._see_orientation(orientation_spread)
         u, v, w = self.bias
-        if not (u or v or w) and self._new_rate == spread:
+        same = self._new_orientation == orientation_spread
+        if same and not (u or v or w) and self._new_rate == spread:
             return self._header(data, self._force)
         if self._has_rate:
             p, q, r = p - u, q - v, r - w
-        return self._header(data, self._rate) + THREE.pack(p, q, r) + self._new_rate
+        return self._header(data, self._given.begin) + _FRONT.pack(
+            x, y, z, t, self._new_orientation, p, q, r, self._new_rate)
 
     def _turned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration, in the levelled frame."""
@@ -313,7 +321,7 @@ class Rewriter:
         time = seconds + nanoseconds * 1e-9
         known: dict[str, Any] = {
             'time': time, 'std': _NONE, 'previous': _NONE,
-            'rate': _NONE if absent or not math.isfinite(sum(rate)) else rate}
+            'rate': _NONE if absent or not all(map(math.isfinite, rate)) else rate}
         if not math.isnan(temperature):
             known['temperature'] = temperature
             if self._thermal is not None:

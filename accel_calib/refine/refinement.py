@@ -122,7 +122,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     """
     check_units(poses, units)
     if isinstance(base, Calibration):
-        check_sensor(base, sensor or poses.sensor)
+        check_sensor(base, poses.sensor)
+        check_sensor(base, sensor)
     sure, doubts = sure_rows(poses)
     if doubts:
         try:

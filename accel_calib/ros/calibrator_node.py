@@ -21,7 +21,6 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
@@ -30,18 +29,27 @@ from visualization_msgs.msg import MarkerArray
 from . import qos
 from .declare import declared, follow
 from .display import pose_markers, progress_of, self_test_of, statuses_of
-from .services import Services, Worker
+from .page import Page
+from .services import in_executor, Services
 from .stream import Stream
 from .transforms import MountingBroadcaster, watch_static
 from ..messages.correction import output_frame
-from ..session import CalibratorSettings, Event, Job, Log, Mounting, Session, ShowPoses, Still
+from ..session import (
+    CalibratorSettings,
+    Event,
+    Job,
+    Log,
+    LogFilter,
+    Mounting,
+    Session,
+    ShowPoses,
+    Still,
+)
+from ..session.worker import Worker
 
 _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
              'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
 """Services that are commands of the session."""
-
-_UNKNOWN = '_NODE_NAME_UNKNOWN_'
-"""Name of a node of which DDS knows only the publisher so far."""
 
 _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
@@ -89,18 +97,22 @@ class Calibrator:
                             else None)
         self.session = Session(settings, self._topic)  # last, because it locks the files
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
-        self._worker = Worker(node, self._handle_events)
-        self._last_logged: dict[str, float] = {}
+        call_soon = in_executor(node)
+        self._worker = Worker(call_soon, self._handle_events,
+                              lambda words: self._log(Log('error', words)))
+        self._filter = LogFilter()
         self._progress_at = 0.0
         self._still = node.create_publisher(Bool, '~/still', qos.LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', qos.LATCHED)
         self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._overrides = QoSOverridingOptions.with_default_policies()
-        self.stream = Stream(
-            self.session, self._published(Imu, 'imu/data_calibrated'),
-            self._published(Imu, '~/preview'),
-            self._published(Vector3Stamped, '~/linear_acceleration'), self._handle_events)
+        outputs = (self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
+                   self._published(Vector3Stamped, '~/linear_acceleration'))
+        self.stream = Stream(self.session, *outputs, self._handle_events)
+        self._heard: list[Any] = []
+        self._said = [*outputs, self._still, self._poses, self._progress, self._diagnostics]
+        self._page = Page(node, self.session, self.stream, self._worker, call_soon, self._log)
         self._still.publish(Bool(data=False))
         self._serve()
 
@@ -109,7 +121,7 @@ class Calibrator:
                                            qos_overriding_options=self._overrides)
 
     def _serve(self) -> None:
-        services = Services(self._node, self._worker, self._handle_events)
+        services = Services(self._node, self._worker, self._log)
         for name in _TRIGGERS:
             services.serve(name, self._command(name))
         self._node.create_service(SetBool, '~/enable', self._on_enable)
@@ -119,11 +131,13 @@ class Calibrator:
         """Start; to be called when the node has an executor."""
         self._handle_events()
         node, overrides = self._node, self._overrides
-        node.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True,
-                                 qos_overriding_options=overrides)
-        node.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR,
-                                 qos_overriding_options=overrides)
+        self._heard = [
+            node.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True,
+                                     qos_overriding_options=overrides),
+            node.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR,
+                                     qos_overriding_options=overrides)]
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._page.start()
 
     def _command(self, name: str) -> Any:
         """Return a command of the session that first processes all messages so far."""
@@ -158,14 +172,17 @@ class Calibrator:
     def _on_tick(self) -> None:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
-            map(_name_of, self._node.get_publishers_info_by_topic(self._topic)))
+            map(qos.name_of, self._node.get_publishers_info_by_topic(self._topic)))
+        self.session.mismatches = qos.mismatches(self._node, self._heard, self._said)
         self.stream.flush()
         self.session.tick()
         self._on_transforms()
         self._handle_events()
-        array = DiagnosticArray(status=statuses_of(self.session.health(), self._name))
+        health = self.session.health()
+        array = DiagnosticArray(status=statuses_of(health, self._name))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
+        self._page.show_state(health)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, self.session.commands.enable(request.data)
@@ -199,6 +216,7 @@ class Calibrator:
             self._still.publish(Bool(data=event.still))
         elif isinstance(event, ShowPoses):
             self._poses.publish(pose_markers(event.up, event.asked, event.frame_id))
+            self._page.show_poses(event)
         elif isinstance(event, Mounting):
             self._broadcast(event)
         else:
@@ -215,13 +233,9 @@ class Calibrator:
                                   event.rotation)
 
     def _log(self, line: Log) -> None:
-        if not line.words:
+        if not self._filter.passes(line):
             return
-        if line.once_in:
-            kind, now = line.words[:20], monotonic()
-            if now - self._last_logged.get(kind, -line.once_in) < line.once_in:
-                return
-            self._last_logged[kind] = now
+        self._page.show_line(line)
         log = self._node.get_logger()  # rclpy needs a separate line of code for each severity
         if line.severity == 'error':
             log.error(line.words)
@@ -233,12 +247,6 @@ class Calibrator:
     def close(self) -> None:
         """Finish writing, and release the files."""
         self._node.remove_on_set_parameters_callback(self._followed)
+        self._page.close()
         self._worker.close()
         self.session.close()
-
-
-def _name_of(endpoint: TopicEndpointInfo) -> str:
-    """Return the name of the node of a publisher, with its namespace."""
-    if endpoint.node_name == _UNKNOWN:
-        return 'a node whose name is not known yet'
-    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'

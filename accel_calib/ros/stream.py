@@ -37,6 +37,7 @@ from ..messages.layout import (
     samples_of,
     THREE,
 )
+from ..one_reading import Triple
 from ..session import CalibratorSettings, Session
 from ..session.active_calibration import output_scale
 
@@ -134,6 +135,14 @@ class Stream:
         if math.isfinite(temperature):
             self._temperature = temperature
             self._session.set_temperature(temperature)
+
+    @property
+    def newest(self) -> Triple | None:
+        """Return the newest reading, unless the session has it already."""
+        if not self._waiting:
+            return None
+        x, y, z = THREE.unpack_from(self._waiting[-1], self._layout.place(ACCELERATION))
+        return x, y, z
 
     def on_message(self, data: bytes) -> None:
         """Correct and publish a serialized Imu message."""

@@ -12,10 +12,10 @@ and the state. `settings` defines the parameters.
 
 """
 
-from .events import Event, Job, Log, Mounting, ShowPoses, Still
+from .events import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
 from .health import Finding, findings, Health, worst
 from .session import Session
 from .settings import CalibratorSettings
 
-__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'Mounting',
-           'Session', 'ShowPoses', 'Still', 'findings', 'worst']
+__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'LogFilter',
+           'Mounting', 'Session', 'ShowPoses', 'Still', 'findings', 'worst']

@@ -5,16 +5,17 @@
 The commands of a session: what the services of the node do.
 
 A command returns an answer, or a `Job` for long work, or raises an error that says what to do. If
-the parameter ``confirm`` is set, a new calibration is only offered: it is published on ~/preview,
-until ~/save stores it or ~/undo discards it.
+the parameter ``confirm`` is set, or a command is called with `offered`, a new calibration is only
+offered: it is published on ~/preview, until ~/save stores it or ~/undo discards it.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -44,7 +45,13 @@ from ..calibrate import (
 from ..calibrate.mounting import mounting_words
 from ..capture import Dwell, poses_from
 from ..effects import LADDER
-from ..errors import counted, InputError, RefusedFitError, StoredCalibrationError
+from ..errors import (
+    AccelCalibError,
+    counted,
+    InputError,
+    RefusedFitError,
+    StoredCalibrationError,
+)
 from ..refine import Refinement
 from ..words import now
 
@@ -54,10 +61,16 @@ if TYPE_CHECKING:
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
 
-_Fitted = tuple[Calibration, str, OSError | None]
-"""A calibration, the words about it if it is used, and why it is not stored."""
+_NEXT_LATER = 'the next pose is on ~/poses after the computation that is running'
+"""Advice while a fit or a refinement occupies the worker process."""
+
+Found = TypeVar('Found')
 
 _NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
+
+
+class ChangedError(AccelCalibError):
+    """The calibration changed during a fit or a refinement."""
 
 
 class Commands:
@@ -73,6 +86,7 @@ class Commands:
         """Capture the ongoing rest as a pose."""
         session = self._session
         self._check_fresh()
+        session.files.usable()
         dwell = session.live.capture_now()
         if dwell is None:
             raise self._not_still()
@@ -82,88 +96,89 @@ class Commands:
         words = (f'{counted(len(given[0]), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
 
-        def finish(plan: Plan) -> str:
-            return f'{words}; {next_action(plan.asked)}'
+        def finish(plan: Plan | None) -> str:
+            return f'{words}; {_NEXT_LATER if plan is None else next_action(plan.asked)}'
 
-        return Job(lambda compute: compute(plan_for, *given), finish)
+        if session.computing:
+            return Job(lambda compute: None, finish)
+        return Job(lambda compute: compute(plan_for, *given), finish, computes=True)
 
-    def undo_pose(self) -> str:
+    def undo_pose(self) -> Job:
         """Remove the last pose."""
+        if self._session.files.store is not None:
+            self._session.files.usable()
         if not self._session.live.undo():
             raise InputError('there are no poses to remove', 'capture a pose first')
         self._session.poses_changed(ended=False)
         count = len(self._session.live.book.poses())
-        return f'the last pose is removed; remaining: {counted(count, "pose")}'
+        words = f'the last pose is removed; remaining: {counted(count, "pose")}'
+        return Job(lambda compute: None, lambda none: words)  # waits until the poses are stored
 
     # Calibrations
 
-    def fit(self) -> Job:
-        """Fit the poses; use and store the calibration."""
-        return self._fit(lambda before, found: True)
+    def fit(self, *, offered: bool = False) -> Job:
+        """Fit the poses; use and store the calibration, or only offer it."""
+        return self._fit(lambda before, found: True, offered=offered)
 
     def auto_fit(self) -> Job:
         """Fit the poses; use the result if it differs by more than its uncertainty."""
+        session = self._session
         job = self._fit(lambda before, found: _is_linear(before) and has_changed(before, found))
 
-        def finish(found: object) -> str:
+        def finish(found: object) -> str | Job:
             try:
-                words, self._refused = job.finish(found), ''
+                after, self._refused = job.finish(found), ''
+            except ChangedError:
+                session.auto_fit_later()
+                return ''
             except RefusedFitError as error:
                 before, self._refused = self._refused, str(error)
                 if self._refused == before:
                     return ''
                 raise
-            return words
+            return after
 
-        return Job(job.run, finish)
+        return replace(job, finish=finish)
 
-    def _fit(self, is_used: Callable[[Calibration | None, Calibration], bool]) -> Job:
+    def _fit(self, is_used: Callable[[Calibration | None, Calibration], bool], *,
+             offered: bool = False) -> Job:
         session, store = self._session, self._session.files.usable()
-        before = self._present()
+        before = self.present
         session.live.refresh()
         poses = session.live.book.poses()
         given = (poses, session.units, session.settings, session.sensor, before,
                  session.present_context())
-        offered = session.settings.confirm
+        offered = offered or session.settings.confirm
 
-        def run(compute: Compute) -> _Fitted | RefusedFitError:
-            try:
-                calibration = compute(fitted, *given)
-            except RefusedFitError as error:  # `finish` decides whether to report it
-                return error
+        def run(compute: Compute) -> tuple[Calibration, str]:
+            calibration = compute(fitted, *given)
             used = is_used(before, calibration)
-            not_stored = compute(_stored, store, calibration) if used and not offered else None
-            return calibration, compute(summary, calibration) if used else '', not_stored
+            return calibration, compute(summary, calibration) if used else ''
 
-        def finish(found: _Fitted | RefusedFitError) -> str:
-            if isinstance(found, RefusedFitError):
-                raise found
-            calibration, story_of_fit, not_stored = found
+        def finish(found: tuple[Calibration, str]) -> str | Job:
+            calibration, story_of_fit = found
             session.fitted_poses = len(poses)
             if not story_of_fit:
                 return ''
             words = [story_of_fit, change_words(before, calibration)]
-            return self._use(calibration, not_stored, words, offered=offered)
+            return self._job_to_store(store, calibration, words, offered=offered)
 
-        return Job(run, finish)
+        return self._unless_changed('fit', run, finish)
 
-    def refine(self) -> Job:
-        """Refine the calibration; use and store the refined calibration."""
+    def refine(self, *, offered: bool = False) -> Job:
+        """Refine the calibration; use and store the refined calibration, or only offer it."""
         session, store = self._session, self._session.files.usable()
-        before = self._present()
+        before = self.present
         session.live.refresh()
         given = session.live.book.poses(), session.units, session.sensor, before
-        offered = session.settings.confirm
+        offered = offered or session.settings.confirm
 
-        def run(compute: Compute) -> tuple[Refinement, str, OSError | None]:
+        def run(compute: Compute) -> tuple[Refinement, str]:
             refinement = compute(refined, *given)
-            words = compute(story, refinement)
-            if refinement.refusal or offered:
-                return refinement, words, None
-            return refinement, words, compute(_stored, store, refinement.calibration)
+            return refinement, compute(story, refinement)
 
-        def finish(found: tuple[Refinement, str, OSError | None]) -> str:
-            refinement, story_of_search, not_stored = found
+        def finish(found: tuple[Refinement, str]) -> str | Job:
+            refinement, story_of_search = found
             if refinement.refusal:
                 raise RefusedFitError(f'{story_of_search}; not used: {refinement.refusal[0]}',
                                       refinement.refusal[1])
@@ -171,42 +186,66 @@ class Commands:
             session.guide.follow(refinement.plan.poses)
             if refinement.plan.poses:
                 session.fitted_poses = 0  # more poses are asked for
-            return self._use(refinement.calibration, not_stored, words, offered=offered)
+            return self._job_to_store(store, refinement.calibration, words, offered=offered)
 
-        return Job(run, finish)
+        return self._unless_changed('refine', run, finish)
 
-    def set_level(self) -> Job:
+    def _unless_changed(self, name: str, run: Callable[[Compute], Found],
+                        finish: Callable[[Found], str | Job]) -> Job:
+        """Return a job that computes, and fails if another command changes the calibration."""
+        session = self._session
+        changes = session.changes
+        session.computing += 1
+
+        def computed(compute: Compute) -> Found | AccelCalibError:
+            try:
+                return run(compute)
+            except AccelCalibError as error:  # raised in `checked`, which counts
+                return error
+
+        def checked(found: Found | AccelCalibError) -> str | Job:
+            session.computing -= 1
+            if isinstance(found, AccelCalibError):
+                raise found
+            if session.changes != changes:
+                raise ChangedError(f'another command changed the calibration during ~/{name}; '
+                                   'the result is discarded', f'call ~/{name} again')
+            return finish(found)
+
+        return Job(computed, checked, computes=True)
+
+    def set_level(self, *, offered: bool = False) -> Job:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
         session, rest = self._session, self._rest()
-        calibration = self._present()
+        calibration = self.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
                 poses_from([rest]), session.units, sensor=session.sensor, date=now()))
         return self._job_to_use(self._levelled(calibration, rest),
-                                ['the mounting is levelled by this pose'])
+                                ['the mounting is levelled by this pose'], offered=offered)
 
-    def set_heading(self) -> Job:
+    def set_heading(self, *, offered: bool = False) -> Job:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        calibration = self._present()
+        calibration = self.present
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
         rest = self._rest()
         headed = set_heading(calibration, rest.mean,
                              self._session.active.context_of(rest, calibration))
-        return self._job_to_use(headed, ['the heading is set by this pose'])
+        return self._job_to_use(headed, ['the heading is set by this pose'], offered=offered)
 
-    def calibrate_at_rest(self) -> Job:
+    def calibrate_at_rest(self, *, offered: bool = False) -> Job:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
         session, rest = self._session, self._rest()
-        before = self._present()
+        before = self.present
         calibration = session.with_given(at_rest(rest, session.units, session.sensor, before))
         words = [carried_words(calibration) if before is None or is_partial(before)
                  else 'offset and gain of the fit are kept']
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words.append(f'gyro bias ({bias}) °/s')
-        return self._job_to_use(self._levelled(calibration, rest), words)
+        return self._job_to_use(self._levelled(calibration, rest), words, offered=offered)
 
     def _levelled(self, calibration: Calibration, rest: Dwell) -> Calibration:
         """Return a calibration levelled by a rest; check it against the given mounting."""
@@ -219,21 +258,28 @@ class Commands:
                              'given mounting and restart the node')
         return levelled
 
-    def _present(self) -> Calibration | None:
+    @property
+    def present(self) -> Calibration | None:
         """Return the calibration that a command starts from: the offered one, or that in use."""
         return self._session.preview or self._session.active.calibration
 
-    def _job_to_use(self, calibration: Calibration, words: list[str]) -> Job:
-        """Return the job that stores and uses a calibration with a new mounting."""
-        store, offered = self._session.files.usable(), self._session.settings.confirm
-        words = [*words, change_words(self._present(), calibration), *(
+    def _job_to_use(self, calibration: Calibration, words: list[str], *, offered: bool) -> Job:
+        """Return the job that stores and uses, or offers, a calibration with a new mounting."""
+        offered = offered or self._session.settings.confirm
+        words = [*words, change_words(self.present, calibration), *(
             each for each in calibration.warnings
             if each.startswith(FLAT) or each == ARBITRARY_HEADING)]
+        return self._job_to_store(self._session.files.usable(), calibration, words,
+                                  offered=offered)
 
+    def _job_to_store(self, store: Store, calibration: Calibration, words: list[str], *,
+                      offered: bool) -> Job:
+        """Return the job that stores and uses, or offers, a calibration."""
         def finish(not_stored: OSError | None) -> str:
             return self._use(calibration, not_stored, words, offered=offered)
 
-        return Job(lambda compute: None if offered else _stored(store, calibration), finish)
+        return self._session.job(
+            lambda compute: None if offered else _stored(store, calibration), finish)
 
     def _use(self, calibration: Calibration, not_stored: OSError | None, words: list[str], *,
              offered: bool) -> str:
@@ -258,7 +304,7 @@ class Commands:
     def save(self) -> Job:
         """Use the offered calibration if there is one; store calibration and poses."""
         session, store = self._session, self._session.files.usable()
-        calibration = self._present()
+        calibration = self.present
         if calibration is None:
             raise _NO_CALIBRATION
         poses = session.live.book.poses()
@@ -285,13 +331,13 @@ class Commands:
             session.adopt(calibration)
             return f'read {store.calibration}'
 
-        return Job(lambda compute: store.load_calibration(), finish)
+        return session.job(lambda compute: store.load_calibration(), finish)
 
     def undo(self) -> Job | str:
         """Discard the offered calibration, or return to the one before the last stored one."""
         session = self._session
         if session.preview is not None:
-            session.preview = None
+            session.offer(None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
         store = session.files.usable()
 
@@ -304,7 +350,7 @@ class Commands:
             changes = '' if before is None else f'; {change_words(before, calibration)}'
             return f'the calibration of {calibration.date or "unknown date"} is in use{changes}'
 
-        return Job(lambda compute: store.step_back(), finish)
+        return session.job(lambda compute: store.step_back(), finish)
 
     def reset(self) -> Job:
         """Remove poses and calibration; the stored files are renamed."""
@@ -318,7 +364,7 @@ class Commands:
             return 'poses and calibration are removed' + ''.join(
                 f'; the stored file is kept as {path.name}' for path in kept)
 
-        return Job(lambda compute: store.set_aside(), finish)
+        return session.job(lambda compute: store.set_aside(), finish)
 
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
@@ -343,13 +389,17 @@ class Commands:
         return rest
 
     def _check_fresh(self) -> None:
-        """Check that the last message is recent."""
+        """Check that the last message is recent, and that its stamp is."""
         statistics = self._session.statistics
         if not statistics.messages:
             raise InputError('there is no Imu message yet', 'start the driver')
         if statistics.age > _OLD:
             raise InputError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
                              f'one within {_OLD:g} s', 'check the driver and try again')
+        if statistics.stopped > _OLD:
+            raise InputError(f'the stamps have not changed for {statistics.stopped:.1f} s '
+                             f'({statistics.stamp:.3f} s), expected the time of each reading',
+                             'set header.stamp in the driver')
 
     def _not_still(self) -> InputError:
         """Return the error for a sensor that is not at rest."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, Literal
 
 from ..calibrate import NextPose
@@ -29,13 +30,17 @@ class Job:
         Function of a `Compute`. It does not use the session, and can raise AccelCalibError or
         OSError.
     finish : callable
-        Function of the result of `run`, called in the thread of the session. It returns an answer
-        and can raise AccelCalibError. An empty answer is not logged.
+        Function of the result of `run`, called in the thread of the session. It returns an answer,
+        or the job that continues, and can raise AccelCalibError. An empty answer is not logged.
+    computes : bool
+        Whether `run` computes and uses no files. Commands and other jobs run at the same time.
+        Only such a job calls its `Compute`.
 
     """
 
     run: Callable[[Compute], Any]
-    finish: Callable[[Any], str]
+    finish: Callable[[Any], str | Job]
+    computes: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,32 @@ class Mounting:
 
     rotation: Floats
     frame_id: str
+
+
+class LogFilter:
+    """
+    Decide which lines are logged: not empty, and not again within their `once_in`.
+
+    Parameters
+    ----------
+    clock : callable
+        Steady clock [s].
+
+    """
+
+    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+        self._clock = clock
+        self._last: dict[str, float] = {}
+
+    def passes(self, line: Log) -> bool:
+        """Return whether to log a line, and note it."""
+        if not line.once_in:
+            return bool(line.words)
+        kind, now = line.words[:20], self._clock()
+        if now - self._last.get(kind, -line.once_in) < line.once_in:
+            return False
+        self._last[kind] = now
+        return True
 
 
 Event = Log | Mounting | Still | ShowPoses | Job

@@ -51,6 +51,11 @@ _FIGURES = {
     'direction': _Figure('next direction',
                          lambda parts: ' '.join(f'{part:.4f}' for part in parts),
                          lambda text: tuple(map(float, text.split()))),
+    'up': _Figure('up', lambda parts: ' '.join(f'{part:.4f}' for part in parts),
+                  lambda text: tuple(map(float, text.split()))),
+    'length': _Figure('|a| [g]', '{:.5f}'.format, float),
+    'corrected': _Figure('|a| corrected [g]', '{:.5f}'.format, float),
+    'temperature': _Figure('temperature [°C]', '{:.2f}'.format, float),
 }
 """Figure of each field of `Progress`."""
 
@@ -80,6 +85,13 @@ class Progress:
         What to do next.
     direction : tuple of float
         Direction to point up, a unit vector in the sensor axes; empty: none.
+    up : tuple of float
+        Direction of the newest raw reading, a unit vector in the sensor axes; empty: not known.
+    length, corrected : float
+        Raw and corrected |a| of the newest message [g]; the correction is the offered one while a
+        calibration waits for ~/save. NaN: not known.
+    temperature : float
+        Temperature [°C]; NaN: not known.
 
     """
 
@@ -93,6 +105,10 @@ class Progress:
     accuracy: float
     advice: str
     direction: tuple[float, ...]
+    up: tuple[float, ...] = ()
+    length: float = math.nan
+    corrected: float = math.nan
+    temperature: float = math.nan
 
     def figures(self) -> Iterator[tuple[str, str]]:
         """Yield names and values."""

@@ -55,6 +55,8 @@ class Health:
         Topic of the raw messages, with namespace and remapping.
     publishers : tuple of str
         Names of the nodes that publish on this topic.
+    mismatches : tuple of str
+        Publishers and subscribers with another QoS, and what to do.
     calibration : str
         Model and date, or empty.
     outside : str
@@ -97,6 +99,7 @@ class Health:
     problem: str
     topic: str
     publishers: tuple[str, ...]
+    mismatches: tuple[str, ...]
     calibration: str
     outside: str
     file: str
@@ -141,17 +144,19 @@ def worst(health: Health) -> Finding:
 
 def _stream(health: Health) -> Finding:
     """Return the first fault of the stream, or its rate."""
-    fault = stream_fault(health.statistics, health.length, health.topic, health.publishers)
+    fault = stream_fault(health.statistics, health.length, health.topic, health.publishers,
+                         health.mismatches)
     if fault:
         return Finding('stream', Level.WARN, fault)
     return Finding('stream', Level.OK, f'{health.statistics.rate:.1f} Hz on {health.topic}')
 
 
 def stream_fault(statistics: StreamStatistics, length: float, topic: str,
-                 publishers: Sequence[str]) -> str:
+                 publishers: Sequence[str], mismatches: Sequence[str] = ()) -> str:
     """Return what is wrong with the messages, and what to do; arguments as in `Health`."""
-    faults = (_publishers(topic, publishers), _silence(statistics, topic, publishers),
-              statistics.stamp_fault, _dropped(statistics), _wrong_unit(statistics, length))
+    silence = '' if mismatches else _silence(statistics, topic, publishers)
+    faults = (_publishers(topic, publishers), *mismatches, silence, statistics.stamp_fault,
+              _dropped(statistics), _wrong_unit(statistics, length))
     return '; '.join(filter(None, faults))
 
 
@@ -177,8 +182,8 @@ def _dropped(statistics: StreamStatistics) -> str:
     if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
         return ''
     return '; '.join(words for count, words in (
-        (statistics.not_finite, f'dropped {counted(statistics.not_finite, "message")} with NaN or '
-                                'infinite readings: check the driver'),
+        (statistics.not_finite, f'dropped {counted(statistics.not_finite, "message")} with NaN, '
+                                'infinite or absurd readings: check the driver'),
         (statistics.foreign, f'dropped {counted(statistics.foreign, "message")} of another '
                              'sensor: use a separate topic for each sensor'),
         (statistics.implausible, f'dropped {counted(statistics.implausible, "corrected message")} '

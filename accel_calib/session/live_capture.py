@@ -13,7 +13,8 @@ certain that the rest does not continue after a knock. The next rest may have st
 undone.
 
 The pose of an ongoing rest is provisional. The final average replaces it: the dwell that overlaps
-it in time. Only the user removes poses. If later rests show that the sensor may have moved during
+it in time. A recording that is played again repeats its stamps and readings, and its poses do not
+count twice. Only the user removes poses. If later rests show that the sensor may have moved during
 a pose, the pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
@@ -38,6 +39,9 @@ _SAME_TEMPERATURE = 120.0
 
 _BAND = 5.0
 """Poses with a larger difference of temperature are not merged [°C]; ~/refine needs both."""
+
+_SAME_MEAN = 4.0
+"""Largest difference of two means of the same samples, in their standard deviations."""
 
 _CONTEXT = ('temperature', 'supply_voltage', 'rate')
 
@@ -94,9 +98,15 @@ class PoseBook:
         """Return whether this rest is a provisional pose."""
         return any(overlap(dwell, each) for each in self._held)
 
+    def _has(self, dwell: Dwell) -> bool:
+        """Return whether a rest is known already: a recording is played again."""
+        return any(_same_samples(each, dwell) for each in (*self._earlier, *self._dwells))
+
     def hold(self, dwell: Dwell) -> None:
         """Add or update the provisional pose of an ongoing rest."""
-        self._held = [*(each for each in self._held if not overlap(dwell, each)), dwell]
+        self._held = [each for each in self._held if not overlap(dwell, each)]
+        if not self._has(dwell):
+            self._held.append(dwell)
 
     def end(self, dwell: Dwell) -> None:
         """Add a rest that ended, in place of its provisional pose."""
@@ -104,6 +114,8 @@ class PoseBook:
         self._add(dwell)
 
     def _add(self, dwell: Dwell) -> None:
+        if self._has(dwell):
+            return
         self._dwells.append(dwell)
         if len(self._dwells) > _SEPARATE:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
@@ -159,6 +171,13 @@ def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
 def overlap(one: Dwell, other: Dwell) -> bool:
     """Return whether two dwells overlap in time; they are then the same rest."""
     return one.start <= other.end and other.start <= one.end
+
+
+def _same_samples(one: Dwell, other: Dwell) -> bool:
+    """Return whether two dwells have the same stamps, and the same mean within its noise."""
+    noise = np.hypot(one.std / np.sqrt(one.count), other.std / np.sqrt(other.count))
+    return (overlap(one, other) and not one.doubtful
+            and bool(np.all(np.abs(one.mean - other.mean) <= _SAME_MEAN * noise)))
 
 
 def dwells_of(poses: Poses) -> list[Dwell]:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 import math
 import re
 from time import monotonic
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,9 +27,10 @@ from .events import Compute, Event, Job, Log, Mounting, Severity, ShowPoses, Sti
 from .guidance import Guide, Plan, Progress
 from .health import Health, stream_fault
 from .live_capture import Change, LiveCapture
+from .newest_reading import Newest, NewestReading
 from .sensor_files import SensorFiles
 from .settings import CalibratorSettings, capture_settings
-from .store import load, Loaded, writing_advice
+from .store import load, Loaded, Store, writing_advice
 from .stream_statistics import SILENT, StreamStatistics
 from .work import is_partial, plan_for, title
 from ..calibrate import Calibration, Outside, outside, USES_LIMIT, with_given_mounting
@@ -36,8 +38,9 @@ from ..calibrate.mounting import mounting_of, mounting_words
 from ..effects import Context
 from ..errors import AccelCalibError, counted, InputError
 from ..monitor import status
+from ..one_reading import Triple
 from ..table import Floats, Poses
-from ..units import units_of
+from ..units import Units, units_of
 
 _AGAIN = 10.0
 """Shortest time between two equal log lines about single messages or a silent stream [s]."""
@@ -46,6 +49,11 @@ _FAULT_AGAIN = 60.0
 """Shortest time between two equal log lines about another fault of the stream [s]."""
 
 _NUMBER = re.compile(r'[\d.]+')
+
+_LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
+"""Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
+
+_Found = TypeVar('_Found')
 
 _AUTO_FIT_EVERY = 60.0
 """Shortest time between two automatic fits [s]."""
@@ -72,6 +80,12 @@ class Session:
         A calibration that waits for ~/save or ~/undo.
     publishers : tuple of str
         Names of the nodes that publish the messages.
+    mismatches : tuple of str
+        Publishers and subscribers with another QoS, which exchange no messages with this node.
+    changes : int
+        Number of changes of the calibration in use or offered.
+    computing : int
+        Number of fits and refinements that are running.
 
     Raises
     ------
@@ -89,12 +103,15 @@ class Session:
         self.statistics = StreamStatistics(clock)
         self.files = SensorFiles(settings, topic)
         self.guide = Guide()
+        self._newest = NewestReading(self.units)
+        self._spread = math.nan, math.nan
         self.commands = Commands(self)
         self.frame_id: str | None = None
         self.problem = ''
         self.publishers: tuple[str, ...] = ()
+        self.mismatches: tuple[str, ...] = ()
         self.preview: Calibration | None = None
-        self.fitted_poses = 0
+        self.fitted_poses = self.changes = self.computing = 0
         _check_frames(settings)
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._loaded: set[str] = set()
@@ -103,6 +120,8 @@ class Session:
         self._reported, self._reported_at = '', -math.inf
         self._auto_fit_at = -math.inf
         self._left: frozenset[str] = frozenset()
+        self._largest = (_LARGEST_NATIVE if self.units.name == 'native'
+                         else _LARGEST_G * self.units.per_g)
         self._events: list[Event] = []
         if settings.sensor or settings.calibration_file:
             store = self.files.take(settings.sensor)
@@ -174,17 +193,31 @@ class Session:
             Arrival time of the last sample, by the steady clock [s].
 
         """
-        good = np.isfinite(samples[:, 1:4]).all(axis=1)
+        good = (np.abs(samples[:, 1:4]) <= self._largest).all(axis=1)  # and no NaN
         if not np.all(good):
             reading = tuple(samples[~good][0, 1:4].tolist())
             self.statistics.drop('not_finite', int(np.sum(~good)))
             self._log('warning', f'an Imu message has the linear_acceleration {reading}, expected '
-                      'three finite numbers; it is dropped: check the driver', once_in=_AGAIN)
+                      f'three finite numbers up to {self._largest:.3g}; it is dropped: check the '
+                      'driver', once_in=_AGAIN)
             samples = samples[good]
         if len(samples):
+            since = arrived - self.statistics.arrived
             self.statistics.add(samples, arrived)
             self.active.temperatures.add(samples[:, 0], samples[:, 7])
+            before = self.live.detector.interruptions[-1:]
             self._change(self.live.push(samples, self.settings.auto_capture))
+            last = self.live.detector.interruptions[-1:]
+            if last != before:
+                self._report_jump(last[0].seconds, since)
+
+    def _report_jump(self, seconds: float, since: float) -> None:
+        """Log a jump of the stamps, unless no messages arrived for as long [s]."""
+        if abs(seconds - since) > SILENT:
+            self._log('warning', f'the stamps jumped {"back" if seconds < 0.0 else "ahead"} by '
+                      f'{abs(seconds):.1f} s; the rest before it has ended, and the poses are '
+                      'kept: unless a recording is played, check the clock of the driver',
+                      once_in=_FAULT_AGAIN)
 
     def drop_unreadable(self, size: int) -> None:
         """Count an unreadable message of this size [bytes]."""
@@ -209,7 +242,9 @@ class Session:
         self._report_still()
 
     def _report_still(self) -> None:
-        if self.live.detector.still is not self._still:
+        # Without messages, or without a clock, nobody knows whether the sensor rests.
+        blind = max(self.statistics.age, self.statistics.stopped) > SILENT
+        if (self.live.detector.still and not blind) is not self._still:
             self._still = not self._still
             self._still_since = self.statistics.stamp - self.settings.still_window
             self._events.append(Still(self._still))
@@ -238,14 +273,24 @@ class Session:
         """Set the sensor from the first message."""
         self.frame_id = frame_id
         self._log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}')
-        if frame_id and frame_id == self.settings.output_frame_id:
-            self._log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
-                      'turns levelled messages twice; choose another output_frame_id, or set '
-                      'rotate to false')
+        self._show_frame()
         if self.files.store is None or self._loaded - {self.sensor}:
             self._begin_again()
         elif not self.settings.sensor:
             self.files.take(self.sensor)
+
+    def _show_frame(self) -> None:
+        """Show poses and mounting in the frame of the sensor, which was not known before."""
+        frame_id, calibration = self.frame_id, self.active.calibration
+        if frame_id and frame_id == self.settings.output_frame_id:
+            self._log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
+                      'turns levelled messages twice; choose another output_frame_id, or set '
+                      'rotate to false')
+        if frame_id and calibration is not None and calibration.is_levelled:
+            self._events.append(Mounting(calibration.rotation, frame_id))
+        if self.guide.plan is not None:
+            self._events.append(ShowPoses(self.guide.plan.up, self.guide.plan.asked,
+                                          frame_id or ''))
 
     def _switch_to(self, frame_id: str) -> None:
         """Switch to another sensor."""
@@ -253,17 +298,40 @@ class Session:
         self.frame_id = frame_id
         if not self.settings.sensor:  # otherwise the user has set the sensor
             self._begin_again()
+        self._show_frame()
 
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.live = LiveCapture(capture_settings(self.settings), self.units)
+        enabled = self.active.enabled
         self.active = ActiveCalibration(self.settings.gravity, rotates=self.settings.rotate)
+        self.active.enabled = enabled
         self.guide, self.preview = Guide(), None
-        self.fitted_poses = 0
+        self.fitted_poses, self._loaded, self._auto_fit_waits = 0, set(), False
+        self.changes += 1
         store = self.files.take(self.sensor)
         self._check_lock()
         if store is not None:
-            self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
+            self._load(store)
+
+    def _load(self, store: Store) -> None:
+        """Add a job that reads the files, for the sensor that is in use now."""
+        live = self.live
+        self._events.append(Job(lambda compute: load(store), lambda loaded: (
+            self._adopt_loaded(loaded) if self.live is live else '')))
+
+    def job(self, run: Callable[[Compute], _Found], finish: Callable[[_Found], str]) -> Job:
+        """Return a job whose result is used only for the sensor that is in use now."""
+        live, sensor = self.live, self.sensor
+
+        def finish_for_sensor(found: _Found) -> str:
+            if self.live is not live:
+                raise InputError(f'the sensor {self.sensor!r} has replaced {sensor!r} meanwhile, '
+                                 'expected one sensor: the result is not used',
+                                 'call the service again')
+            return finish(found)
+
+        return Job(run, finish_for_sensor)
 
     def _check_lock(self) -> None:
         """Report it if another node uses the files."""
@@ -290,6 +358,7 @@ class Session:
     def adopt(self, calibration: Calibration | None) -> None:
         """Use this calibration for the correction, with the given mounting if there is one."""
         self.preview, self.problem = None, ''
+        self.changes += 1
         if calibration is None:
             self.active.adopt(None)
             return
@@ -303,7 +372,7 @@ class Session:
         for line in calibration.warnings:
             self._log('warning', line)
         if calibration.is_levelled:
-            self._events.append(Mounting(calibration.rotation, self.frame_id or self.sensor))
+            self._events.append(Mounting(calibration.rotation, self.frame_id or ''))
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -325,15 +394,17 @@ class Session:
         known = {'time': self.statistics.stamp, 'temperature': self.statistics.temperature}
         return {key: np.array([value]) for key, value in known.items() if math.isfinite(value)}
 
-    def offer(self, calibration: Calibration) -> None:
-        """Publish this calibration on ~/preview only."""
+    def offer(self, calibration: Calibration | None) -> None:
+        """Publish this calibration on ~/preview only; None: discard the offered one."""
         self.preview = calibration
+        self.changes += 1
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self._events.append(Job(lambda compute: load(store), self._adopt_loaded))
+            self._load(store)
+        self._report_still()
         self._report_stream()
         self._report_outside()
         self._auto_fit()
@@ -360,12 +431,13 @@ class Session:
 
     def _report_stream(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""
-        fault = stream_fault(self.statistics, self.length_g(), self.topic, self.publishers)
+        fault = stream_fault(self.statistics, self.length_g(), self.topic, self.publishers,
+                             self.mismatches)
         silent = self.statistics.age > SILENT
         again = self.clock() - self._reported_at >= (_AGAIN if silent else _FAULT_AGAIN)
         kind = _NUMBER.sub('', fault)
         if fault and (again or kind != self._reported):
-            waiting = not self.statistics.messages
+            waiting = not self.statistics.messages and not self.mismatches
             self._log('info' if waiting else 'warning', f'waiting: {fault}' if waiting else fault)
             self._reported, self._reported_at = kind, self.clock()
         elif not fault and self._reported:
@@ -394,38 +466,41 @@ class Session:
             self._auto_fit_waits, self._auto_fit_at = False, self.clock()
             self._events.append(self.commands.auto_fit())
 
+    def auto_fit_later(self) -> None:
+        """Repeat an automatic fit when the next one is due."""
+        self._auto_fit_waits = True
+
     def _show_poses(self, *, store: bool, new_rest: bool = False) -> None:
-        """Add a job that draws the poses with the next pose, and stores them."""
+        """Add a job that stores the poses, and draws them with the next pose."""
         poses, units, model = self.live.book.poses(), self.units, self.settings.model
         where = self.files.store if store else None
         guide = self.guide
         added = guide.added(len(poses))
         due = added != 0 or guide.plan is None
 
-        def run(compute: Compute) -> tuple[OSError | None, Plan | None]:
-            not_stored = None
+        def stored(compute: Compute) -> OSError | None:
             try:
                 if where is not None:
                     where.save_poses(poses)
             except OSError as error:
-                not_stored = error
-            if not due:  # only an average has changed
-                return not_stored, None
-            if not len(poses):  # without waiting for the start of the worker process
-                return not_stored, plan_for(poses, units, model)
-            return not_stored, compute(plan_for, poses, units, model)
+                return error
+            return None
 
-        def finish(found: tuple[OSError | None, Plan | None]) -> str:
-            not_stored, plan = found
+        def plan_next(not_stored: OSError | None) -> str | Job:
             if not_stored is not None:
                 self._log('error', f'the poses could not be stored: {not_stored}; '
                           f'{writing_advice(not_stored)}', once_in=_AGAIN)
-            if plan is not None:
+            if not due:  # only an average has changed
+                return finish(None)
+            return Job(lambda compute: _plan(compute, poses, units, model), finish, computes=True)
+
+        def finish(plan: Plan | None) -> str:
+            if plan is not None and guide is self.guide:  # otherwise, it is of another sensor
                 guide.plan = plan
                 self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
             return guide.line(poses, units, added=added > 0) if new_rest else ''
 
-        self._events.append(Job(run, finish))
+        self._events.append(Job(stored, plan_next))
 
     @property
     def _all_used(self) -> bool:
@@ -439,21 +514,50 @@ class Session:
             return 'the calibration uses these poses'
         return self.guide.advice
 
-    def progress(self) -> Progress:
-        """Return the progress of the calibration."""
+    def progress(self, reading: Triple | None = None) -> Progress:
+        """
+        Return the progress of the calibration.
+
+        Parameters
+        ----------
+        reading : (float, float, float), optional
+            The newest reading; by default the last one that was pushed.
+
+        """
         plan = self.guide.plan
         silent = self.statistics.age > SILENT
-        threshold = self.live.detector.threshold
+        newest = Newest() if silent else self.newest(reading)
         direction = None if plan is None or self._all_used else plan.asked.direction
         return Progress(
             still=self._still and not silent,
-            stillness=math.nan if silent else self.statistics.spread / threshold,
+            stillness=math.nan if silent else self._stillness(),
             dwell=self.statistics.stamp - self._still_since if self._still else 0.0,
             min_dwell=self.settings.min_dwell, poses=self.guide.poses,
             total=0 if plan is None else plan.asked.total,
             coverage=0.0 if plan is None else plan.coverage,
             accuracy=math.nan if plan is None else plan.asked.error * plan.noise_g,
-            advice=self.advice, direction=() if direction is None else tuple(direction.tolist()))
+            advice=self.advice, direction=() if direction is None else tuple(direction.tolist()),
+            up=newest.up, length=newest.length, corrected=newest.corrected,
+            temperature=self.statistics.temperature)
+
+    def _stillness(self) -> float:
+        """Return the spread of the last samples relative to the largest of a still sensor."""
+        arrived, stillness = self._spread
+        if arrived != self.statistics.arrived:  # the threshold takes longer than all the rest
+            stillness = self.statistics.spread / self.live.detector.threshold
+            self._spread = self.statistics.arrived, stillness
+        return stillness
+
+    def newest(self, reading: Triple | None = None) -> Newest:
+        """Return direction and length of the newest reading; the parameter is as in `progress`."""
+        if reading is None:
+            if self.statistics.newest is None:
+                return Newest()
+            reading = tuple(self.statistics.newest.tolist())
+        known = {'time': self.statistics.stamp, **self.active.temperatures.columns}
+        if math.isfinite(self.statistics.temperature):
+            known['temperature'] = self.statistics.temperature
+        return self._newest.described(reading, self.preview or self.active.calibration, known)
 
     def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:
         self._events.append(Log(severity, words, once_in))
@@ -476,7 +580,7 @@ class Session:
                 0.0, self.statistics.stamp - active.rest.end)
         return Health(
             sensor=self.sensor, state=self._state(), problem=self.problem, topic=self.topic,
-            publishers=self.publishers,
+            publishers=self.publishers, mismatches=self.mismatches,
             calibration='' if active.calibration is None else title(active.calibration),
             outside='; '.join(each.words for key, each in self._outside().items()
                               if key != 'std'),
@@ -506,6 +610,14 @@ class Session:
             return 'waiting for the first message'
         return ('no calibration, raw messages are published' if self.settings.passthrough
                 else 'no calibration, nothing is published')
+
+
+def _plan(compute: Compute, poses: Poses, units: Units, model: str) -> Plan:
+    """Return the next pose; without poses, do not wait for the start of the worker process."""
+    if not len(poses):
+        return plan_for(poses, units, model)
+    plan: Plan = compute(plan_for, poses, units, model)
+    return plan
 
 
 def _doubtful(poses: Poses) -> int:

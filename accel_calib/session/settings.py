@@ -247,6 +247,11 @@ class CalibratorSettings:
     drift_warn: float = parameter(
         0.01, 'Smallest lasting change of |a| at rest for a warning; it must also exceed the '
         'stated uncertainty of the calibration [m/s²]', limits=(0.0, 100.0), live=True)
+    web_port: int = parameter(
+        0, 'Port of the live page, such as 8080. 0: no page', limits=(0, 65535))
+    web_host: str = parameter(
+        '127.0.0.1', 'Address at which the live page is served. 0.0.0.0: to the whole network, '
+        'without encryption')
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:

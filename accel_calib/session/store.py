@@ -360,12 +360,13 @@ def _tidied(store: Store) -> list[str]:
     notes = []
     try:
         notes = take_over(store)
-        for path in (store.calibration, store.poses):
-            remove_leftovers(path)
+        failed = [error for path in (store.calibration, store.poses)
+                  for error in remove_leftovers(path)]
     except OSError as error:
-        notes.append(f'the folder {store.calibration.parent} could not be tidied: {error}; '
-                     f'{writing_advice(error)}')
-    return notes
+        return [*notes, f'the folder {store.calibration.parent} could not be tidied: {error}; '
+                f'{writing_advice(error)}']
+    return [*notes, *(f'the temporary file {error.filename} could not be removed: '
+                      f'{error.strerror}; remove it by hand' for error in failed)]
 
 
 def _after(path: Path, error: Exception) -> str:

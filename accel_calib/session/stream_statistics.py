@@ -68,6 +68,8 @@ class StreamStatistics:
         Last temperature [°C]; NaN: none.
     reading : (3,) array or None
         Mean reading of the last batch.
+    newest : (3,) array or None
+        The last reading.
     spread : float
         Largest standard deviation over the axes of the last batch [unit of the reading].
 
@@ -77,8 +79,9 @@ class StreamStatistics:
         self._clock = clock
         self.messages = self.not_finite = self.foreign = self.implausible = 0
         self.stamp = self.temperature = self.spread = math.nan
-        self.arrived = self._dropped_at = -math.inf
+        self.arrived = self._advanced = self._dropped_at = -math.inf
         self.reading: Floats | None = None
+        self.newest: Floats | None = None
         self._batches: deque[_Batch] = deque()
 
     def add(self, rows: Floats, arrived: float) -> None:
@@ -91,8 +94,10 @@ class StreamStatistics:
         while self._batches[0].arrived < arrived - _SPAN:
             self._batches.popleft()
         self.messages += len(rows)
+        if np.any(steps):  # NaN, too
+            self._advanced = arrived
         self.stamp, self.arrived = float(stamps[-1]), arrived
-        self.reading = rows[:, 1:4].mean(axis=0)
+        self.reading, self.newest = rows[:, 1:4].mean(axis=0), rows[-1, 1:4]
         self.spread = float(np.max(rows[:, 1:4].std(axis=0)))
 
     def drop(self, name: str, count: int = 1) -> None:
@@ -111,6 +116,11 @@ class StreamStatistics:
     def age(self) -> float:
         """Time since the last message [s]; infinite if there was none."""
         return self._clock() - self.arrived
+
+    @property
+    def stopped(self) -> float:
+        """Time for which messages have arrived with one and the same stamp [s]."""
+        return self.arrived - self._advanced
 
     @property
     def rate(self) -> float:

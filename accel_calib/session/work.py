@@ -192,12 +192,23 @@ def poses_up(poses: Poses, units: Units) -> Floats:
 
 
 def plan_for(poses: Poses, units: Units, model: str) -> Plan:
-    """Return the next pose for a fit of this model, or that more poses no longer help."""
+    """
+    Return the next pose for a fit of this model, or that more poses no longer help.
+
+    As long as the directions of native readings are not known, the poses are taken for those that
+    were asked for. Otherwise the same pose would be asked for again.
+
+    """
     up = poses_up(poses, units)
     noise, noise_g = pose_noise(poses.noise, up), None
     if noise is not None and len(noise) and units.name != 'native':
         noise_g = float(np.median(units.to_g(noise)))
-    asked = next_pose(up, '10' if model == 'auto' else model, noise, noise_g=noise_g)
+    fitted_model = '10' if model == 'auto' else model
+    asked = next_pose(up, fitted_model, noise, noise_g=noise_g)
+    supposed = up
+    while len(supposed) < len(poses) and asked.direction is not None:
+        supposed = np.vstack([supposed, asked.direction])
+        asked = next_pose(supposed, fitted_model)
     return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
                 coverage(up) if len(up) else 0.0)
 

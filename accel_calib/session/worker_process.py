@@ -26,8 +26,8 @@ from select import select
 import signal
 import subprocess
 import sys
-from threading import Thread
-from typing import Any, BinaryIO, TypeVar
+from threading import Lock, Thread
+from typing import Any, BinaryIO, cast, TypeVar
 
 from ..errors import InputError
 
@@ -53,7 +53,7 @@ _START = ('import sys; sys.path[:] = filter(None, sys.path); '
 
 class WorkerProcess:
     """
-    The interface of the node to the process; for one thread at a time.
+    The interface of the node to the process; other threads wait for their turn.
 
     Parameters
     ----------
@@ -66,6 +66,7 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
         self._idle = idle
+        self._turn = Lock()
 
     def start(self) -> None:
         """Start the process unless it is running, without waiting for it."""
@@ -104,6 +105,10 @@ class WorkerProcess:
             If the node is ending.
 
         """
+        with self._turn:
+            return self._call(function, given)
+
+    def _call(self, function: Callable[..., Found], given: tuple[Any, ...]) -> Found:
         self.start()
         try:
             good, found = self._ask(function, given)
@@ -114,7 +119,7 @@ class WorkerProcess:
             return function(*given)
         if not good:
             raise found
-        return found
+        return cast('Found', found)
 
     def _ask(self, function: Callable[..., Any], given: tuple[Any, ...]) -> tuple[bool, Any]:
         process = self._process

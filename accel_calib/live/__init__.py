@@ -1,0 +1,11 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The live page: a calibration in a browser, served by the node or without ROS.
+
+`server` serves the page and its messages (`messages`). `exchange` connects it with a session. The
+node has its own session; `host` runs one with the samples of `sources`. `page` contains the files
+for the browser.
+
+"""

@@ -1,0 +1,215 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Samples as they arrive: from a serial port, or from a recording that is played in real time.
+
+A source yields blocks of samples without waiting for long: a block can be empty. Whoever takes
+them can do something else in between.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+import time
+from typing import Any
+
+import numpy as np
+
+from ..capture import samples_of
+from ..errors import InputError
+from ..files import LineReader, LogOptions, open_log
+from ..table import Floats, Recording
+from ..units import Units
+
+_WAIT_S = 0.03
+"""Longest time without a block [s]."""
+
+_HEAD_S = 2.0
+"""Time over which the first lines of a port are collected [s]."""
+
+_HEAD_LINES = 20
+_PATIENCE_S = 10.0
+"""Time without a line that is understood after which a port is refused [s]."""
+
+_LONGEST_LINE = 4096
+"""Longest line of a port [bytes]."""
+
+_LONGEST_GAP_S = 5.0
+"""Longer gaps in a recording are not waited for [s]."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    Samples as they arrive; `open_source` makes it.
+
+    Parameters
+    ----------
+    name : str
+        The port or the recording.
+    sensor : str
+        Name of the sensor; empty if it is not known.
+    units : Units
+        Unit of the readings.
+    read_as : str
+        How they are read, in one line; empty if nothing is assumed.
+    blocks : iterator of (n, 9) array
+        The samples, as for `accel_calib.capture.StillDetector.push`. A block can be empty.
+
+    """
+
+    name: str
+    sensor: str
+    units: Units
+    read_as: str
+    blocks: Iterator[Floats]
+
+
+def is_port(name: str) -> bool:
+    """Return whether a name is that of a serial port, and not of a recording."""
+    return '://' in name or name.upper().startswith(('COM', '/DEV/')) or (
+        Path(name).is_char_device())
+
+
+@contextmanager
+def open_source(name: str, options: LogOptions, *, baud: int = 115200, speed: float = 1.0
+                ) -> Iterator[Source]:
+    """
+    Open a serial port, or a recording.
+
+    Parameters
+    ----------
+    name : str
+        Device of the port or its URL (``socket://HOST:PORT``), or file of the recording.
+    options : LogOptions
+        How to read it; by default it is recognised.
+    baud : int
+        Baud rate of the port.
+    speed : float
+        Speed of the recording, relative to real time.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened or read, or sends no samples; also while it is read.
+    OSError
+        If the file cannot be read.
+
+    """
+    if is_port(name):
+        with _opened_port(name, baud) as port:
+            lines = _lines(name, port)
+            reader = _understood(name, lines, options, baud)
+            yield Source(name, '', reader.units, reader.read_as, _arriving(reader, lines))
+        return
+    with open_log(Path(name), options) as log:
+        yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed))
+
+
+# ----------------------------------------------------------------------------- a recording
+
+def _played(blocks: Iterator[Recording], speed: float) -> Iterator[Floats]:
+    """Yield the samples of a recording when they are due."""
+    shift = last = -np.inf
+    for block in blocks:
+        rows = _rows(block)
+        due = np.maximum.accumulate(rows[:, 0]) / speed
+        done = 0
+        while done < len(rows):
+            now = time.monotonic()
+            if due[done] - last > _LONGEST_GAP_S / speed:
+                shift = due[done] - now
+            ready = int(np.searchsorted(due, now + shift, side='right'))
+            ready = _before_gap(due, done, ready, speed)
+            yield rows[done:ready]
+            if ready > done:
+                last, done = due[ready - 1], ready
+            time.sleep(_WAIT_S)
+
+
+def _before_gap(due: Floats, done: int, ready: int, speed: float) -> int:
+    """Return the end of the samples that are ready, at the latest at the next long gap."""
+    gaps = np.flatnonzero(np.diff(due[done:ready]) > _LONGEST_GAP_S / speed)
+    return max(done, done + int(gaps[0]) + 1 if len(gaps) else ready)
+
+
+def _rows(recording: Recording) -> Floats:
+    """Return samples as rows of all columns."""
+    rows = np.full((len(recording), 9), np.nan)
+    columns = samples_of(recording, 0, len(recording))
+    rows[:, :len(columns)] = columns.T
+    return rows
+
+
+# ----------------------------------------------------------------------------- a serial port
+
+@contextmanager
+def _opened_port(name: str, baud: int) -> Iterator[Any]:
+    try:
+        import serial
+    except ImportError as err:
+        raise InputError('pyserial is not installed, but a serial port needs it',
+                         "run pip install 'accel_calib[live]'") from err
+    try:
+        port = serial.serial_for_url(name, baudrate=baud, timeout=_WAIT_S)
+    except (serial.SerialException, ValueError) as err:
+        raise InputError(f'{name} cannot be opened: {err}', 'check its name, whether another '
+                         'program uses it, and your rights (on Linux: group dialout)') from err
+    try:
+        yield port
+    finally:
+        port.close()
+
+
+def _lines(name: str, port: Any) -> Iterator[list[str]]:
+    """Yield complete lines from a port, or none after a moment."""
+    rest = b''
+    while True:
+        try:
+            data = port.read(port.in_waiting or 1)
+        except OSError as err:  # SerialException is one, too
+            raise InputError(f'{name} has ended: {err}', 'connect the sensor again, and start '
+                             'again') from err
+        *lines, rest = (rest + data).split(b'\n')
+        rest = rest[-_LONGEST_LINE:]
+        yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
+               for line in lines]
+
+
+def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int
+                ) -> LineReader:
+    """Return the reader of the lines, as soon as the first ones are understood."""
+    head: list[str] = []
+    begin = tried = time.monotonic()
+    problem = InputError(f'{name} sends no lines, expected one line for each sample',
+                         'check the sensor and its program')
+    first = True
+    for new in lines:
+        now = time.monotonic()
+        if new and first:  # it can be cut
+            new, first, begin, tried = new[1:], False, now, now
+        head += new
+        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES:
+            tried = now
+            try:
+                return LineReader(name, head, now - begin, options)
+            except InputError as err:
+                problem = err
+        if now - begin > _PATIENCE_S:
+            break
+    raise InputError(problem.message, f'{problem.advice}; check the baud rate {baud}, too '
+                     '(--baud)')
+
+
+def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats]:
+    """Yield the samples of a port."""
+    if reader.first is not None:
+        yield _rows(reader.first)
+    for new in lines:
+        recording = reader.samples(new) if new else None
+        yield np.empty((0, 9)) if recording is None else _rows(recording)

@@ -1,0 +1,95 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Services that four processes call at random while messages arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import sys
+from typing import Any
+
+from accel_calib.files import read_calibration
+from accel_calib.sphere import spread_directions
+from faults.feed import send_until, start_poses
+from faults.logged import log_to_files
+from faults.order import Call, explained, State
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+CALLER = Path(__file__).with_name('caller.py')
+CLIENTS = 4
+CALLS = 50 * int(os.environ.get('ACCEL_CALIB_TRIALS', '1'))
+READING = np.array([1.0, 2.0, 9.0])
+_POSES = 12
+_SLOW = ('fit', 'refine')
+_QUICK_S = 0.1
+
+
+def answer_to(bench: Any, message: Any) -> Any:
+    """Publish a message, and return the corrected acceleration of this message."""
+    bench.send(message)
+
+    def found() -> list[Any]:
+        return [each for each in bench.came_out if each.header.stamp == message.header.stamp]
+
+    bench.spin(found)
+    return found()[0].linear_acceleration
+
+
+def calls_of(printed: str) -> list[Call]:
+    """Return the calls that a caller printed."""
+    return [Call(**json.loads(line)) for line in printed.splitlines() if line.startswith('{')]
+
+
+def figures(clients: list[list[Call]]) -> str:
+    """Return how long the responses took."""
+    quick = np.array([call.ended - call.begun for calls in clients for call in calls
+                      if call.name not in _SLOW])
+    p50, p99 = 1e3 * np.quantile(quick, [0.5, 0.99])
+    return (f'{sum(map(len, clients))} calls; without fit and refine: '
+            f'{100 * np.mean(quick < _QUICK_S):.1f} % within 100 ms, median {p50:.0f} ms, '
+            f'p99 {p99:.0f} ms, longest {1e3 * np.max(quick):.0f} ms')
+
+
+def test_each_call_is_answered_and_all_agree_with_some_order(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    home = bench.home / 'accel_calib'
+    start_poses(home / 'arm_poses.csv', _POSES)
+    log_to_files(bench, tmp_path)
+    node = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
+    turned = readings(spread_directions(14), dwell=4.0)
+    callers = [bench.run(str(CALLER), str(seed), str(CALLS)) for seed in range(CLIENTS)]
+    send_until(bench, turned, lambda: all(each.poll() is not None for each in callers),
+               30.0 + 0.5 * CALLS)
+    clients = [calls_of(each.communicate()[0]) for each in callers]
+    assert bench.call('enable', data=True).success
+    force = answer_to(bench, bench.imu(READING))
+    status, printed = bench.end(node, signal.SIGINT)
+    sys.stdout.write(f'{figures(clients)}\n')
+    assert status == 0, printed
+    assert 'Traceback' not in printed
+    assert 'unexpected error' not in printed
+    assert [len(calls) for calls in clients] == [CALLS] * CLIENTS
+    assert not [call for calls in clients for call in calls if call.words is None]
+    stored = home / 'arm.yaml'
+    levelled = stored.exists() and read_calibration(stored).is_levelled
+    steps = sum(bool(re.fullmatch(r'arm\.yaml\.before\d+', path.name)) for path in home.iterdir())
+
+    def fits(state: State) -> bool:
+        return ((state.stored is not None) is stored.exists() and len(state.steps) == steps
+                and (state.stored is not None and state.stored.levelled) is levelled)
+
+    found, stuck = explained(clients, State(_POSES), fits)
+    assert found is not None, stuck
+    if found.used == found.stored:
+        expected = (read_calibration(stored).apply(READING[np.newaxis])[0] if stored.exists()
+                    else READING)
+        np.testing.assert_allclose([force.x, force.y, force.z], expected, atol=1e-9)

@@ -1,0 +1,212 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Nodes that are killed at random times, and two nodes on one store: nothing answered is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import sys
+import time
+from typing import Any
+
+from accel_calib.files import read_calibration, read_poses
+from accel_calib.session.work import is_partial
+from accel_calib.sphere import spread_directions
+from faults.feed import send_until, start_poses
+from faults.logged import log_to_files
+from faults.order import AFTER, Call, State
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+FACTOR = int(os.environ.get('ACCEL_CALIB_TRIALS', '1'))
+KILLS = 6 * FACTOR
+SECONDS = 6.0 * FACTOR
+READER = Path(__file__).with_name('reader.py')
+COMMANDS = ('capture_pose', 'fit', 'set_level', 'fit', 'undo_pose', 'save', 'capture_pose', 'undo',
+            'fit', 'refine', 'calibrate_at_rest', 'load', 'reset')
+_POSES = 12
+_LATEST_KILL_S = 1.5
+
+
+class Stored:
+    """
+    What the files of a store hold.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a store of the sensor ``arm``; a torn file raises an error.
+
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path, table = folder / 'arm.yaml', folder / 'arm_poses.csv'
+        names = [each.name for each in folder.iterdir()]
+        self.calibration = read_calibration(path) if path.exists() else None
+        self.poses = len(read_poses(table)) if table.exists() else 0
+        self.steps = sorted(int(name.rpartition('before')[2]) for name in names
+                            if re.fullmatch(r'arm\.yaml\.before\d+', name))
+        for number in self.steps:
+            step = folder / f'arm.yaml.before{number}'
+            if step.stat().st_size:
+                read_calibration(step)
+        self.damaged = [name for name in names if '.damaged' in name]
+
+    def agrees(self, state: State) -> bool:
+        """Return whether this is what a state has stored."""
+        made, found = state.stored, self.calibration
+        if (made is None) is not (found is None) or state.poses != self.poses:
+            return False
+        return made is None or found is None or (
+            made.levelled is found.is_levelled and made.full is not is_partial(found))
+
+
+def after_kill(states: Iterable[State], name: str) -> list[State]:
+    """Return the states that a call without a response may leave, if it was killed or done."""
+    words = 'mounting of the sensor changes offset {} poses no calibration any more'
+    found = []
+    for state in states:
+        found.append(state)
+        for count in {max(state.poses - 1, 0), state.poses, state.poses + 1}:
+            for text in (words, *(words.replace(part, '') for part in (
+                    'mounting of the sensor', 'changes offset', 'no calibration any more'))):
+                call = Call(name, 0.0, 0.0, text.format(count), good=True)
+                found += AFTER[name](state, call, -1)
+    return found
+
+
+def call_until_killed(bench: Any, node: Any, turned: Any, rng: np.random.Generator,
+                      states: list[State]) -> list[State]:
+    """Call services one after the other, kill the node, and return what may be stored."""
+    ends = time.monotonic() + rng.uniform(0.1, _LATEST_KILL_S)
+    number = 0
+    while True:
+        name = str(rng.choice(COMMANDS))
+        client = bench.client(name)
+        future = client.call_async(client.srv_type.Request())
+        send_until(bench, turned, lambda future=future: (
+            future.done() or time.monotonic() > ends))
+        if not future.done():
+            bench.end(node, signal.SIGKILL)
+            return after_kill(states, name)
+        answer, number = future.result(), number + 1
+        call = Call(name, 0.0, 0.0, answer.message, answer.success)
+        states = [after for state in states for after in AFTER[name](state, call, number)]
+        assert states, call
+
+
+def test_a_killed_node_has_stored_all_that_it_answered(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    folder = bench.home / 'accel_calib'
+    start_poses(folder / 'arm_poses.csv', _POSES)
+    log_to_files(bench, tmp_path)
+    turned = readings(spread_directions(14), dwell=4.0)
+    rng = np.random.default_rng(FACTOR)
+    states = [State(_POSES)]
+    for _ in range(KILLS):
+        node = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
+        bench.feed(turned[:100])
+        found = call_until_killed(bench, node, turned, rng, states)
+        bench.join_anew()
+        printed = node.communicate()[0]
+        assert 'Traceback' not in printed
+        assert ' kept as ' not in printed.replace('the stored file is kept as', '')
+        stored = Stored(folder)
+        assert not stored.damaged
+        states = [state for state in found if stored.agrees(state)]
+        assert states, (found[0], stored.calibration, stored.poses)
+        states = [State(state.poses, state.stored, state.stored, state.steps)
+                  for state in set(states)]
+
+
+def test_a_node_that_fits_by_itself_is_killed_without_damage(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    folder = bench.home / 'accel_calib'
+    log_to_files(bench, tmp_path)
+    turned = readings(spread_directions(12))
+    rng = np.random.default_rng(FACTOR)
+    poses = 0
+    for _ in range(max(2, KILLS // 3)):
+        node = bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=8, passthrough=True)
+        bench.feed(turned[:round(rng.uniform(0.3, 1.0) * len(turned))])
+        bench.end(node, signal.SIGKILL)
+        bench.join_anew()
+        assert 'Traceback' not in node.communicate()[0]
+        stored = Stored(folder)
+        assert not stored.damaged
+        assert stored.poses >= poses
+        poses = stored.poses
+    bench.calibrator(sensor='arm', passthrough=True)
+    bench.feed(turned)
+    assert bench.call('fit').success
+    assert not list(folder.glob('.*.tmp'))
+
+
+def second(bench: Any) -> Any:
+    """Start a second calibrator for the same sensor."""
+    return bench.run('-m', 'accel_calib.ros.calibrator', '--ros-args', '-r', '__node:=second',
+                     '-p', 'sensor:=arm', '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
+
+
+def test_of_two_nodes_one_stores_and_the_other_says_so(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    from std_srvs.srv import Trigger
+    folder = bench.home / 'accel_calib'
+    start_poses(folder / 'arm_poses.csv', _POSES)
+    log_to_files(bench, tmp_path)
+    first = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
+    other, reader = second(bench), bench.run(str(READER), str(folder / 'arm.yaml'))
+    turned = readings(spread_directions(14), dwell=4.0)
+    names = ('capture_pose', 'fit', 'undo', 'undo_pose', 'set_level', 'save', 'reset')
+    clients = {(node, name): bench.node.create_client(Trigger, f'{node}/{name}')
+               for node in ('calibrator', 'second') for name in names}
+    bench.spin(lambda: all(client.service_is_ready() for client in clients.values()))
+    rng = np.random.default_rng(FACTOR)
+    states, ends, refused, called = [State(_POSES)], time.monotonic() + SECONDS, 0, 0
+    while time.monotonic() < ends:
+        name = str(rng.choice(names, p=[0.3, 0.2, 0.15, 0.1, 0.1, 0.1, 0.05]))
+        both = [clients[node, name].call_async(Trigger.Request())
+                for node in ('calibrator', 'second')]
+        send_until(bench, turned, lambda both=both: all(each.done() for each in both))
+        mine, others = (each.result() for each in both)
+        call = Call(name, 0.0, 0.0, mine.message, mine.success)
+        called += 1
+        states = [after for state in states for after in AFTER[name](state, call, called)]
+        assert states, call
+        assert not others.success, others.message
+        refused += f'process id {first.pid}' in others.message
+    stored = Stored(folder)
+    assert [state for state in states if stored.agrees(state)], stored.poses
+    assert refused > called // 2
+    bench.end(first, signal.SIGKILL)
+    assert takes_over(bench, turned, clients['second', 'capture_pose'])
+    assert bench.end(other, signal.SIGINT)[0] == 0
+    bench.end(reader, signal.SIGKILL)
+    reads = [json.loads(line) for line in reader.communicate()[0].splitlines()]
+    count = sum(each['reads'] for each in reads)
+    sys.stdout.write(f'{called} calls of each node, {count} reads\n')
+    assert count > 100
+    assert not [bad for each in reads for bad in each['bad']]
+
+
+def takes_over(bench: Any, turned: Any, client: Any) -> bool:
+    """Return whether the second node stores poses after the first one has ended."""
+    answers: list[Any] = []
+    futures = [client.call_async(client.srv_type.Request())]
+
+    def captured() -> bool:
+        if futures[-1].done():
+            answers.append(futures[-1].result())
+            futures.append(client.call_async(client.srv_type.Request()))
+        return bool(answers) and answers[-1].success
+
+    send_until(bench, turned, captured)
+    return bool(answers[-1].success)

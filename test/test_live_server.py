@@ -1,0 +1,434 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The server of the live page with a real session, without ROS and without a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import re
+import socket
+from threading import Event, Thread
+import time
+from typing import Any
+
+from accel_calib.errors import InputError
+from accel_calib.live import messages, server
+from accel_calib.live.host import Host
+from accel_calib.session import CalibratorSettings, Log
+from accel_calib.simulate import model_with, simulate_recording
+from accel_calib.sphere import spread_directions
+from accel_calib.table import Floats
+import numpy as np
+import pytest
+from viewer import fetch, Viewer, wait
+
+GRAVITY = 9.80665
+OFFSET = (0.03, -0.02, 0.04)
+PAUSE = 0.02
+
+
+def rows_of(directions: Floats, seed: int = 7) -> Floats:
+    """Return the samples of a sensor that is turned; its temperature is 21 °C."""
+    recording = simulate_recording(
+        model_with({'offset': np.array(OFFSET)}), directions, np.random.default_rng(seed),
+        noise_g=0.0005, rate_hz=50.0, dwell=1.8, turn=0.4)
+    rows = np.full((len(recording), 9), np.nan)
+    rows[:, 0], rows[:, 1:4], rows[:, 7] = recording['time'], recording.reading * GRAVITY, 21.0
+    return rows
+
+
+@dataclass
+class Recording:
+    """A source that plays rows faster than real time."""
+
+    rows: Floats
+    name: str = 'bench.csv'
+    sensor: str = 'imu_link'
+    played: Event = field(default_factory=Event)
+
+    @property
+    def blocks(self) -> Iterator[Floats]:
+        for block in np.array_split(self.rows, max(1, len(self.rows) // 40)):
+            time.sleep(PAUSE)
+            yield block
+        self.played.set()
+
+
+class Bench:
+    """A host that runs in a thread."""
+
+    def __init__(self, source: Recording, path: Path) -> None:
+        self.logged: list[Log] = []
+        self.source, self.path = source, path
+        self.host = Host(source, CalibratorSettings(calibration_file=str(path)),
+                         self.logged.append)
+        self._over = Event()
+        self._thread = Thread(target=self.host.run, args=[self._over.is_set])
+        self._viewers: list[Viewer] = []
+        self._thread.start()
+
+    @property
+    def base(self) -> str:
+        return self.host.server.link.partition('/#')[0]
+
+    @property
+    def port(self) -> int:
+        return int(self.base.rpartition(':')[2])
+
+    def viewer(self, *, token: str | None = None, seen: int = 0) -> Viewer:
+        link = self.host.server.link if token is None else f'{self.base}/#{token}'
+        self._viewers.append(Viewer(link, seen=seen))
+        return self._viewers[-1]
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self.host.close()
+        for viewer in self._viewers:
+            viewer.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Yield a host with a short recording."""
+    made = Bench(Recording(rows_of(spread_directions(3))), tmp_path / 'c.yaml')
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def turned(tmp_path: Path) -> Iterator[Bench]:
+    """Yield a host whose recording has been played, with poses for a fit."""
+    made = Bench(Recording(rows_of(spread_directions(14))), tmp_path / 'c.yaml')
+    assert made.source.played.wait(60.0)
+    yield made
+    made.close()
+
+
+def test_a_new_viewer_gets_all_kinds_of_messages(bench: Bench) -> None:
+    viewer = bench.viewer()
+    wait(lambda: {each['kind'] for each in viewer.got} >= {
+        'welcome', 'state', 'poses', 'progress', 'log'})
+    assert viewer.got[0]['kind'] == 'welcome'
+    assert viewer.got[0]['may']
+    assert set(viewer.got[0]['commands']) == set(messages.COMMANDS)
+    bench.source.played.wait(60.0)
+    wait(lambda: viewer.of('progress')[-1]['poses'] == 3)
+    now = [each for each in viewer.of('progress') if each['up']][-1]  # before the end
+    assert abs(np.linalg.norm(now['up']) - 1.0) < 1e-6
+    assert abs(now['raw'] - 1.0) < 0.06
+    assert (now['corrected'], now['temperature']) == (None, 21.0)
+    shown = np.array(viewer.of('poses')[-1]['up']) @ spread_directions(3).T
+    assert np.all(np.max(shown, axis=0) > 0.99)
+    wait(lambda: 'bench.csv has ended' in viewer.state['problem'])
+
+
+def test_a_calibration_is_offered_and_then_accepted(turned: Bench) -> None:
+    viewer = turned.viewer()
+    offered = viewer.ask('fit')
+    assert (offered['success'], turned.path.exists()) == (True, False)
+    wait(lambda: viewer.state['preview'] and viewer.state['rating'])
+    assert viewer.state['rating']['rating'] == 'GOOD'
+    result = viewer.state['result']
+    np.testing.assert_allclose(np.array(result['offset']) / GRAVITY, OFFSET, atol=3e-4)
+    assert result['after_mg'] < 1.0 < result['before_mg']
+    wait(lambda: viewer.of('progress')[-1]['corrected'] is None
+         or abs(viewer.of('progress')[-1]['corrected'] - 1.0) < 0.01)
+    first = viewer.state['page']
+    assert viewer.ask('save')['success']
+    assert turned.path.exists()
+    wait(lambda: not viewer.state['preview'])
+    assert viewer.state['page'] == first
+    assert viewer.ask('undo')['success']
+    wait(lambda: viewer.state['page'] == '')
+
+
+def test_taking_back_an_offered_calibration_stores_nothing(turned: Bench) -> None:
+    viewer = turned.viewer()
+    assert viewer.ask('fit')['success']
+    assert viewer.ask('undo')['success']
+    wait(lambda: not viewer.state['preview'])
+    assert not turned.path.exists()
+    assert viewer.state['result'] is None
+
+
+def test_the_calibration_page_is_drawn_and_has_its_own_policy(turned: Bench) -> None:
+    viewer = turned.viewer()
+    assert fetch(f'{turned.base}/calibration.html')[0] == 404
+    viewer.ask('fit')
+    wait(lambda: viewer.state['page'])
+    status, headers, page = fetch(turned.base + viewer.state['page'])
+    assert (status, page.count(b'<script>')) == (200, 1)
+    policy = headers['Content-Security-Policy']
+    assert "frame-ancestors 'self'" in policy
+    assert "'unsafe-inline'" not in re.findall('script-src[^;]*', policy)[0]
+    script = re.findall(b'<script>(.*?)</script>', page, re.DOTALL)[0]
+    assert server.policy_hash(script.decode()) in policy
+    assert fetch(turned.base + viewer.state['page'])[2] == page
+
+
+def test_exports_need_the_token_and_an_accepted_calibration(turned: Bench) -> None:
+    viewer, url = turned.viewer(), f'{turned.base}/export/json'
+    key = f'Bearer {viewer.token}'
+    assert fetch(url)[0] == fetch(url, Authorization='Bearer x')[0] == 401
+    assert fetch(url, Authorization=f'Basic {viewer.token}')[0] == 401
+    status, _, words = fetch(url, Authorization=key)
+    assert (status, words.decode().count('\n')) == (409, 1)
+    viewer.ask('fit')
+    assert fetch(url, Authorization=key)[0] == 409
+    viewer.ask('save')
+    status, headers, content = fetch(url, Authorization=key)
+    assert (status, headers['Content-Disposition']) == (
+        200, 'attachment; filename="calibration.json"')
+    found = json.loads(content)
+    assert viewer.state['result']['model'] in str(found)
+    for name in messages.EXPORTS:
+        assert fetch(f'{turned.base}/export/{name}', Authorization=key)[0] == 200, name
+    words = fetch(f'{turned.base}/export/kalibr', Authorization=key)
+    assert words[0] == 409
+    assert b'noise' in words[2]
+
+
+@pytest.mark.parametrize(('token', 'words'), [('', 'no token'), ('x' * 22, 'another start'),
+                                              ('\ud83d\ude00', 'another start')])
+def test_without_the_token_the_page_only_shows(bench: Bench, token: str, words: str) -> None:
+    viewer = bench.viewer(token=token)
+    wait(lambda: viewer.of('progress'))
+    assert not viewer.got[0]['may']
+    assert words in viewer.got[0]['why']
+    for command in messages.COMMANDS:
+        answer = viewer.ask(command)
+        assert (answer['success'], answer['words']) == (False, viewer.got[0]['why'])
+    assert bench.host.server.token not in str(viewer.got)
+
+
+def test_unknown_commands_are_refused(bench: Bench) -> None:
+    answer = bench.viewer().ask('close')
+    assert not answer['success']
+    assert "'close', expected one of capture_pose" in answer['words']
+
+
+@pytest.mark.parametrize('headers', [
+    {'Host': 'evil.example'}, {'Host': 'localhost.evil.example:{port}'}, {'Host': 'localhost:1'},
+    {'Host': '[::1]:{port}'}, {'Host': '127.0.0.1'}, {'Host': 'x@127.0.0.1:{port}'},
+    {'Origin': 'http://evil.example'}, {'Origin': 'null'}, {'Origin': 'https://127.0.0.1:{port}'},
+    {'Origin': 'http://127.0.0.1'}, {'Origin': 'http://localhost:{port}'}])
+@pytest.mark.parametrize('path', ['/', '/stream', '/calibration.html', '/export/c', '/none'])
+def test_a_foreign_host_or_origin_is_refused(bench: Bench, headers: dict[str, str], path: str
+                                             ) -> None:
+    given = {name: value.format(port=bench.port) for name, value in headers.items()}
+    status, found, words = fetch(bench.base + path, **given)
+    assert (status, words.decode().count('\n')) == (403, 1)
+    assert 'Content-Security-Policy' in found
+
+
+@pytest.mark.parametrize('host', ['localhost', 'LOCALHOST', '127.0.0.1', '192.168.7.9',
+                                  socket.gethostname(), f'{socket.gethostname()}.local'])
+def test_names_of_this_machine_are_accepted(bench: Bench, host: str) -> None:
+    own = f'{host}:{bench.port}'
+    assert fetch(bench.base, Host=own, Origin=f'http://{own.lower()}')[0] == 200
+
+
+def test_pages_have_the_headers_of_security(bench: Bench) -> None:
+    for path in ('/', '/none', '/stream'):
+        headers = fetch(bench.base + path)[1]
+        policy = headers['Content-Security-Policy']
+        assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'; ")
+        assert "frame-ancestors 'none'" in policy
+        assert 'unsafe' not in policy
+        assert (headers['X-Content-Type-Options'], headers['Referrer-Policy'],
+                headers['Cache-Control']) == ('nosniff', 'no-referrer', 'no-store')
+
+
+def test_the_page_consists_of_its_files_and_nothing_else(bench: Bench) -> None:
+    folder = Path(server.__file__).parent / 'page'
+    assert fetch(bench.base)[2] == (folder / 'index.html').read_bytes()
+    for path in folder.glob('*.*'):
+        status, headers, content = fetch(f'{bench.base}/page/{path.name}')
+        assert (status, content) == (200, path.read_bytes())
+        assert headers['Content-Type'].split(';')[0] == {
+            '.js': 'text/javascript', '.css': 'text/css', '.html': 'text/html',
+            '.svg': 'image/svg+xml', '.png': 'image/png'}[path.suffix]
+
+
+@pytest.mark.parametrize('path', [
+    '/page/', '/page', '/page/../server.py', '/page/..%2fserver.py', '/page/%2e%2e/server.py',
+    '/server.py', '//etc/passwd', '/page//etc/passwd', '/page/main.js/', '/page/main.js%00',
+    '/export/', '/export/../c', '/export/exe', '/stream/', '/index.html', '/calibration.html/'])
+def test_all_other_paths_are_not_found(bench: Bench, path: str) -> None:
+    assert raw_status(bench.port, 'GET', path) == 404
+
+
+@pytest.mark.parametrize('method', ['POST', 'PUT', 'DELETE', 'OPTIONS', 'HEAD', 'TRACE'])
+def test_all_other_methods_are_not_found(bench: Bench, method: str) -> None:
+    assert raw_status(bench.port, method, '/') == 404
+
+
+def raw_status(port: int, method: str, path: str) -> int:
+    """Return the status of a request whose path no client has changed."""
+    with socket.create_connection(('127.0.0.1', port), 5.0) as client:
+        client.sendall(f'{method} {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n'
+                       'Connection: close\r\n\r\n'.encode())
+        return int(client.recv(4096).split()[1])
+
+
+@pytest.mark.parametrize('text', ['x', '[]', '{}', '{"ask": {"id": 1}}', '{"ask": []}', '7',
+                                  '{"ask": {"id": "1", "command": "fit"}}', '[' * 4000])
+def test_messages_that_are_not_understood_close_the_connection(bench: Bench, text: str) -> None:
+    viewer, other = bench.viewer(), bench.viewer()
+    viewer.send(text)
+    wait(lambda: viewer.code)
+    assert viewer.code == 1008
+    count = len(other.got)
+    wait(lambda: len(other.got) > count)
+
+
+def test_a_big_message_closes_the_connection(bench: Bench) -> None:
+    viewer = bench.viewer()
+    viewer.send(json.dumps({'ask': {'id': 1, 'command': 'x' * messages.LARGEST}}))
+    wait(lambda: viewer.code)
+    assert viewer.code == 1009
+
+
+def test_the_seventeenth_viewer_is_refused_until_another_ends(bench: Bench) -> None:
+    viewers = [bench.viewer() for _ in range(16)]
+    assert bench.viewer().code == 1013
+    viewers[0].close()
+    wait(lambda: bench.viewer().code is None)
+    assert all(viewer.code is None for viewer in viewers[1:])
+
+
+def test_a_viewer_that_comes_back_gets_the_lines_it_missed(bench: Bench) -> None:
+    viewer = bench.viewer()
+    wait(lambda: viewer.of('log'))
+    viewer.close()
+    last = viewer.of('log')[-1]['number']
+    assert bench.source.played.wait(60.0)
+    again, whole = bench.viewer(seen=last), bench.viewer()
+    wait(lambda: any('has ended' in line['words'] for line in again.of('log')))
+    wait(lambda: len(whole.of('log')) >= len(viewer.of('log')) + len(again.of('log')))
+    assert [*viewer.of('log'), *again.of('log')] == whole.of('log')
+    assert [line['words'] for line in whole.of('log')] == [line.words for line in bench.logged]
+    wait(lambda: again.of('poses') and again.of('state') and len(again.of('progress')) > 10)
+    history = bench.viewer().got[0]['history']
+    assert len(history['time']) == len(history['raw']) > 10
+    assert history['time'] == sorted(history['time'])
+
+
+def test_two_viewers_see_the_same_and_each_gets_its_answers(turned: Bench) -> None:
+    one, other = turned.viewer(), turned.viewer()
+    assert one.ask('fit')['success']
+    assert other.of('answer') == []
+    wait(lambda: other.state['preview'] and other.state == one.state)
+    assert other.ask('save')['success']
+    wait(lambda: not one.state['preview'])
+
+
+def test_a_command_that_runs_is_not_begun_again(turned: Bench) -> None:
+    viewer = turned.viewer()
+    numbers = [viewer.begin('fit') for _ in range(2)]
+    wait(lambda: all(map(viewer.answer, numbers)))
+    assert sorted(viewer.answer(each)['success'] for each in numbers) == [False, True]
+    assert any('still running' in viewer.answer(each)['words'] for each in numbers)
+    wait(lambda: 'fit' in [state['busy'] for state in viewer.of('state')]
+         and viewer.state['busy'] == '')
+
+
+def test_a_stuck_viewer_is_closed_and_the_others_go_on(
+        bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, '_STUCK_S', 1.0)
+    other = bench.viewer()
+    with socket.socket() as stuck:
+        stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        stuck.connect(('127.0.0.1', bench.port))
+        stuck.sendall(f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\nUpgrade: websocket'
+                      '\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                      'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n'.encode())
+        assert b'101' in stuck.recv(64)
+        stuck.sendall(masked(json.dumps({'hello': {'token': '', 'seen': 0}}).encode()))
+        wait(lambda: len(bench.host.server.viewers) == 2)
+        wait(lambda: len(bench.host.server.viewers) == 1)
+    count = len(other.of('progress'))
+    wait(lambda: len(other.of('progress')) > count + 5)
+    assert other.code is None
+
+
+def masked(text: bytes) -> bytes:
+    """Return a short text as a frame of a client, with a mask of zeros."""
+    assert len(text) < 126
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
+
+
+def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, '_HELLO_S', 0.3)
+    with socket.create_connection(('127.0.0.1', bench.port)) as silent:
+        silent.sendall(f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\nUpgrade: websocke'
+                       't\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                       'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n'.encode())
+        received = b''
+        while part := silent.recv(4096):
+            received += part
+            if b'no hello came' in received:
+                break
+        assert b'no hello came' in received
+        assert b'progress' not in received
+
+
+def test_at_most_twenty_messages_of_progress_arrive_in_a_second(bench: Bench) -> None:
+    viewer = bench.viewer()
+    bench.source.played.wait(60.0)
+    wait(lambda: len(viewer.of('progress')) > 40)
+    times = [each['time'] for each in viewer.of('progress')]
+    assert np.median(np.diff(times)) > 0.045
+
+
+def test_a_port_in_use_is_an_error_in_one_line(bench: Bench, tmp_path: Path) -> None:
+    settings = CalibratorSettings(calibration_file=str(tmp_path / 'd.yaml'), web_port=bench.port)
+    with pytest.raises(InputError, match=f'port {bench.port} of 127.0.0.1 is in use'):
+        Host(Recording(np.zeros((0, 9))), settings, lambda line: None)
+    with pytest.raises(InputError, match='cannot be served at 192.0.2.7'):
+        server.PageServer(bench.host.exchange, '192.0.2.7', 0).start()
+
+
+def test_a_missing_package_is_an_error_in_one_line(
+        bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__('sys').modules, 'aiohttp', None)
+    with pytest.raises(InputError, match='aiohttp is not installed.*run pip install'):
+        server.PageServer(bench.host.exchange, '127.0.0.1', 0)
+
+
+def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) -> None:
+    class Broken(Recording):
+        @property
+        def blocks(self) -> Iterator[Floats]:
+            yield self.rows[:40]
+            raise InputError('the port has ended', 'connect the sensor again')
+
+    bench = Bench(Broken(rows_of(spread_directions(1))), tmp_path / 'c.yaml')
+    try:
+        viewer = bench.viewer()
+        wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
+        assert 'the port has ended' in viewer.state['problem']
+        assert not viewer.ask('fit')['success']
+    finally:
+        bench.close()
+
+
+def test_numbers_that_are_not_known_are_null() -> None:
+    from accel_calib.session.guidance import Progress
+    now = Progress(False, float('nan'), 0.0, 1.0, 0, 0, 0.0, float('inf'), '', ())
+    text = messages.text_of(messages.progress(1.0, now))
+    found: dict[str, Any] = json.loads(text)
+    assert [found[key] for key in ('stillness', 'accuracy_mg', 'raw', 'up')] == [
+        None, None, None, []]
+
+
+def test_the_link_names_a_reachable_address() -> None:
+    assert server._reachable('127.0.0.1') == '127.0.0.1'
+    assert server._reachable('robot.local') == 'robot.local'
+    assert server._reachable('0.0.0.0') not in ('0.0.0.0', '')
+    assert '█' in server.qr_code('http://127.0.0.1:8080/#abc')

@@ -1,0 +1,131 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The live page of the node, over DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import math
+from pathlib import Path
+import select
+import signal
+import socket
+import subprocess
+import time
+from typing import Any
+
+from accel_calib.files import read_calibration
+from accel_calib.sphere import spread_directions
+import numpy as np
+import pytest
+from viewer import fetch, Viewer, wait
+
+DIRECTIONS = spread_directions(12)
+
+
+def free_port() -> int:
+    with socket.create_server(('127.0.0.1', 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def printed_until(node: subprocess.Popen[str], words: str, seconds: float = 15.0) -> str:
+    """Return the first line of a node that contains some words."""
+    ends, text = time.monotonic() + seconds, ''
+    while time.monotonic() < ends:
+        if select.select([node.stdout], [], [], 0.1)[0]:
+            assert node.stdout is not None
+            text = node.stdout.readline()
+            if words in text:
+                return text
+    raise AssertionError(f'the node has not printed {words!r} within {seconds} s')
+
+
+@pytest.fixture
+def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
+    """Yield a viewer of a calibrator with a page."""
+    node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=free_port(),
+                            passthrough=True)
+    made = Viewer(printed_until(node, 'live page: ').split('live page: ')[1].strip())
+    made.node = node  # type: ignore[attr-defined]
+    yield made
+    made.close()
+
+
+def test_a_whole_calibration_through_the_commands_of_the_page(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any], tmp_path: Path) -> None:
+    path = tmp_path / 'c.yaml'
+    bench.feed(readings(DIRECTIONS))
+    bench.spin(lambda: len(viewer.of('poses')[-1]['up']) >= len(DIRECTIONS))
+
+    offered = viewer.ask('fit', bench.spin)
+    assert offered['success'], offered['words']
+    assert viewer.state['preview']
+    assert viewer.state['result']['after_mg'] < 1.0 < viewer.state['result']['before_mg']
+    assert not path.exists()
+    bench.spin(lambda: viewer.state['rating'])
+    assert fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')[0] == 409
+
+    assert viewer.ask('save', bench.spin)['success']
+    np.testing.assert_allclose(read_calibration(path).offset / 9.80665, [0.03, -0.02, 0.04],
+                               atol=5e-4)
+    assert not viewer.state['preview']
+    bench.feed(readings(DIRECTIONS[:1]))
+    bench.spin(lambda: abs((viewer.of('progress')[-1]['corrected'] or 0.0) - 1.0) < 0.003)
+
+    status, headers, page = fetch(viewer.base + viewer.state['page'])
+    assert (status, b'<svg' in page) == (200, True)
+    assert "frame-ancestors 'self'" in headers['Content-Security-Policy']
+    status, _, export = fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')
+    assert (status, b'void' in export) == (200, True)
+
+    assert viewer.ask('undo', bench.spin)['success']
+    assert viewer.state['result'] is None
+
+
+def test_commands_of_services_and_of_the_page_are_shown_in_the_same_log(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
+    bench.feed(readings(DIRECTIONS[:2]))
+    refusal = bench.call('fit').message
+    bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
+    assert viewer.ask('fit', bench.spin)['words'] == refusal
+    numbers = [line['number'] for line in viewer.of('log')]
+    assert numbers == sorted(set(numbers))
+
+
+def test_the_newest_message_is_shown_and_not_the_batch_of_the_session(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
+    bench.feed(readings(DIRECTIONS[:1]))
+    count = len(viewer.of('progress'))
+    for k in range(10):
+        bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
+    bench.spin(lambda: any(math.isclose(each['raw'] or 0.0, 1.09, abs_tol=1e-6)
+                           for each in viewer.of('progress')[count:]))
+
+
+def test_a_node_with_viewers_ends_cleanly(viewer: Viewer, bench: Any) -> None:
+    code, printed = bench.end(viewer.node, signal.SIGINT)  # type: ignore[attr-defined]
+    assert (code, 'Traceback' in printed) == (0, False)
+    wait(lambda: viewer.code)
+
+
+def test_a_node_whose_port_is_in_use_says_so_and_works_on(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+        node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
+                                passthrough=True)
+        line = printed_until(node, 'in use')
+        assert f'the port {port} of 127.0.0.1 is in use' in line
+        bench.feed(readings(DIRECTIONS[:1]))
+        assert 'pose' in bench.call('capture_pose').message
+        assert node.poll() is None
+
+
+def test_the_token_is_not_sent_to_viewers(bench: Any, viewer: Viewer) -> None:
+    bench.spin(lambda: viewer.of('state'))
+    other = Viewer(viewer.base)
+    bench.spin(lambda: other.of('state'))
+    other.close()
+    assert viewer.token not in str(other.got)
+    assert not other.of('welcome')[0]['may']

@@ -1,0 +1,182 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+No calibration is applied to another sensor without a word.
+
+A name is that of the calibration, of the data (frame_id, or `sensor` of a table), or the one that
+the user states (parameter or option `sensor`). An unnamed one fits every sensor.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from accel_calib.cli.main import main
+from accel_calib.errors import AccelCalibError
+from accel_calib.files import read_calibration
+from accel_calib.session import Job, Mounting
+from accel_calib.sphere import spread_directions
+import pytest
+from test_session import Driver
+
+Stored = Callable[..., Path]
+Readings = Callable[..., Any]
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    return tmp_path / 'home' / 'accel_calib'
+
+
+@pytest.fixture(scope='module')
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with poses and a recording of no sensor, of a and of b."""
+    folder = tmp_path_factory.mktemp('tables')
+    for kind, options in (('poses', []), ('recording', ['--recording'])):
+        path = folder / f'{kind}.csv'
+        assert main(['simulate', '-o', str(path), '--effect', 'offset=0.01,0.02,0.03',
+                     *options]) == 0
+        for name in ('a', 'b'):
+            (folder / f'{kind}_{name}.csv').write_text(f'# sensor: "{name}"\n{path.read_text()}')
+        path.rename(folder / f'{kind}_.csv')
+    return folder
+
+
+@pytest.mark.parametrize('command', ['verify', 'apply'])
+@pytest.mark.parametrize('data', ['', 'a', 'b'])
+@pytest.mark.parametrize('owner', ['', 'a'])
+def test_commands_refuse_data_of_another_sensor(
+        tables: Path, tmp_path: Path, stored: Stored, capsys: pytest.CaptureFixture[str],
+        command: str, data: str, owner: str) -> None:
+    kind = 'recording' if command == 'apply' else 'poses'
+    out = tmp_path / 'out.csv'
+    target = ['-o', str(out)] if command == 'apply' else []
+    status = main([command, str(tables / f'{kind}_{data}.csv'), '-c', str(stored(sensor=owner)),
+                   *target])
+    if owner and data and owner != data:
+        assert status == 2
+        assert f'belongs to sensor {owner!r}, but the readings come from {data!r}' in (
+            capsys.readouterr().err)
+        assert not out.exists()
+    else:
+        assert status == 0
+
+
+@pytest.mark.parametrize(('data', 'stated', 'accepted'), [
+    ('a', '', True), ('', '', True), ('', 'a', True), ('b', '', False), ('', 'b', False),
+    ('a', 'b', False), ('b', 'a', False), ('b', 'b', False)])
+def test_refine_refuses_another_name_in_the_table_or_in_the_option(
+        tables: Path, stored: Stored, capsys: pytest.CaptureFixture[str], data: str, stated: str,
+        accepted: bool) -> None:
+    option = ['--sensor', stated] if stated else []
+    status = main(['refine', str(tables / f'poses_{data}.csv'), '-c', str(stored(sensor='a')),
+                   *option])
+    assert status == (0 if accepted else 2)
+    assert ("belongs to sensor 'a', but" in capsys.readouterr().err) is not accepted
+
+
+@pytest.mark.parametrize(('data', 'stated', 'name'), [
+    ('', '', ''), ('a', '', 'a'), ('', 'b', 'b'), ('a', 'b', 'b')])
+def test_fit_names_the_sensor_as_stated_or_as_in_the_table(tables: Path, tmp_path: Path,
+                                                           data: str, stated: str, name: str
+                                                           ) -> None:
+    option = ['--sensor', stated] if stated else []
+    out = tmp_path / 'fit.yaml'
+    assert main(['fit', str(tables / f'poses_{data}.csv'), '-o', str(out), *option]) == 0
+    assert read_calibration(out).sensor == name
+
+
+@pytest.mark.parametrize(('names', 'status'), [(('a', 'a'), 0), (('a', ''), 0), (('a', 'b'), 2)])
+def test_compare_refuses_calibrations_of_two_sensors(stored: Stored, names: tuple[str, str],
+                                                     status: int) -> None:
+    files = [str(stored(f'{k}.yaml', sensor=name)) for k, name in enumerate(names)]
+    assert main(['compare', *files]) == status
+
+
+@pytest.mark.parametrize('owner', ['', 'imu_link', 'arm', 'other'])
+@pytest.mark.parametrize('stated', ['', 'imu_link', 'arm'])
+@pytest.mark.parametrize('given', [False, True])
+def test_node_uses_a_stored_calibration_only_for_its_sensor(
+        home: Path, stored: Stored, readings: Readings, owner: str, stated: str, given: bool
+        ) -> None:
+    path = stored(sensor=owner)
+    if not given:
+        home.mkdir(parents=True)
+        path = path.rename(home / f'{stated or "imu.data_raw@imu_link"}.yaml')
+    before = path.read_bytes()
+    driver = Driver(sensor=stated, calibration_file=str(path) if given else '')
+    driver.feed(readings([[0, 0, 1]])[:30])
+    used = driver.session.active.calibration is not None
+    assert used is (owner in ('', stated or 'imu_link'))
+    if not used:
+        assert repr(owner) in driver.finding('calibration').words
+    assert path.read_bytes() == before
+
+
+def test_a_fit_that_ends_after_another_sensor_took_over_is_not_used_for_it(
+        readings: Readings) -> None:
+    driver = Driver()
+    driver.feed(readings(spread_directions(12)))
+    job = driver.session.commands.fit()
+    assert isinstance(job, Job)
+    found = job.run(lambda function, *given: function(*given))
+    driver.now += 3.0
+    driver.feed(readings([[0, 0, 1]])[:30], 'other')
+    with pytest.raises(AccelCalibError, match='call ~/fit again'):
+        job.finish(found)
+    assert driver.session.sensor == 'other'
+    assert driver.session.active.calibration is None
+
+
+@pytest.mark.parametrize('name', ['undo', 'load', 'reset'])
+def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_it(
+        readings: Readings, name: str) -> None:
+    driver = Driver()
+    turned = readings(spread_directions(12))
+    driver.feed(turned)
+    driver.done(driver.session.commands.fit())
+    job = getattr(driver.session.commands, name)()
+    found = job.run(lambda function, *given: function(*given))
+    driver.now += 3.0
+    driver.feed(turned[:200], 'other')
+    poses = len(driver.session.live.book.poses())
+    with pytest.raises(AccelCalibError, match="'other' has replaced 'imu_link' meanwhile"):
+        job.finish(found)
+    assert driver.session.active.calibration is None
+    assert len(driver.session.live.book.poses()) == poses > 0
+
+
+def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
+        home: Path, stored: Stored, readings: Readings) -> None:
+    home.mkdir(parents=True)
+    stored(sensor='imu_link').rename(home / 'imu.data_raw@imu_link.yaml')
+    driver, rest = Driver(), readings([[0, 0, 1]])[:30]
+    assert driver.session.accepts('imu_link')
+    late = [event for event in driver.session.events() if isinstance(event, Job)]
+    driver.now += 3.0
+    driver.feed(rest, 'other')
+    for job in late:
+        driver.done(job)
+    assert driver.session.sensor == 'other'
+    assert driver.session.active.calibration is None
+
+
+def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings
+                                                                         ) -> None:
+    driver = Driver()
+    driver.session.commands.enable(False)
+    driver.feed(readings([[0, 0, 1]])[:30])
+    assert not driver.session.active.enabled
+
+
+def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_parameter(
+        stored: Stored) -> None:
+    driver = Driver(sensor='arm', calibration_file=str(stored(sensor='arm', flat=[0, 0.6, 0.8])))
+    driver.session.accepts('imu_link')
+    found = [event.frame_id for event in driver.session.events() if isinstance(event, Mounting)]
+    assert found == ['imu_link']

@@ -1,0 +1,108 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A viewer of the live page: a client of its WebSocket, in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+import json
+from threading import Thread
+import time
+from typing import Any
+
+import aiohttp
+
+
+class Viewer:
+    """
+    A viewer, which keeps what it gets.
+
+    Parameters
+    ----------
+    link : str
+        Address of the page; the fragment is the token.
+    seen : int
+        Number of the last log line that the viewer has.
+
+    Attributes
+    ----------
+    got : list of dict
+        The messages, in their order.
+    code : int or None
+        Why the server closed the connection; None while it is open.
+
+    """
+
+    def __init__(self, link: str, *, seen: int = 0) -> None:
+        self.base, _, self.token = link.partition('/#')
+        self.got: list[dict[str, Any]] = []
+        self.code: int | None = None
+        self._seen, self._asked = seen, 0
+        self._loop = asyncio.new_event_loop()
+        self._socket: Any = None
+        self._thread = Thread(target=lambda: self._loop.run_until_complete(self._run()))
+        self._thread.start()
+        wait(lambda: self.got or self.code)
+
+    async def _run(self) -> None:
+        async with aiohttp.ClientSession() as client, client.ws_connect(
+                f'{self.base}/stream', max_msg_size=0) as self._socket:
+            await self._socket.send_json({'hello': {'token': self.token, 'seen': self._seen}})
+            async for message in self._socket:
+                self.got.append(json.loads(message.data))
+            self.code = self._socket.close_code
+
+    def send(self, text: str) -> None:
+        """Send a text."""
+        asyncio.run_coroutine_threadsafe(self._socket.send_str(text), self._loop).result(5.0)
+
+    def begin(self, command: str) -> int:
+        """Ask for a command, and return the number of its answer."""
+        self._asked += 1
+        self.send(json.dumps({'ask': {'id': self._asked, 'command': command}}))
+        return self._asked
+
+    def answer(self, number: int) -> Any:
+        """Return an answer; None if it has not come yet."""
+        return next((each for each in self.of('answer') if each['id'] == number), None)
+
+    def ask(self, command: str, spin: Callable[[Callable[[], Any]], None] | None = None) -> Any:
+        """Ask for a command, and return its answer."""
+        number = self.begin(command)
+        (spin or wait)(lambda: self.answer(number))
+        return self.answer(number)
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        """Return the messages of a kind so far."""
+        return [message for message in list(self.got) if message['kind'] == kind]
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Return the newest state."""
+        return self.of('state')[-1]
+
+    def close(self) -> None:
+        """End the connection."""
+        self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._socket.close()))
+        self._thread.join()
+
+
+def fetch(url: str, method: str = 'GET', **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Return status, headers and body of a page; underscores of header names become dashes."""
+    async def run() -> tuple[int, dict[str, str], bytes]:
+        given = {name.replace('_', '-'): value for name, value in headers.items()}
+        async with aiohttp.ClientSession() as client, client.request(
+                method, url, headers=given, allow_redirects=False) as found:
+            return found.status, dict(found.headers), await found.read()
+
+    return asyncio.run(run())
+
+
+def wait(until: Callable[[], Any], seconds: float = 20.0) -> None:
+    """Wait until a condition holds."""
+    ends = time.monotonic() + seconds
+    while not until():
+        assert time.monotonic() < ends, f'not so within {seconds} s'
+        time.sleep(0.01)
