@@ -1,0 +1,73 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The short form of `benchmarks/long_run.py`: rounds of captures, fits and refinements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+from typing import Any
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+
+from long_run import long_run, trend  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+ROUNDS, ROUND, INTERVAL = 2, 50.0, 10.0
+"""A round of 50 s has a fit and a refinement [s]."""
+
+RATE = 200.0
+"""At this rate a message is only lost if the node does not run for half a second [1/s]."""
+
+GROWTH = {'node': 3.0, 'own': 3.0, 'worker': 6.0}
+"""
+Growth of a memory in the second round that is allowed [MB].
+
+A leak of 300 bytes for each message would be 3 MB. The second refinement of a worker process takes
+3 MB more than the first one, and later ones take no more.
+
+"""
+
+
+@pytest.fixture(scope='module')
+def run() -> Any:
+    return long_run(ROUNDS, ROUND, INTERVAL, RATE)
+
+
+def test_no_message_is_lost_while_services_are_called(run: Any) -> None:
+    assert np.all(run.count(run.sent) > 0.5 * RATE * INTERVAL)
+    assert not np.any(run.lost(run.ours))
+
+
+def test_every_capture_fit_and_refinement_succeeds(run: Any) -> None:
+    assert [each for each in run.answers if not each.success] == []
+    for name in ('fit', 'refine'):
+        assert len(run.called(name)) == ROUNDS
+    poses = [int(each.words.partition(' from ')[2].split()[0]) for each in run.called('fit')]
+    assert all(count >= 10 for count in poses), poses
+
+
+@pytest.mark.parametrize('name', GROWTH)
+def test_memory_is_flat_after_the_first_round(run: Any, name: str) -> None:
+    assert run.grown(name) < GROWTH[name]
+
+
+def test_the_node_reports_no_defect(run: Any) -> None:
+    assert 'correcting with model' in run.log
+    assert 'Traceback' not in run.log
+    assert 'unexpected error' not in run.log
+
+
+def test_trend_is_found_beside_the_pattern_of_a_round() -> None:
+    rng = np.random.default_rng(4)
+    hours = np.arange(60) / 60.0
+    pattern = np.tile([0.0, 5.0, -3.0, 9.0, 1.0], 12)
+    slope, error = trend(hours, 100.0 + pattern + 2.0 * hours + 0.1 * rng.normal(size=60), 5)
+    assert 0.03 < error < 0.06
+    assert abs(slope - 2.0) < 3.0 * error
+
+
+def test_trend_of_too_few_values_is_not_known() -> None:
+    assert np.isnan(trend(np.arange(6.0), np.arange(6.0), 5)).all()
