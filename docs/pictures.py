@@ -6,7 +6,7 @@ Draw the pictures of the documentation: ``python docs/pictures.py``.
 
 The poses are those that the calibrator asks for. The terminals are commands that this script runs
 on simulated data; the times of their lines are kept. A test runs the commands again and compares
-the text. The picture of the page needs Chromium, and is left as it is without it.
+the text. The pictures of the pages need Chromium, and are left as they are without it.
 
 """
 
@@ -315,6 +315,31 @@ def screenshot(page: Path, picture: Path) -> None:
                    check=True, capture_output=True, timeout=120)
 
 
+# The live page
+
+def live_pictures(folder: Path) -> None:
+    """Take pictures of the live page, on a phone in a turn and on a desk after a fit."""
+    from playwright.sync_api import expect, sync_playwright
+    sys.path[:0] = [str(HERE.parent / 'test')]
+    import live_bench as bench
+
+    with sync_playwright() as playwright, bench.live_page(folder, speed=2.0) as live:
+        browser = bench.chromium(playwright)
+        viewers = bench.Viewers(browser)
+        phone = viewers.visit(live.link, (360, 740))
+        live.follow(phone, 5)
+        live.turn_half(phone)
+        phone.screenshot(path=FOLDER / 'live_phone.png')
+        desk = viewers.visit(live.link, (1280, 860), color_scheme='dark')
+        live.follow(desk)
+        desk.locator('[data-command=fit]').click()
+        expect(desk.locator('#verdict strong')).not_to_be_empty(timeout=bench.PATIENCE)
+        desk.evaluate('scrollTo(0, 0)')
+        desk.wait_for_timeout(5000.0)  # some corrected readings
+        desk.screenshot(path=FOLDER / 'live_desk.png')
+        browser.close()
+
+
 def main() -> None:
     """Draw all pictures."""
     FOLDER.mkdir(exist_ok=True)
@@ -328,6 +353,8 @@ def main() -> None:
         page = folder / 'calibration.html'
         if page.exists():
             screenshot(page, FOLDER / 'page.png')
+        if shutil.which('chromium'):
+            live_pictures(folder)
 
 
 if __name__ == '__main__':

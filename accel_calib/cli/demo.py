@@ -10,7 +10,9 @@ from dataclasses import asdict
 from typing import Any, TYPE_CHECKING
 
 from . import options
+from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
+from ..live.server import check_installed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,6 +24,9 @@ _EXAMPLE = 'accel-calib demo --hidden temperature'
 HIDDEN = ('temperature', 'temperature-lag', 'gain-temperature', 'quadratic')
 """What the sensor can hide; `accel_calib.ros.demo_hidden` has the effects."""
 
+_WEB_PORT = 8080
+"""Port of the live page."""
+
 CHECK_FAILED = 1
 """Exit status if the effect is not found, or the error does not shrink."""
 
@@ -31,6 +36,8 @@ def add_to(made: argparse.ArgumentParser) -> None:
     options.add_example(made, _EXAMPLE)
     made.add_argument('--hidden', choices=HIDDEN, help='let the sensor hide this effect, and show '
                       'that ~/refine finds it and that the corrected topic gets better')
+    made.add_argument('--web', action='store_true', help='calibrate on the live page instead, '
+                      f'at port {_WEB_PORT}, until Ctrl-C')
     options.add_json(made)
     made.set_defaults(run=run)
 
@@ -38,7 +45,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run simulator and calibrator in separate processes, and print the result."""
     try:
-        from ..ros.demo import demonstrate
+        from ..ros.demo import demonstrate, demonstrate_page
         from ..ros.demo_hidden import demonstrate_hidden
     except ImportError as err:
         raise InputError(f'ROS 2 is not installed ({err}), but the demonstration needs it',
@@ -48,6 +55,11 @@ def run(args: argparse.Namespace) -> int:
     def report(line: str) -> None:
         console.print(line)
 
+    if args.web:
+        check_installed()
+        with ended() as is_over:
+            demonstrate_page(_WEB_PORT, report, is_over)
+        return 0
     if args.hidden is not None:
         found = demonstrate_hidden(args.hidden, report)
         options.write_json(args.json, asdict(found))

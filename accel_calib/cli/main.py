@@ -44,6 +44,7 @@ COMMANDS = {
     'simulate': 'simulate poses or a recording of a sensor with known effects',
     'report': 'write a report about effects that a calibration lacks, with figures (HTML)',
     'watch': 'show the progress of a calibrator node, and which pose is next',
+    'live': 'calibrate on a page in the browser, from a serial port or a recording',
     'node': 'run the calibrator node',
     'simulator': 'run the simulated Imu node',
 }

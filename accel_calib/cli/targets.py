@@ -23,7 +23,7 @@ _INPUTS = ('poses', 'recording', 'log', 'calibration', 'calibrations', 'noise')
 _OUTPUTS = {'json': 'result', 'report': 'page', 'plan': 'table', 'figures': ''}
 _OWN_OUTPUT = {'fit': 'calibration', 'refine': 'calibration', 'calibrate': 'calibration',
                'capture': 'table', 'simulate': 'table', 'report': 'page', 'export': 'export',
-               'apply': 'table'}
+               'apply': 'table', 'live': 'calibration'}
 """Kind of the file that ``-o`` writes, by command."""
 
 _SUFFIXES = {'calibration': '.yaml', 'page': '.html', 'table': '.csv'}

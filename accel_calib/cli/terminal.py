@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Output on a terminal: width and progress.
+Output on a terminal: width, progress, and its end by the user.
 
 Lines break at words, at the width of the terminal or of ``COLUMNS``. A word that is longer, such
 as the name of a file, stays whole. Progress is shown on standard error
@@ -12,9 +12,10 @@ if it is a terminal.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import re
+import signal
 import sys
 from textwrap import wrap
 from typing import Any, TYPE_CHECKING
@@ -83,3 +84,16 @@ def working(what: str) -> Iterator[None]:
         return
     with Output(stderr=True).status(what):
         yield
+
+
+@contextmanager
+def ended() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether Ctrl-C or SIGTERM came."""
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, frame: came.append(number))
+              for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

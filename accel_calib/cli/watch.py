@@ -12,14 +12,14 @@ such as a pipe or ``ssh HOST COMMAND`` without ``-t``, gets a line for each chan
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 import os
-import signal
 import sys
 from typing import TYPE_CHECKING
 
 from . import options
+from .terminal import ended, Output
 from ..errors import InputError, NEEDS_ROS
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the progress until the user ends it; return the exit status."""
-    with _signals() as is_over:
+    with ended() as is_over:
         try:
             from ..ros import watch
         except ImportError as err:
@@ -67,22 +67,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-@contextmanager
-def _signals() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C or SIGTERM came."""
-    came: list[int] = []
-    before = {number: signal.signal(number, lambda number, frame: came.append(number))
-              for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(came)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _print(node: str, progress: Progress | None) -> None:
     """Print a progress once."""
-    from .terminal import Output
     from .watch_view import screen, state
 
     if progress is None:
@@ -97,8 +83,6 @@ def _print(node: str, progress: Progress | None) -> None:
 def _output(bell: bool) -> Iterator[Show]:
     """Yield the function that shows the progress."""
     from rich.live import Live
-
-    from .terminal import Output
 
     console = Output()
     if not sys.stdout.isatty() or console.is_dumb_terminal:

@@ -45,8 +45,10 @@ from ..units import MG, STANDARD_GRAVITY
 POSES = 12
 _EFFECTS = ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
             'cross_axis=0.006,-0.004,0.003']
-_MOUNTING = [8.0, -5.0, 0.0]
-_DWELL, _TURN = 1.5, 0.5
+_SIMULATED = {'poses': POSES, 'dwell': 1.5, 'turn': 0.5, 'mounting': [8.0, -5.0, 0.0],
+              'effects': _EFFECTS, 'loop': True}
+"""Parameters of the simulator."""
+
 _CHECKED, _LEAST_SAMPLES = 5, 100
 _PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
 
@@ -162,9 +164,7 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
         report('starting a simulated Imu, turned by hand, and the calibrator node')
         processes = [
             stack.enter_context(running('node', {'sensor': 'demo'})),
-            stack.enter_context(running('simulator', {
-                'poses': POSES, 'dwell': _DWELL, 'turn': _TURN, 'mounting': _MOUNTING,
-                'effects': _EFFECTS, 'loop': True, 'wait': 10.0}))]
+            stack.enter_context(running('simulator', {**_SIMULATED, 'wait': 10.0}))]
         user, spin = stack.enter_context(user_of(processes))
         spin(lambda: user.poses > 0, 'the first pose')
         for count in range(4, POSES + 1, 4):
@@ -179,6 +179,36 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
         return _outcome(rests_of(user)[1:], time.monotonic() - began)
 
 
+def demonstrate_page(port: int, report: Callable[[str], None],
+                     is_over: Callable[[], bool]) -> None:
+    """
+    Run simulator and calibrator with its live page, until it is over.
+
+    Parameters
+    ----------
+    port : int
+        Port of the page.
+    report, is_over : callable
+        Function that is called with a line for the user; function that returns whether to end.
+
+    Raises
+    ------
+    DemoError
+        If a node ends on its own.
+
+    """
+    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
+        set_environment(Path(folder))
+        report('a simulated Imu is turned by hand; open the link of the live page in a browser, '
+               'wait for the poses, and press Fit. Ctrl-C ends it')
+        processes = [
+            stack.enter_context(running('node', {'sensor': 'demo', 'web_port': port}, 'info')),
+            stack.enter_context(running('simulator', {**_SIMULATED, 'wait': 10.0}))]
+        while not is_over():
+            _check_running(processes)
+            time.sleep(_LOOK_EVERY)
+
+
 def set_environment(folder: Path) -> None:
     """Isolate the demonstration: own domain, local machine only, own files."""
     os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
@@ -187,14 +217,14 @@ def set_environment(folder: Path) -> None:
 
 
 @contextmanager
-def running(command: str, parameters: dict[str, Any]
+def running(command: str, parameters: dict[str, Any], severity: str = 'error'
             ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node in a process, and end it."""
+    """Run a node in a process, which prints log lines from this severity on, and end it."""
     given = [part for name, value in parameters.items()
              for part in ('-p', f'{name}:={_in_yaml(value)}')]
     process = subprocess.Popen(
         [sys.executable, '-m', 'accel_calib.cli.main', command, '--ros-args',
-         '--log-level', 'error', *given])
+         '--log-level', severity, *given])
     try:
         yield process
     finally:
@@ -221,8 +251,7 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
     def spin(until: Callable[[], bool], what: str) -> None:
         ends = time.monotonic() + _PATIENCE
         while not until():
-            if any(process.poll() is not None for process in processes):
-                raise DemoError('a node has ended unexpectedly', 'see its output above')
+            _check_running(processes)
             if time.monotonic() > ends:
                 raise DemoError(f'{what}: not available within {_PATIENCE:.0f} s, '
                                 f'{counted(user.poses, "pose")} so far',
@@ -237,6 +266,11 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
         executor.shutdown()
         user.destroy_node()
         rclpy.try_shutdown()
+
+
+def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+    if any(process.poll() is not None for process in processes):
+        raise DemoError('a node has ended unexpectedly', 'see its output above')
 
 
 def _request(user: User, spin: Spin, name: str) -> Trigger.Response:

@@ -9,8 +9,9 @@ Reader of logs: text of any dialect, bags, and flight logs of PX4 and ArduPilot.
 
 """
 
+from .incoming import LineReader
 from .read import open_log, open_own, OwnTable, read_log, read_recording
 from .records import are_samples, Log, LogOptions, OpenLog
 
-__all__ = ['Log', 'LogOptions', 'OpenLog', 'OwnTable', 'are_samples', 'open_log', 'open_own',
-           'read_log', 'read_recording']
+__all__ = ['LineReader', 'Log', 'LogOptions', 'OpenLog', 'OwnTable', 'are_samples', 'open_log',
+           'open_own', 'read_log', 'read_recording']

@@ -133,14 +133,14 @@ def _source(layout: Layout, index: int, unit: str = '') -> Source:
 
 def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     """Return the columns of a table without header, by their order."""
-    orders = {3: READING, 4: ('time', *READING), 7: ('time', *READING, *RATE),
-              8: ('time', *READING, *RATE, 'temperature')}
+    orders = {3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
+              7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
     if set(READING) <= set(found):
         return {}
     if layout.width not in orders:
         raise InputError(f'{layout.path} has no header line and {layout.width} columns, expected '
-                         '3 (ax, ay, az), 4 (time first), 7 (angular rate last) or 8 (temperature '
-                         'last)', 'add a header line, or name them with '
+                         '3 (ax, ay, az), 4 (time first), 5 (temperature last), 7 (angular rate '
+                         'last) or 8 (temperature last)', 'add a header line, or name them with '
                          '--columns time=1,ax=2,ay=3,az=4')
     return {name: Source(k, str(k + 1)) for k, name in enumerate(orders[layout.width])}
 

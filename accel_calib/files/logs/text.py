@@ -182,12 +182,11 @@ class TextTable:
 
         """
         found = 0
-        self._dates = tuple(dates)
         lines = list(islice(self._lines, ROWS))
         while lines:
             following = list(islice(self._lines, ROWS))
             self.more = bool(following)
-            cells = self._read(lines, list(numeric), text, skip_bad=skip_bad, last=not following)
+            cells = self.read(lines, numeric, text, dates, skip_bad=skip_bad, last=not following)
             self.characters = sum(map(len, lines))
             found += len(cells.row)
             if len(cells.row):
@@ -197,9 +196,15 @@ class TextTable:
             raise InputError(f'{self.layout.path} has a header line but no rows, expected one row '
                              'for each pose or sample', 'add the rows')
 
-    def _read(self, lines: list[str], numeric: list[int], text: Sequence[int], *, skip_bad: bool,
-              last: bool) -> Cells:
-        """Return some columns of a block of lines."""
+    def read(self, lines: Sequence[str], numeric: Sequence[int], text: Sequence[int] = (),
+             dates: Sequence[int] = (), *, skip_bad: bool = False, last: bool = False) -> Cells:
+        """
+        Return the rows of the next lines; parameters and errors as in `blocks`.
+
+        If they are the last lines, the last one can be cut; it is then left out.
+
+        """
+        self._dates = tuple(dates)
         kept = [line for line in lines if line[0] != '#' and not line.isspace()]
         joined = _joined_quotes(kept) if '"' in ''.join(kept) else kept
         rows = np.arange(self._row + 1, self._row + len(joined) + 1)
@@ -220,7 +225,7 @@ class TextTable:
         texts = [[self.layout.dialect.cells(line)[k] for line in joined] for k in text]
         return Cells(values, texts, rows)
 
-    def _parsed(self, lines: list[str], numeric: list[int]) -> Floats | None:
+    def _parsed(self, lines: list[str], numeric: Sequence[int]) -> Floats | None:
         """Return the numbers of rows, or None if a row has a fault."""
         if not lines or not numeric:
             sound = all(self._fault(line, numeric) is None for line in lines)
@@ -238,8 +243,8 @@ class TextTable:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
 
-    def _plain(self, lines: list[str], numeric: list[int]
-               ) -> tuple[list[str], str | None, list[int]] | None:
+    def _plain(self, lines: list[str], numeric: Sequence[int]
+               ) -> tuple[list[str], str | None, Sequence[int]] | None:
         """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
         dialect, width = self.layout.dialect, self.layout.width
         if dialect.monitor or dialect.labelled:
@@ -255,8 +260,8 @@ class TextTable:
             lines = [line.replace(',', '.') for line in lines]
         return lines, delimiter or None, numeric
 
-    def _unquoted(self, lines: list[str], numeric: list[int]
-                  ) -> tuple[list[str], str, list[int]] | None:
+    def _unquoted(self, lines: list[str], numeric: Sequence[int]
+                  ) -> tuple[list[str], str, Sequence[int]] | None:
         """Return lines without quotes, parted by tabs; or None if ragged."""
         delimiter, width = self.layout.dialect.delimiter, self.layout.width
         between = f'"{delimiter}"'
@@ -276,7 +281,7 @@ class TextTable:
             kept = [line.replace(',', '.') for line in kept]
         return kept, '\t', columns
 
-    def _without_cut(self, lines: list[str], numeric: list[int]) -> list[str]:
+    def _without_cut(self, lines: list[str], numeric: Sequence[int]) -> list[str]:
         """Return rows without a last one that is cut; note that it is left out."""
         line = lines[-1]
         cells = len(self.layout.dialect.cells(line))

@@ -1,0 +1,202 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A simulated sensor in the hands of a person, and the live page in a real browser.
+
+The person knows only what the page shows.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import math
+from pathlib import Path
+import re
+import shutil
+from threading import Event, Thread
+import time
+
+from accel_calib.live.host import Host
+from accel_calib.model import predict
+from accel_calib.session import CalibratorSettings, Log
+from accel_calib.simulate import model_with
+from accel_calib.sphere import unit
+from accel_calib.table import Floats
+import numpy as np
+from playwright.sync_api import Browser, expect, Page, Playwright
+import pytest
+
+GRAVITY = 9.80665
+TRUTH = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.005)}
+SIZES = ((360, 740), (740, 360), (820, 1180), (1440, 900), (2560, 1440))
+PATIENCE = 30_000
+"""Longest time until the page shows something [ms]."""
+
+_FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+          '--disable-background-networking', '--disable-component-update', '--disable-sync')
+_SIDES = {'front': (0, 1), 'back': (0, -1), 'left': (1, 1), 'right': (1, -1), 'top': (2, 1),
+          'bottom': (2, -1)}
+_GOAL = re.compile(r'([\w ]+) (?:side|edge|corner) up', re.IGNORECASE)
+_RATE = 100.0
+_TURN = 1.2
+_NOISE = 0.002
+
+
+class TurnedSensor:
+    """A sensor that is turned by hand; it is the source of a host. Its time runs faster."""
+
+    name, sensor = 'simulated', 'imu_link'
+
+    def __init__(self, speed: float = 6.0) -> None:
+        self.speed = speed
+        self.silent = False
+        self._model = model_with(TRUTH)
+        self._rng = np.random.default_rng(5)
+        self._start = self._end = np.array([0.0, 0.0, 1.0])
+        self._since, self._stamp = math.inf, 0.0
+
+    def turn_to(self, direction: Floats) -> None:
+        """Turn the sensor so that about this direction points up."""
+        self._start = self._force(self._stamp)
+        shaky = np.asarray(direction) + 0.03 * self._rng.normal(size=3)
+        self._end, self._since = unit(shaky[np.newaxis])[0], self._stamp
+
+    @property
+    def up(self) -> Floats:
+        """Direction that points up in the last pose."""
+        return self._end
+
+    def _force(self, stamp: float) -> Floats:
+        if stamp < self._since:  # it tumbles until it is turned
+            tumbling = np.array([[np.sin(2.0 * stamp), 0.4, np.cos(2.0 * stamp)]])
+            return unit(tumbling)[0]
+        share = min(1.0, (stamp - self._since) / _TURN)
+        aside = np.cross(self._start, self._end)
+        between = self._start + share * (self._end - self._start) + np.sin(np.pi * share) * aside
+        force: Floats = unit(between[np.newaxis])[0]
+        return force if share == 1.0 else force * (1.0 + 0.1 * np.sin(20.0 * stamp))
+
+    @property
+    def blocks(self) -> Iterator[Floats]:
+        """Yield the samples as they arrive."""
+        last = time.monotonic()
+        while True:
+            time.sleep(0.02)
+            now = time.monotonic()
+            count = int((now - last) * self.speed * _RATE)
+            last += count / (self.speed * _RATE)
+            stamps = self._stamp + np.arange(1, count + 1) / _RATE
+            rows = np.zeros((count, 9))
+            for row, stamp in zip(rows, stamps, strict=True):
+                row[0], self._stamp = 1000.0 + stamp, float(stamp)
+                row[1:4] = GRAVITY * (predict(self._model, self._force(stamp)[np.newaxis], {})[0]
+                                      + _NOISE * self._rng.normal(size=3))
+                row[7:] = 30.0, np.nan
+            yield rows[:0] if self.silent else rows
+
+
+class LivePage:
+    """A host with a turned sensor, and its page."""
+
+    def __init__(self, sensor: TurnedSensor, host: Host, lines: list[Log]) -> None:
+        self.sensor, self.host, self.lines = sensor, host, lines
+
+    @property
+    def link(self) -> str:
+        """Link with the token."""
+        return self.host.server.link
+
+    @property
+    def bare_link(self) -> str:
+        """Link without the token."""
+        return self.link.partition('#')[0]
+
+    def follow(self, page: Page, poses: int = 100) -> None:
+        """Turn the sensor as the page says, until it has so many poses, or asks for the fit."""
+        follow(page, self.sensor.turn_to, poses)
+
+    def turn_half(self, page: Page) -> None:
+        """Begin the turn that the page asks for, and stop when about half of it is done."""
+        asked = _GOAL.fullmatch(page.locator('#next').inner_text())
+        assert asked is not None
+        goal = direction_of(asked.group(1))
+        self.sensor.turn_to(self.sensor.up + goal)
+        page.wait_for_timeout(1000.0 * _TURN / self.sensor.speed + 300.0)
+
+
+def follow(page: Page, turn_to: Callable[[Floats], object], poses: int = 100) -> None:
+    """Turn a sensor as the page says, until it has so many poses, or asks for the fit."""
+    while True:
+        expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'),
+                                                   timeout=PATIENCE)
+        words = page.locator('#next').inner_text()
+        count = int(page.locator('#poses').inner_text().split()[0])
+        asked = _GOAL.fullmatch(words)
+        if asked is None or count >= poses:
+            return
+        turn_to(direction_of(asked.group(1)))
+        expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'),
+                                                        timeout=PATIENCE)
+
+
+def direction_of(sides: str) -> Floats:
+    """Return the unit vector of sides such as “front left”."""
+    direction = np.zeros(3)
+    for side in sides.lower().split():
+        axis, sign = _SIDES[side]
+        direction[axis] = sign
+    return direction / np.linalg.norm(direction)
+
+
+@contextmanager
+def live_page(folder: Path, *, speed: float = 6.0) -> Iterator[LivePage]:
+    """Serve the page of a simulated sensor; the calibration is stored in this folder."""
+    sensor, lines, over = TurnedSensor(speed), list[Log](), Event()
+    host = Host(sensor, CalibratorSettings(calibration_file=str(folder / 'imu.yaml')),
+                lines.append)
+    thread = Thread(target=host.run, args=(over.is_set,), name='host')
+    thread.start()
+    try:
+        yield LivePage(sensor, host, lines)
+    finally:
+        over.set()
+        thread.join()
+        host.close()
+
+
+def chromium(playwright: Playwright) -> Browser:
+    """Start Chromium; fail with how to install it if there is none."""
+    found = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which(
+        'google-chrome')
+    if found is None:
+        pytest.fail('no Chromium is found, expected one for the tests of the live page; run '
+                    'apt install chromium')
+    return playwright.chromium.launch(executable_path=found, args=list(_FLAGS))
+
+
+class Viewers:
+    """The pages of a test, and what their consoles say."""
+
+    def __init__(self, browser: Browser) -> None:
+        self._browser = browser
+        self.complaints: list[str] = []
+
+    def visit(self, link: str, size: tuple[int, int] = (1000, 900), **options: object) -> Page:
+        """Open a page in a context of its own."""
+        context = self._browser.new_context(
+            viewport={'width': size[0], 'height': size[1]}, **options)  # type: ignore[arg-type]
+        page = context.new_page()
+        page.on('console', lambda line: self.complaints.append(line.text)
+                if line.type in ('error', 'warning') else None)
+        page.on('pageerror', lambda error: self.complaints.append(str(error)))
+        page.goto(link)
+        expect(page.locator('body')).to_have_attribute('data-connection', 'open')
+        return page
+
+    def close(self) -> None:
+        """Close all pages."""
+        for context in self._browser.contexts:
+            context.close()
