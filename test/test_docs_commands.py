@@ -11,7 +11,7 @@ the sample of ``test/data/logs`` that it is::
     <!-- files: log.csv=esp32/counts.log -->
 
 ``<!-- status: 1 -->`` above a block states the exit status of its last command. The commands
-`OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py and test_watch.py run them.
+`OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py, test_watch.py and test_live_command.py run them.
 
 """
 
@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LOGS = ROOT / 'test' / 'data' / 'logs'
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (
     ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')))
-OF_ROS = {'node', 'simulator', 'watch', 'demo'}
+OF_ROS = {'node', 'simulator', 'watch', 'demo', 'live'}
 SENSOR = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.005],
           'cross_axis': [0.004, 0.002, -0.003]}
 LIBRARIES = {'.ulg': 'pyulog', '.bin': 'pymavlink'}

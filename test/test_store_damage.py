@@ -246,7 +246,7 @@ def test_the_calibrator_starts_with_files_of_which_bytes_were_changed(
 
 
 HUGE = ['1e300,0,0', '0,-1e308,1e308', '1e-320,0,0', '0,0,0', '9e99,9e99,9e99']
-LARGE = ['1e29,0,0', '0,-1e30,0', '1e-320,0,0', '0,0,0', '0,0,9e15']
+LARGE = ['1e29,0,0', '0,-9e29,0', '1e-320,0,0', '0,0,0', '0,0,9e15']
 
 
 @pytest.mark.parametrize(('largest', 'most'), [(HUGE, 1e300), (LARGE, 1e29)])
