@@ -172,15 +172,15 @@ def _shaking(rng: np.random.Generator, kind: str, size: float,
     count = len(phase)
     carried = 0.08 * coloured(rng, count, rate, 0.05) * (phase == _CARRY)[:, np.newaxis]
     more: dict[str, Callable[[], Floats]] = {
-        'tremor': lambda: (phase == _OTHER)[:, np.newaxis] * _swinging(rng, count, rate, size,
-                                                                       (5.0, 12.0), 0.6),
+        'tremor': lambda: (phase == _OTHER)[:, np.newaxis] * swinging(rng, count, rate, size,
+                                                                      (5.0, 12.0), 0.6),
         'footsteps': lambda: _steps(rng, count, rate, size),
-        'motor': lambda: _swinging(rng, count, rate, size, (20.0, 80.0), 2.0)}
+        'motor': lambda: swinging(rng, count, rate, size, (20.0, 80.0), 2.0)}
     return carried + (more[kind]() if kind in more else 0.0)
 
 
-def _swinging(rng: np.random.Generator, count: int, rate: float, size: float,
-              band: tuple[float, float], jitter: float) -> Floats:
+def swinging(rng: np.random.Generator, count: int, rate: float, size: float,
+             band: tuple[float, float], jitter: float) -> Floats:
     """Return an oscillation in a fixed direction; its frequency [Hz] wanders by `jitter`."""
     frequency = rng.uniform(*band) + jitter * coloured(rng, count, rate, 1.0)[:, 0]
     phase = 2.0 * np.pi * np.cumsum(frequency) / rate

@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
+from accel_calib.capture.window import oscillation
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 G = units_of('g')
@@ -225,6 +226,103 @@ def test_a_hand_held_tremor_is_not_a_pose_after_a_quiet_rest(amplitude):
     result = captured(np.arange(len(time) + 500) / 100.0, np.concatenate([held, reading]))
     assert len(result.poses) == 4
     assert result.poses['time'].min() > 5.0
+
+
+def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):
+    """Return times and readings of a sensor shaken along gravity by this share of |a|."""
+    time, reading = still(seed, seconds, rate, noise)
+    force = reading.mean(axis=0) / np.linalg.norm(reading.mean(axis=0))
+    swing = np.sin(2.0 * np.pi * frequency * time + seed)
+    return time, reading + size * swing[:, np.newaxis] * force
+
+
+@pytest.mark.parametrize('frequency', [1.0, 1.7, 3.0, 10.0 / 3.0, 4.7])
+@pytest.mark.parametrize(('size', 'rate'), [(0.02, 100.0), (0.1, 100.0), (0.05, 1000.0)])
+def test_shaking_from_the_first_second_on_is_neither_still_nor_a_pose(frequency, size, rate):
+    time, reading = shaken(3, frequency, size, seconds=9.0, rate=rate)
+    detector = StillDetector(CaptureSettings(), G)
+    block = int(0.1 * rate)
+    for start in range(0, len(time), block):
+        detector.push(rows(time[start:start + block], reading[start:start + block]))
+        assert detector.current() is None or time[start] < 4.0
+        assert not detector.still or time[start] < 4.0
+    detector.close()
+    assert detector.dwells() == []
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_shaking_at_a_wandering_frequency_is_not_a_pose(seed):
+    rng = np.random.default_rng(seed)
+    time, reading = still(seed, 12.0)
+    frequency = 3.0 + 0.3 * lfilter([0.14], [1.0, -0.99], rng.normal(size=len(time)))
+    swing = np.sin(2.0 * np.pi * np.cumsum(frequency) / 100.0)[:, np.newaxis] * [0.05, 0.08, -0.02]
+    assert len(captured(time, reading + swing).poses) == 0
+
+
+@pytest.mark.parametrize(('size', 'poses'), [(0.01, 0), (4e-3, 6)])
+def test_shaking_in_counts_is_not_a_pose(size, poses):
+    moved = np.random.default_rng(1).normal(size=(6, 100, 3))
+    reading = np.concatenate([np.concatenate([shaken(seed, 1.5, size, 8.0)[1], moved[seed]])
+                              for seed in range(6)])
+    time = np.arange(len(reading)) / 100.0
+    assert len(captured(time, 4000.0 * reading, units=units_of('native')).poses) == poses
+
+
+def test_a_rest_after_shaking_is_a_pose():
+    shaking, resting = shaken(3, 3.0)[1], still(3, 8.0)[1]
+    time = np.arange(len(shaking) + len(resting)) / 100.0
+    reading = np.concatenate([shaking, resting])
+    result, detector = captured(time, reading), pushed(time, reading)
+    assert len(result.poses) == 1
+    assert 12.0 < detector.dwells()[0].start < 14.0
+    np.testing.assert_array_equal([detector.dwells()[0].time], result.poses['time'])
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('order', 'corner'), [(1, 5.0), (2, 5.0), (4, 10.0), (2, 20.0)])
+def test_noise_behind_a_low_pass_filter_is_still(seed, order, corner):
+    time, _ = still(seed, 12.0)
+    noise = lfilter(*butter(order, corner, fs=100.0),
+                    np.random.default_rng(seed).normal(size=(len(time) + 500, 3)), axis=0)[500:]
+    assert len(captured(time, [0.6, 0.0, 0.8] + 0.01 * noise / noise.std()).poses) == 1
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.05])
+def test_white_noise_is_still(noise):
+    for seed in range(5):
+        time, reading = still(seed, 12.0, noise=noise)
+        assert len(captured(time, reading).poses) == 1
+
+
+@pytest.mark.parametrize('frequency', [31.0, 37.0, 52.0, 78.0])
+def test_the_vibration_of_an_engine_is_still(frequency):
+    time, reading = shaken(2, frequency, 0.02)
+    result = captured(time, reading)
+    assert len(result.poses) == 1
+    np.testing.assert_allclose(result.poses.reading[0], reading.mean(axis=0), atol=1e-3)
+
+
+def test_a_base_that_sways_by_a_few_milli_g_is_still():
+    time, reading = shaken(5, 2.0, size=4e-3)
+    assert len(captured(time, reading).poses) == 1
+
+
+def test_a_limit_of_the_user_accepts_a_base_that_sways_more():
+    time, reading = shaken(5, 2.0, size=0.02)
+    assert len(captured(time, reading).poses) == 0
+    assert len(captured(time, reading, CaptureSettings(still_std_max=0.03)).poses) == 1
+
+
+def test_the_share_of_an_oscillation_is_that_of_its_power():
+    time = np.arange(36.0)
+    one, other = (np.cos(2.0 * np.pi * periods / 36.0 * time) for periods in (9.0, 14.0))
+    values = np.array([2.0 * one + 0.01 * time, other, 5.0 + 0.0 * time])
+    assert oscillation(values, 36, np.array([0])) == pytest.approx([0.8], abs=1e-3)
+    noise = np.random.default_rng(1).normal(size=(3, 400))
+    every = np.arange(365)
+    shares = oscillation(noise, 36, every)
+    assert 0.1 < shares.mean() < 0.2
+    np.testing.assert_allclose(oscillation(noise[:, 100:], 36, every[:9]), shares[100:109])
 
 
 def test_a_knock_does_not_divide_a_dwell():

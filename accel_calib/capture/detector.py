@@ -8,9 +8,9 @@ The stillness detector of one sensor: it converts samples to dwells.
 
 The window of a chunk is tested at once, and again after `HORIZON` more chunks, when the noise is
 better known. Only then does the chunk join the dwell. A dwell that began before the noise was
-known therefore starts where the sensor came to rest, and a slope excludes all its chunks. A window
-that is not still ends the dwell at once; the waiting chunks are then decided with the noise known
-so far.
+known therefore starts where the sensor came to rest, and a slope or an oscillation excludes all
+its chunks. A window that is not still ends the dwell at once; the waiting chunks are then decided
+with the noise known so far.
 
 Next to a significant slope, the slope may continue below significance. There a weaker slope is
 enough to reject the dwell.

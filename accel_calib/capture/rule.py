@@ -12,7 +12,11 @@ A window is the last `CHUNKS_PER_WINDOW` chunks. It is still if
 3. |mean reading| is near 1 g, if the unit of the readings is known;
 4. the reading has no slope over the last `SLOPE_CHUNKS` that is both significant and larger than
    the drift of a sensor during warm-up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s
-   and is not visible in any variance.
+   and is not visible in any variance;
+5. the chunk means do not oscillate with one frequency. Without this condition, shaking from the
+   first second on passes for noise of the sensor. White noise and vibration average out over a
+   chunk. Noise behind a slow low-pass filter does not, but it has no single frequency. A limit of
+   the user (`still_std_max`) replaces this condition.
 
 **The noise of the sensor** is the lower envelope of the variances so far. The mean variance v of
 the windows in `LONG` chunks has a standard error of about v √(2/dof), with dof = 2 n / (1 +
@@ -32,6 +36,7 @@ deviation above `STD_CAP_G` is not still.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import math
 from typing import NamedTuple
 
@@ -45,6 +50,7 @@ from .window import (
     at_least_any,
     clipped,
     columns_of,
+    oscillation,
     rounding,
     Stretch,
     stretch,
@@ -58,7 +64,15 @@ LONG = 12
 """Number of chunks from which the noise is estimated."""
 
 SLOPE_CHUNKS = (LONG, 3 * LONG)
-"""Numbers of chunks over which slopes are tested; a longer stretch reveals smaller slopes."""
+"""Numbers of chunks over which slopes are tested; a longer stretch reveals smaller slopes.
+Oscillations are tested over the same stretches; a longer stretch reveals slower ones."""
+
+OSCILLATION = {LONG: 0.9, 3 * LONG: 0.7}
+"""Largest share of one frequency in the chunk means of a still stretch, by the number of chunks.
+Noise exceeds it with p ≈ 1e-4, even on one axis alone or with a correlation time of two chunks."""
+
+OSCILLATION_G = 5e-3
+"""Largest oscillation of a still sensor [g], as standard deviation: a soft base that sways."""
 
 HORIZON = max(SLOPE_CHUNKS)
 """Number of chunks after which the verdict on a chunk is final."""
@@ -112,7 +126,7 @@ class Judged(NamedTuple):
     still : (m,) array of bool
         The verdict.
     trending : (m,) array of int
-        Number of chunks over which the reading has a slope; 0 without slope.
+        Number of chunks over which the reading has a slope or oscillates; 0 if it does not.
 
     """
 
@@ -212,10 +226,7 @@ class Rule:
         noise = self._learn(seen[LONG], mean, chunks.step)
         scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0))
         limit = self.limit_of(at_least_any(noise, scale))
-        trending = np.zeros(size, dtype=np.intp)
-        for length, each in seen.items():
-            calm = np.all(each.highest <= limit[:3], axis=0)
-            trending[calm & self.moved(each.trend, scale, each.variance[:3])] = length
+        trending = self._trending(seen, mean, limit, scale)
         still = self._quiet(mean, recent, limit) & (trending == 0)
         return Judged(chunks, _six(recent, np.nan), _six(limit, np.inf), still, trending)
 
@@ -249,6 +260,23 @@ class Rule:
         """Return whether dwells exclude a slow turn; see `TURN_G`."""
         size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
         return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
+
+    def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
+                  ) -> NDArray[np.intp]:
+        trending = np.zeros(mean.shape[1], dtype=np.intp)
+        one_g = scale
+        if not self.known:  # the scale is too small before several orientations are seen
+            one_g = np.maximum(scale, np.sqrt(np.sum(mean[:3]**2, axis=0)))
+        for length, each in seen.items():
+            calm = np.all(each.highest <= limit[:3], axis=0)
+            moved = self.moved(each.trend, scale, each.variance[:3])
+            suspect = each.scatter > np.maximum((OSCILLATION_G * one_g)**2, each.white)
+            suspect &= calm & (self._settings.still_std_max == 0.0)
+            index = np.flatnonzero(suspect)
+            share = oscillation(each.means, length, index)
+            moved[index] |= share > OSCILLATION[length]
+            trending[calm & moved] = length
+        return trending
 
     def _quiet(self, mean: Floats, level: Floats, limit: Floats) -> NDArray[np.bool_]:
         quiet = np.all(level[:3] <= limit[:3], axis=0)

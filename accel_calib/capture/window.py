@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Windows over chunks: means, variances, slopes, and lower limits of the variance.
+Windows over chunks: means, variances, slopes, oscillations, and lower limits of the variance.
 
 **Sliding sums.** Sums, maxima and slopes over sliding windows. The cost grows with the logarithm
 of the length.
@@ -30,6 +30,12 @@ from the residuals r: their power over w, times (1 + ρ)/(1 - ρ) for a correlat
 neighbours (the sum of the correlations of an AR(1) process [1]_). Power and ρ are pooled over the
 axes, because K cells of one axis are too few. They are at least those of white noise.
 
+**Oscillation.** A frequency f explains the share Σ p² / Σ r² of the residuals r of the line. Here
+p is the least squares fit of a cos(2πft) + b sin(2πft), with a and b for each axis. The largest
+share over all f is near 1 if one frequency dominates (periodogram of Lomb and Scargle [4]_). Over
+36 cells of three axes it is about 0.14 for white noise, and about 0.3 for noise with a correlation
+time of two cells, because the spectrum of noise has no peak.
+
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
 
@@ -49,6 +55,8 @@ References
 .. [1] G. E. P. Box, G. M. Jenkins, G. C. Reinsel, Time Series Analysis, 3rd ed., section 2.1.
 .. [2] C. J. Geyer, Practical Markov Chain Monte Carlo, Statistical Science 7 (1992) 473-483.
 .. [3] B. Widrow, I. Kollár, Quantization Noise, Cambridge 2008, chapter 4.
+.. [4] J. D. Scargle, Studies in Astronomical Time Series Analysis II, Astrophysical Journal 263
+   (1982) 835-853.
 
 """
 
@@ -56,6 +64,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 import math
 from typing import NamedTuple
 
@@ -179,6 +188,58 @@ def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
         weighted = weighted[..., :-size] + weighted[..., size:] + size * values[..., size:]
         values = values[..., :-size] + values[..., size:]
         size *= 2
+
+
+_FEWEST_PERIODS = 2.0
+"""Number of periods in a window below which a drift resembles an oscillation."""
+
+_BATCH = 4096
+"""Number of windows of which the oscillation is computed at a time, to bound the memory."""
+
+
+def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
+    """
+    Return the largest share of the residuals of the lines that one frequency explains.
+
+    Parameters
+    ----------
+    values : (axes, n) array
+        Values of the axes.
+    length : int
+        Length of the windows.
+    index : (m,) array of int
+        First value of each window.
+
+    Returns
+    -------
+    (m,) array
+        The shares, 0 to 1, over all axes together.
+
+    """
+    line, waves = _waves(length)
+    found = np.empty(len(index))
+    for start in range(0, len(index), _BATCH):
+        part = index[start:start + _BATCH, np.newaxis] + np.arange(length)
+        window = values[:, part]
+        window = window - window.mean(axis=2, keepdims=True)
+        window -= (window @ line)[..., np.newaxis] * line
+        power = np.sum((window @ waves)**2, axis=0).reshape(len(part), -1, 2).sum(axis=2)
+        found[start:start + _BATCH] = (power.max(axis=1)
+                                       / (np.sum(window**2, axis=(0, 2)) + _TINY))
+    return found
+
+
+@cache
+def _waves(length: int) -> tuple[Floats, Floats]:
+    """Return the unit line, and (length, 2 f) orthonormal pairs of waves of f frequencies."""
+    time = np.arange(length) - 0.5 * (length - 1)
+    smooth = np.column_stack([np.full(length, length**-0.5), time / np.sqrt(np.sum(time**2))])
+    found = []
+    for periods in np.arange(_FEWEST_PERIODS, 0.5 * length, 0.5):
+        angle = 2.0 * np.pi * periods / length * time
+        pair = np.column_stack([np.cos(angle), np.sin(angle)])
+        found.append(np.linalg.qr(pair - smooth @ (smooth.T @ pair))[0])
+    return smooth[:, 1], np.concatenate(found, axis=1)
 
 
 _CORRELATION_MAX = 0.9
@@ -359,6 +420,12 @@ class Stretch:
         Number of samples.
     at_limit : (3, m) array
         Share of samples that repeat the extreme of their axis so far.
+    means : (3, m + length - 1) array
+        Means of the chunks of the reading.
+    scatter : (m,) array
+        Mean square of the residuals of the means of the reading, sum over the axes.
+    white : (m,) array
+        The same for independent samples.
 
     """
 
@@ -368,6 +435,9 @@ class Stretch:
     highest: Floats
     samples: Floats
     at_limit: Floats
+    means: Floats
+    scatter: Floats
+    white: Floats
 
 
 def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
@@ -383,12 +453,14 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
     square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
     white += _DIGITS * square.repeat(3, axis=0)
     line = lines(cells, length)
+    scatter = _over_axes(line.square) / length
     line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
                          neighbours=_grouped(line.neighbours))
     found = strength_of(line, spacing, _grouped(white))
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
-    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit)
+    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
+                   cells[:3], scatter, _over_axes(white))
 
 
 def _grouped(values: Floats) -> Floats:
