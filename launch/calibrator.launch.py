@@ -19,8 +19,8 @@ thermometer. If the driver in the namespace publishes the temperature, add
 **Lifecycle.** With ``lifecycle:=true`` the node is a managed node. This file configures and
 activates it once; later transitions are up to you, for example by `ros2 lifecycle set`.
 
-**Live page.** With ``web:=true`` the node serves the live page at port 8080 of this machine, and
-logs its link. For a phone, add ``web_host:=0.0.0.0``.
+**Live page.** With ``web:=true`` the node serves the live page at `web_port` of this machine, and
+logs its link. For a phone, add ``web_host:=0.0.0.0``. A second node needs another port.
 
 """
 
@@ -77,9 +77,6 @@ PARAMETERS = {
 }
 """Parameters of the node by argument: type and description. A list has three numbers."""
 
-WEB_PORT = 8080
-"""Port of the live page."""
-
 BOOLS = ['true', 'false', 'True', 'False']
 
 
@@ -102,7 +99,9 @@ def generate_launch_description() -> LaunchDescription:
             description='Whether to start the managed node, and configure and activate it.'),
         DeclareLaunchArgument(
             'web', default_value='false', choices=BOOLS,
-            description=f'Whether to serve the live page, at port {WEB_PORT}.'),
+            description='Whether to serve the live page.'),
+        DeclareLaunchArgument(
+            'web_port', default_value='8080', description='Port of the live page with web:=true.'),
         OpaqueFunction(function=_calibrator),
     ])
 
@@ -133,7 +132,7 @@ def _overrides(context: LaunchContext) -> list[dict[str, Any]]:
             values[name] = (_numbers(name, text) if kind is list
                             else ParameterValue(given, value_type=kind))
     if IfCondition(LaunchConfiguration('web')).evaluate(context):
-        values['web_port'] = WEB_PORT
+        values['web_port'] = ParameterValue(LaunchConfiguration('web_port'), value_type=int)
     return [values] if values else []
 
 

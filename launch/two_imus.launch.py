@@ -15,6 +15,8 @@ Further arguments go to both calibrators, for example ``fill_covariance:=true``.
 `calibration_file` or `sensor` here: each calibrator needs its own files, and by default the files
 are named after the topic.
 
+With ``web:=true`` the live page of the left Imu is at port 8080, that of the right one at 8081.
+
 """
 
 from ament_index_python.packages import get_package_share_path
@@ -22,10 +24,13 @@ from launch import LaunchDescription
 from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 
+WEB_PORTS = {'left': '8080', 'right': '8081'}
+"""Ports of the live pages by namespace."""
+
 
 def generate_launch_description() -> LaunchDescription:
     calibrator = get_package_share_path('accel_calib') / 'launch' / 'calibrator.launch.py'
     return LaunchDescription([
         IncludeLaunchDescription(PythonLaunchDescriptionSource(str(calibrator)),
-                                 launch_arguments=[('namespace', namespace)])
-        for namespace in ('left', 'right')])
+                                 launch_arguments=[('namespace', namespace), ('web_port', port)])
+        for namespace, port in WEB_PORTS.items()])

@@ -274,7 +274,7 @@ GIVEN = {
     'confirm': ('true', True), 'calibration_file': ('/x.yaml', '/x.yaml'), 'sensor': ('7', '7'),
     'web_host': ('0.0.0.0', '0.0.0.0')}
 ARGUMENTS = {'imu', 'output', 'temperature', 'linear_acceleration', 'namespace', 'params_file',
-             'lifecycle', 'web', *GIVEN}
+             'lifecycle', 'web', 'web_port', *GIVEN}
 
 
 @pytest.mark.parametrize('name', GIVEN)
@@ -287,6 +287,8 @@ def test_each_parameter_argument_sets_a_parameter_of_its_type(name: str, started
 
 def test_web_serves_the_live_page(started: Any) -> None:
     assert started(web='true').node.values() == {'web_port': 8080}
+    assert started(web='true', web_port='9000').node.values() == {'web_port': 9000}
+    assert started(web_port='9000').node.values() == {}
     assert DEFAULTS['web_port'] == 0
 
 
@@ -336,6 +338,12 @@ def test_two_imus_have_their_own_topics_and_share_the_thermometer(started: Any) 
     own = started(path, temperature='temperature').nodes
     assert [node.topic('temperature') for node in own] == [
         '/left/temperature', '/right/temperature']
+
+
+def test_two_imus_have_live_pages_at_different_ports(started: Any) -> None:
+    path = ROOT / 'launch' / 'two_imus.launch.py'
+    assert [node.values() for node in started(path, web='true').nodes] == [
+        {'web_port': 8080}, {'web_port': 8081}]
 
 
 @pytest.mark.parametrize('namespace', ['', 'robot'])

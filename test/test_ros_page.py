@@ -17,8 +17,11 @@ from typing import Any
 
 from accel_calib.files import read_calibration
 from accel_calib.sphere import spread_directions
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
+from sensor_msgs.msg import Imu
 from viewer import fetch, Viewer, wait
 
 DIRECTIONS = spread_directions(12)
@@ -129,3 +132,30 @@ def test_the_token_is_not_sent_to_viewers(bench: Any, viewer: Viewer) -> None:
     other.close()
     assert viewer.token not in str(other.got)
     assert not other.of('welcome')[0]['may']
+
+
+def test_the_managed_node_serves_the_page_while_it_is_configured(
+        bench: Any, stored: Callable[..., Path]) -> None:
+    node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
+    change = bench.node.create_client(ChangeState, 'calibrator/change_state')
+    publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
+    bench.spin(change.service_is_ready)
+
+    def go(transition: int) -> None:
+        changed = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        bench.spin(changed.done)
+        assert changed.result().success
+
+    for _ in range(2):  # the second page is at the same port
+        go(Transition.TRANSITION_CONFIGURE)
+        viewer = Viewer(printed_until(node, 'live page: ').split('live page: ')[1].strip())
+        bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
+        go(Transition.TRANSITION_ACTIVATE)
+        bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(
+            each['raw'] for each in viewer.of('progress')))
+        assert viewer.ask('disable', bench.spin)['success']
+        go(Transition.TRANSITION_DEACTIVATE)
+        go(Transition.TRANSITION_CLEANUP)
+        wait(lambda viewer=viewer: viewer.code)
+        viewer.close()
+    assert bench.end(node, signal.SIGTERM)[0] == 0

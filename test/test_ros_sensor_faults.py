@@ -42,8 +42,9 @@ def captured(bench: Any, sensor: str = 'imu_link') -> list[list[int]]:
 
 
 def output_of(bench: Any, process: Any) -> str:
-    """End the node, and return what it printed; its end has tests in test_ros_restart.py."""
-    printed = bench.end(process, signal.SIGTERM)[1]
+    """End the node, and return what it printed."""
+    status, printed = bench.end(process, signal.SIGTERM)
+    assert status == 0, printed
     assert 'Traceback' not in printed
     return str(printed)
 

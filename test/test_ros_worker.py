@@ -95,6 +95,24 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         node.destroy_node()
 
 
+@pytest.mark.parametrize('make_executor', [single_threaded_executor, events_executor])
+def test_an_error_of_a_function_is_logged_and_the_executor_continues(
+        bench: Any, make_executor: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    executor = make_executor(bench.node.context)
+    node = Node('calibrator', context=bench.node.context)
+    executor.add_node(node)
+    call_soon, over = in_executor(node), Future()
+    call_soon(lambda: math.sqrt(-1.0))
+    call_soon(lambda: over.set_result(None))
+    executor.spin_until_future_complete(over, timeout_sec=10.0)
+    executor.shutdown()
+    node.destroy_node()
+    assert over.done()
+    printed = capfd.readouterr().err
+    assert printed.count('unexpected error in accel_calib') == 1
+    assert 'ValueError: math domain error' in printed
+
+
 @pytest.fixture
 def process() -> Iterator[WorkerProcess]:
     made = WorkerProcess()

@@ -132,8 +132,8 @@ class Calibrator:
         self._handle_events()
         node, overrides = self._node, self._overrides
         self._heard = [
-            node.create_subscription(Imu, 'imu/data_raw', self._on_imu, qos.SENSOR, raw=True,
-                                     qos_overriding_options=overrides),
+            node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, qos.SENSOR,
+                                     raw=True, qos_overriding_options=overrides),
             node.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR,
                                      qos_overriding_options=overrides)]
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -149,13 +149,6 @@ class Calibrator:
             return found
 
         return call
-
-    def _on_imu(self, data: bytes) -> None:
-        try:
-            self.stream.on_message(data)
-        except RuntimeError:
-            if self._node.context.ok():
-                raise  # otherwise a signal came during publishing
 
     def _on_temperature(self, message: Temperature) -> None:
         self.stream.set_temperature(message.temperature)

@@ -82,4 +82,10 @@ class ManagedCalibrator(LifecycleNode):
                                (self.timers, self.destroy_timer)):
             for each in list(kinds):
                 if each not in self._own:
+                    # The executor calls these for the events that it has already received.
+                    each.callback = each.send_response = _ignore
                     destroy(each)
+
+
+def _ignore(*given: Any) -> None:
+    """Do nothing with a message, a request, a response, or at the time of a timer."""

@@ -1,14 +1,22 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start, spin and shut down a node, also after Ctrl-C and other signals."""
+"""
+Start, spin and shut down a node, also after Ctrl-C and other signals.
+
+A signal stops the executor, and the node then ends between two callbacks. The handlers of rclpy
+would shut down ROS in another thread, so that a callback could fail at every line that uses ROS.
+
+"""
 
 from __future__ import annotations
 
 import gc
 from importlib import import_module
+import os
 import signal
 import sys
+from threading import Thread
 from typing import TYPE_CHECKING
 
 from ..errors import AccelCalibError, NEEDS_ROS
@@ -17,11 +25,15 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rclpy.executors import Executor
+    from rclpy.task import Future
 
 _OK, _BAD_INPUT = 0, 2
 
-_LOOK_EVERY = 0.5
-"""Interval at which the shutdown of ROS is checked [s]."""
+_TURN = 3600.0
+"""Time limit of a call of the executor [s]."""
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a node."""
 
 _SWITCH = 1e-4
 """Switch interval of the interpreter [s]; the longest wait of a message for another thread."""
@@ -44,69 +56,72 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
         Exit status: 0, or 2 if the input is invalid or ROS is not available.
 
     """
+    came, written = os.pipe()
+    os.set_blocking(written, False)
+    signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+    for number in _SIGNALS:
+        signal.signal(number, lambda number, frame: None)  # Python writes to the pipe
     try:
-        return _run(node, args)
-    except KeyboardInterrupt:
-        return _OK
+        return _run(node, args, came)
+    finally:
+        # Under launch, Ctrl-C arrives twice; Python would raise the second one while it exits.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+        signal.set_wakeup_fd(-1)
 
 
-def _run(node: str, args: Sequence[str] | None) -> int:
+def _run(node: str, args: Sequence[str] | None, came: int) -> int:
     """Start ROS, run the node, and shut down ROS."""
     try:
         import rclpy
     except ImportError as error:
         return _refuse(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy; '
                        f'{NEEDS_ROS}')
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.signals import SignalHandlerOptions
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         return _refuse(f'ROS 2 does not start: {str(error).splitlines()[0]}; check the '
                        'parameters and arguments')
     try:
-        _spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        _spin(node, came)
     except AccelCalibError as error:
         return _refuse(str(error))
     finally:
-        # Under launch, Ctrl-C arrives twice; the second one would interrupt the shutdown.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        rclpy.try_shutdown()
+        # rclpy.try_shutdown() would also restore signal handlers, for an instant the default ones.
+        rclpy.get_default_context().try_shutdown()
     return _OK
 
 
-def _spin(node: str) -> None:
+def _spin(node: str, came: int) -> None:
     """Create the node and spin it."""
-    import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.task import Future
     module, name = node.split(':')
-    try:
-        instance = getattr(import_module(module, __package__), name)()
-        executor = _executor()
-        executor.add_node(instance)
-    except Exception:  # rclpy has many errors for a context that a signal has shut down
-        if rclpy.ok():
-            raise
-        return
+    instance = getattr(import_module(module, __package__), name)()
+    executor = _executor()
+    executor.add_node(instance)
     sys.setswitchinterval(_SWITCH)
     gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
     try:
         instance.start()
-        while instance.context.ok():
-            # EventsExecutor.spin() ignores signals. Each call leaks 35 bytes in rclpy 7.1.
-            executor.spin_until_future_complete(Future(), timeout_sec=_LOOK_EVERY)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except RuntimeError:
-        if instance.context.ok():
-            raise  # otherwise a signal came while a callback was publishing
+        ended = Future()
+        Thread(target=_end, args=(came, ended), daemon=True).start()
+        while instance.context.ok() and not ended.done():
+            # Without a time limit, EventsExecutor has a busy loop. Each call leaks 35 bytes.
+            executor.spin_until_future_complete(ended, timeout_sec=_TURN)
+    except ExternalShutdownException:
+        pass  # the node has ended itself
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         instance.close()
         executor.shutdown()
         instance.destroy_node()
+
+
+def _end(came: int, ended: Future) -> None:
+    """Wait for a signal and end the node; a busy executor does not return after `_TURN`."""
+    os.read(came, 1)
+    ended.set_result(None)
 
 
 def _executor() -> Executor:

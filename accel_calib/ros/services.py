@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from queue import SimpleQueue
+from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
 from std_srvs.srv import Trigger
@@ -31,12 +32,18 @@ def in_executor(node: Node) -> CallSoon:
     """Return a function that lets the executor of a node call functions, in their order."""
     waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
 
+    def call_next() -> None:
+        try:
+            waiting.get()()
+        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
+            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+
     def call_soon(function: Callable[[], None]) -> None:
         waiting.put(function)
         executor = node.executor
         if executor is not None:
             # The executor may run tasks in any order; the queue keeps their order.
-            executor.create_task(lambda: waiting.get()())
+            executor.create_task(call_next)
 
     return call_soon
 

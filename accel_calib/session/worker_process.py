@@ -123,6 +123,8 @@ class WorkerProcess:
 
     def _ask(self, function: Callable[..., Any], given: tuple[Any, ...]) -> tuple[bool, Any]:
         process = self._process
+        if self._closed:  # perhaps while another thread started the process
+            self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
         process.stdin.write(pickle.dumps((function, given)))
