@@ -50,6 +50,7 @@ class TurnedSensor:
     """A sensor that is turned by hand; it is the source of a host. Its time runs faster."""
 
     name, sensor = 'simulated', 'imu_link'
+    problem = str
 
     def __init__(self, speed: float = 6.0) -> None:
         self.speed = speed

@@ -57,12 +57,14 @@ def live(*arguments: str) -> Iterator[tuple[str, list[str], subprocess.Popen[str
 @pytest.mark.parametrize('unit', GAINS)
 def test_a_board_on_a_serial_port_is_calibrated_in_the_browser(unit: str, tmp_path: Path) -> None:
     sensor, stored = TurnedSensor(speed=5.0), tmp_path / 'board.yaml'
-    with (board(lines_of(sensor, GAINS[unit])) as port, live(port, '-o', str(stored)) as (link, lines, run),
-          sync_playwright() as playwright):
+    with (board(lines_of(sensor, GAINS[unit])) as port,
+          live(port, '-o', str(stored)) as (link, lines, run), sync_playwright() as playwright):
         browser = chromium(playwright)
         viewers = Viewers(browser)
         page = viewers.visit(link)
         follow(page, sensor.turn_to)
+        expect(page.locator('#box-now')).to_have_attribute(  # also before the zero is fitted
+            'aria-label', re.compile(r'\w+ (side|edge|corner) up$'), timeout=PATIENCE)
         page.get_by_role('button', name='Fit', exact=True).click()
         expect(page.locator('#offer')).to_be_visible(timeout=PATIENCE)
         expect(page.locator('#verdict strong')).to_have_text('GOOD', timeout=PATIENCE)
@@ -103,4 +105,5 @@ def test_a_port_in_use_and_a_missing_recording_are_one_line_and_status_2(tmp_pat
         done = subprocess.run([sys.executable, '-m', 'accel_calib.cli.main', 'live', *arguments],
                               capture_output=True, text=True)
         assert done.returncode == 2
-        assert done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr
+        assert done.stderr.count('\n') == 1
+        assert 'Traceback' not in done.stderr

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
@@ -48,6 +48,7 @@ class Recording:
     rows: Floats
     name: str = 'bench.csv'
     sensor: str = 'imu_link'
+    problem: Callable[[], str] = str
     played: Event = field(default_factory=Event)
 
     @property

@@ -4,12 +4,9 @@
 """Samples of a serial port (a pseudo-terminal) and of a recording that is played in real time."""
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
-import os
+from contextlib import ExitStack
 from pathlib import Path
-from threading import Thread
 import time
-import tty
 
 from accel_calib.errors import InputError
 from accel_calib.files import LogOptions
@@ -117,27 +114,41 @@ def test_bytes_at_another_baud_rate_are_refused_with_that_advice(
         pass
 
 
-def test_a_port_that_is_removed_ends_with_one_line() -> None:
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
-    os.write(ours, b''.join(b'%d,0.0,0.0,%.3f\n' % (k, 1.0 + 0.001 * (k % 3))
-                            for k in range(300)))
-    port = os.ttyname(theirs)
+def test_a_port_that_is_removed_is_waited_for_and_read_again(tmp_path: Path) -> None:
+    port, reading = tmp_path / 'ttyUSB0', readings(4000)
 
-    def write_and_close() -> None:
-        for k in range(300, 560):
-            os.write(ours, b'%d,0.0,0.0,%.3f\n' % (k, 1.0 + 0.001 * (k % 3)))
-            time.sleep(0.01)
-        os.close(ours)
+    def line(k: int) -> str:
+        return f'{5 * k},{numbers(reading[k])}\n' if k > 5 else f'rst:0x1, boot {k}\r\n'
 
-    writer = Thread(target=write_and_close)
-    writer.start()
-    with (pytest.raises(InputError, match='has ended.*connect the sensor again'),
-          open_source(port, LogOptions()) as source):
-        for _ in islice(source.blocks, 2000):
-            pass
-    writer.join()
-    os.close(theirs)
+    with ExitStack() as first, ExitStack() as opened:
+        port.symlink_to(first.enter_context(board(paced(line))))
+        source = opened.enter_context(open_source(str(port), LogOptions()))
+        assert len(samples(source.blocks, 100)) >= 100
+        assert source.problem() == ''
+        port.unlink()
+        first.close()
+        ends = time.monotonic() + 5.0
+        while not source.problem():
+            next(source.blocks)
+            assert time.monotonic() < ends
+        assert 'connect the sensor again' in source.problem()
+        with board(paced(line)) as second:
+            port.symlink_to(second)
+            found = samples(source.blocks, 100)
+            assert source.problem() == ''
+    assert np.isfinite(found[:, :4]).all()
+    assert 0.0 < found[-1, 0] < 10.0  # the clock of the board has started again
+
+
+def test_a_number_that_is_too_large_costs_one_line() -> None:
+    reading = readings(4000)
+
+    def line(k: int) -> str:
+        return f'{5 * k},0.0,1e300,1.0\n' if k == 600 else f'{5 * k},{numbers(reading[k])}\n'
+
+    with board(paced(line)) as port, open_source(port, LogOptions()) as source:
+        found = samples(source.blocks, 800)
+    assert np.abs(found[:, 1:4]).max() < 2.0
 
 
 def test_a_port_that_does_not_exist_is_refused_in_one_line() -> None:

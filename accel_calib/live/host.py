@@ -26,6 +26,7 @@ from .exchange import Exchange, PERIOD
 from .server import PageServer
 from ..errors import AccelCalibError, system_error
 from ..session import CalibratorSettings, Job, Log, LogFilter, Session, ShowPoses
+from ..session.stream_statistics import SILENT
 from ..session.worker import Worker
 from ..table import Floats
 
@@ -49,6 +50,8 @@ class Samples(Protocol):
     blocks : iterable of (n, 9) array
         The samples as they arrive, as in `accel_calib.capture.StillDetector.push`. A block can be
         empty, and comes after a short time at the latest, because the page waits meanwhile.
+    problem : callable
+        Function that returns why no samples come at present; empty if nothing is wrong.
 
     """
 
@@ -63,6 +66,10 @@ class Samples(Protocol):
     @property
     def blocks(self) -> Iterable[Floats]:
         """Return the samples as they arrive."""
+
+    @property
+    def problem(self) -> Callable[[], str]:
+        """Return the function that returns why no samples come at present."""
 
 
 class Host:
@@ -129,6 +136,7 @@ class Host:
                 return
             if len(block):
                 self._waiting.append(block)
+            self._report_source()
             self._work()
         self._flush()
         while not is_over():
@@ -154,6 +162,18 @@ class Host:
         else:
             self._end(Log('info', f'{self._source.name} has ended: fit and save, or end the '
                           'program'))
+
+    def _report_source(self) -> None:
+        """Show and log that the source is interrupted, or is back."""
+        problem = self._source.problem()
+        if not problem and self.session.statistics.messages and (
+                self.session.statistics.age > SILENT):
+            problem = (f'{self._source.name} sends no samples: check the board, its cable and its '
+                       'program; the page continues when they arrive, and the poses are kept')
+        if bool(problem) != bool(self.exchange.problem):
+            self._log(Log('warning', problem) if problem else
+                      Log('info', f'{self._source.name} is back; continue with the next pose'))
+        self.exchange.problem = problem
 
     def _end(self, why: Log) -> None:
         """Show why no more samples come."""

@@ -72,6 +72,7 @@ _KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript',
 
 _HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
             'Referrer-Policy': 'no-referrer', 'Cache-Control': 'no-store',
+            'Cross-Origin-Resource-Policy': 'same-origin',
             'Content-Security-Policy': (
                 "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
                 "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -214,11 +215,11 @@ class PageServer:
         app.router.add_route('*', '/{path:.*}', self._answer)
         app.on_response_prepare.append(_secure)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
-        await runner.setup()
         try:
+            await runner.setup()
             site = web.TCPSite(runner, self._host, self._port)
             await site.start()
-        except OSError as error:
+        except Exception as error:  # `start` raises it, in its own thread
             await runner.cleanup()
             started.set_exception(error)
             return

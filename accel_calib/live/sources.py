@@ -11,8 +11,8 @@ them can do something else in between.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 import time
@@ -39,6 +39,9 @@ _PATIENCE_S = 10.0
 _LONGEST_LINE = 4096
 """Longest line of a port [bytes]."""
 
+_AGAIN_S = 1.0
+"""Interval between two attempts to open a port that was removed [s]."""
+
 _LONGEST_GAP_S = 5.0
 """Longer gaps in a recording are not waited for [s]."""
 
@@ -60,6 +63,8 @@ class Source:
         How they are read, in one line; empty if nothing is assumed.
     blocks : iterator of (n, 9) array
         The samples, as for `accel_calib.capture.StillDetector.push`. A block can be empty.
+    problem : callable
+        Function that returns why no samples come at present; empty if nothing is wrong.
 
     """
 
@@ -68,6 +73,7 @@ class Source:
     units: Units
     read_as: str
     blocks: Iterator[Floats]
+    problem: Callable[[], str] = str
 
 
 def is_port(name: str) -> bool:
@@ -102,10 +108,10 @@ def open_source(name: str, options: LogOptions, *, baud: int = 115200, speed: fl
 
     """
     if is_port(name):
-        with _opened_port(name, baud) as port:
-            lines = _lines(name, port)
-            reader = _understood(name, lines, options, baud)
-            yield Source(name, '', reader.units, reader.read_as, _arriving(reader, lines))
+        with closing(_Port(name, baud)) as port:
+            reader = _understood(name, port.lines(), options, baud)
+            yield Source(name, '', reader.units, reader.read_as,
+                         _arriving(reader, port.lines()), lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
         yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed))
@@ -148,37 +154,91 @@ def _rows(recording: Recording) -> Floats:
 
 # ----------------------------------------------------------------------------- a serial port
 
-@contextmanager
-def _opened_port(name: str, baud: int) -> Iterator[Any]:
-    try:
-        import serial
-    except ImportError as err:
-        raise InputError('pyserial is not installed, but a serial port needs it',
-                         "run pip install 'accel_calib[live]'") from err
-    try:
-        port = serial.serial_for_url(name, baudrate=baud, timeout=_WAIT_S)
-    except (serial.SerialException, ValueError) as err:
-        raise InputError(f'{name} cannot be opened: {err}', 'check its name, whether another '
-                         'program uses it, and your rights (on Linux: group dialout)') from err
-    try:
-        yield port
-    finally:
-        port.close()
+class _Port:
+    """
+    A serial port; it is opened again when it returns after it was removed.
 
+    Parameters
+    ----------
+    name : str
+        Device of the port, or its URL.
+    baud : int
+        Baud rate.
 
-def _lines(name: str, port: Any) -> Iterator[list[str]]:
-    """Yield complete lines from a port, or none after a moment."""
-    rest = b''
-    while True:
+    Attributes
+    ----------
+    problem : str
+        Why the port sends nothing at present; empty if it is open.
+
+    Raises
+    ------
+    InputError
+        If the port cannot be opened.
+
+    """
+
+    def __init__(self, name: str, baud: int) -> None:
+        self._name, self._baud = name, baud
+        self.problem = ''
+        self._port: Any = None
+        self._rest = b''
+        self._tried = time.monotonic()
+        self._open()
+
+    def close(self) -> None:
+        """Close the port."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def lines(self) -> Iterator[list[str]]:
+        """Yield complete lines, or none after a moment."""
+        while True:
+            *lines, rest = (self._rest + self._read()).split(b'\n')
+            self._rest = rest[-_LONGEST_LINE:]
+            yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
+                   for line in lines]
+
+    def _open(self) -> None:
         try:
-            data = port.read(port.in_waiting or 1)
-        except OSError as err:  # SerialException is one, too
-            raise InputError(f'{name} has ended: {err}', 'connect the sensor again, and start '
-                             'again') from err
-        *lines, rest = (rest + data).split(b'\n')
-        rest = rest[-_LONGEST_LINE:]
-        yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
-               for line in lines]
+            import serial
+        except ImportError as err:
+            raise InputError('pyserial is not installed, but a serial port needs it',
+                             "run pip install 'accel_calib[live]'") from err
+        try:
+            self._port = serial.serial_for_url(self._name, baudrate=self._baud, timeout=_WAIT_S)
+        except (OSError, ValueError) as err:  # SerialException is an OSError
+            raise InputError(f'{self._name} cannot be opened: {err}', 'check its name, whether '
+                             'another program uses it, and your rights (on Linux: group '
+                             'dialout)') from err
+
+    def _read(self) -> bytes:
+        """Return the bytes that have arrived; after a loss, try to open the port again."""
+        if self._port is None:
+            self._try_again()
+            return b''
+        try:
+            found: bytes = self._port.read(self._port.in_waiting or 1)
+        except OSError as err:
+            self.close()
+            self._rest = b''
+            self.problem = (f'{self._name} does not send any more ({err}): connect the sensor '
+                            'again; the page continues when it is back, and the poses are kept')
+            return b''
+        return found
+
+    def _try_again(self) -> None:
+        time.sleep(_WAIT_S)
+        if time.monotonic() - self._tried < _AGAIN_S:
+            return
+        self._tried = time.monotonic()
+        try:
+            self._open()
+        except InputError as err:
+            self.problem = (f'{err.message}: connect the sensor again; the page continues when '
+                            'it is back, and the poses are kept')
+        else:
+            self.problem = ''
 
 
 def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int
@@ -211,5 +271,17 @@ def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats
     if reader.first is not None:
         yield _rows(reader.first)
     for new in lines:
-        recording = reader.samples(new) if new else None
-        yield np.empty((0, 9)) if recording is None else _rows(recording)
+        yield from _rows_of(reader, new) if new else (np.empty((0, 9)),)
+
+
+def _rows_of(reader: LineReader, lines: list[str]) -> Iterator[Floats]:
+    """Yield the samples of lines; a line whose numbers are impossible is left out."""
+    try:
+        recording = reader.samples(lines)
+    except InputError:
+        if len(lines) > 1:  # a lost character can make a number too large
+            for line in lines:
+                yield from _rows_of(reader, [line])
+        return
+    if recording is not None:
+        yield _rows(recording)

@@ -156,6 +156,8 @@ class Plan:
         Median noise of the poses [g]; NaN if not known.
     coverage : float
         Share of the sphere within 45° of a pose.
+    zero : tuple of float
+        Approximate zero of native readings, before a fit; empty if it is not known.
 
     """
 
@@ -164,6 +166,7 @@ class Plan:
     up: Floats
     noise_g: float
     coverage: float
+    zero: tuple[float, ...] = ()
 
 
 class Guide:

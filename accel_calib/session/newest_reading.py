@@ -39,11 +39,13 @@ class NewestReading:
         self._units = units
         self._prepared: tuple[Calibration, OneReading] | None = None
 
-    def described(self, reading: Triple, calibration: Calibration | None, known: Known) -> Newest:
+    def described(self, reading: Triple, calibration: Calibration | None, known: Known,
+                  zero: tuple[float, ...] = ()) -> Newest:
         """
         Return direction and length of a reading.
 
-        Native readings have no known zero before a calibration, so they have no direction either.
+        Native readings have a direction only if their zero is known: from a calibration, or about
+        from the poses so far.
 
         Parameters
         ----------
@@ -53,6 +55,8 @@ class NewestReading:
             The calibration that corrects it.
         known : mapping
             Present context: time, and temperature with its lags if it is known.
+        zero : tuple of float, optional
+            Approximate zero of native readings before a calibration; empty if it is not known.
 
         """
         force = None if calibration is None else self._force(calibration, reading, known)
@@ -61,7 +65,8 @@ class NewestReading:
             length = math.hypot(*reading)
             return Newest(_unit(reading, length), length / self._units.per_g, corrected)
         if calibration is None or force is None:
-            return Newest()
+            parts = tuple(part - at for part, at in zip(reading, zero, strict=False))
+            return Newest(_unit(parts, math.hypot(*parts)))
         turned = (calibration.rotation @ force).tolist()
         return Newest(_unit(turned, corrected), corrected=corrected)
 

@@ -557,7 +557,9 @@ class Session:
         known = {'time': self.statistics.stamp, **self.active.temperatures.columns}
         if math.isfinite(self.statistics.temperature):
             known['temperature'] = self.statistics.temperature
-        return self._newest.described(reading, self.preview or self.active.calibration, known)
+        plan = self.guide.plan
+        return self._newest.described(reading, self.preview or self.active.calibration, known,
+                                      () if plan is None else plan.zero)
 
     def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:
         self._events.append(Log(severity, words, once_in))

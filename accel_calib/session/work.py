@@ -27,6 +27,7 @@ from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
 from ..effects import Context
 from ..errors import counted, listed, RefusedFitError
+from ..estimate.closed_form import fit_4
 from ..estimate.geometry import coverage, pose_noise
 from ..model import Model
 from ..rating import rate, rate_refinement
@@ -210,7 +211,14 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
         supposed = np.vstack([supposed, asked.direction])
         asked = next_pose(supposed, fitted_model)
     return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                coverage(up) if len(up) else 0.0)
+                coverage(up) if len(up) else 0.0, _zero(poses, units) if len(up) else ())
+
+
+def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
+    """Return the centre of native readings; empty for readings whose zero is known."""
+    if units.name != 'native':
+        return ()
+    return tuple(fit_4(poses.reading)[1].tolist())
 
 
 def summary(calibration: Calibration) -> str:

@@ -64,6 +64,9 @@ function takeProgress(now) {
   }
   hero.show(progress, state);
   if (progress.up.length) attitude.set(progress.up);
+  element('box-now').hidden = attitude.matrix === null;
+  text(element('now-words'), attitude.matrix ? 'now'
+    : 'How it is held now is known after about 4 poses. Hold it like the other box.');
   redraw = wanted.set(progress.direction) || redraw;
   ball.set(progress.direction, progress.up);
   chart.add(now.time, now.raw, now.corrected);
@@ -75,7 +78,8 @@ function takeState(now) {
   state = now;
   document.title = now.sensor ? `${now.sensor} – calibration` : 'Accelerometer calibration';
   text(element('sensor'), now.sensor || 'Accelerometer');
-  text(element('state'), now.source ? `${now.state} · ${now.source}` : now.state);
+  const words = withButtons(now.state);
+  text(element('state'), now.source ? `${words} · ${now.source}` : words);
   notice('problem', withButtons(now.problem));
   element('offer').hidden = !now.preview;
   text(element('offer-words'), now.rating ? `${now.rating.rating}: ${now.rating.reason}` : '');
