@@ -11,7 +11,8 @@ the sample of ``test/data/logs`` that it is::
     <!-- files: log.csv=esp32/counts.log -->
 
 ``<!-- status: 1 -->`` above a block states the exit status of its last command. The commands
-`OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py, test_watch.py and test_live_command.py run them.
+`OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py, test_watch.py and
+test_live_command.py run them.
 
 """
 

@@ -26,8 +26,8 @@ GROWTH = {'own': 6.0, 'worker': 6.0}
 Growth of a memory in the second round that is allowed [MB].
 
 A leak of 600 bytes for each message would be 6 MB. Smaller ones show only in an hour
-(docs/figures/long_run.md), because a process takes memory at many first times: `own` grew by 0.3 to
-3.3 MB. The second refinement of a worker process takes 3 MB more than the first one, and later
+(docs/figures/long_run.md), because a process takes memory at many first times: `own` grew by 0.3
+to 3.3 MB. The second refinement of a worker process takes 3 MB more than the first one, and later
 ones take no more.
 
 """
