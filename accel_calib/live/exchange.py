@@ -142,8 +142,8 @@ class Exchange:
         def done(success: bool, words: str) -> None:
             self._running.remove(name)
             self._log(Log('info' if success else 'warning', words))
+            self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
-            self.show_state()
 
         self._running.append(name)
         self._worker.do(command, done)

@@ -492,9 +492,8 @@ class _Viewer:
             self.abort()
 
     async def _send_new(self) -> None:
-        """Send the answers, the log lines, and the newest message of each kind."""
-        while self._answers:
-            await self._send(self._answers.popleft())
+        """Send the log lines, the newest message of each kind, and then the answers."""
+        answers = len(self._answers)  # later ones may be about a state that is not sent yet
         for number, text in self._server.lines_after(self._seen):
             await self._send(text)
             self._seen = number
@@ -503,6 +502,8 @@ class _Viewer:
             if newest is not None and newest[0] is not self._sent.get(kind):
                 self._sent[kind] = newest[0]
                 await self._send(newest[1])
+        for _ in range(answers):
+            await self._send(self._answers.popleft())
 
     async def _send(self, text: str) -> None:
         self._sending_since = asyncio.get_running_loop().time()
