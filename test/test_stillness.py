@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
-from accel_calib.capture.window import oscillation
+from accel_calib.capture.trend import oscillation
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 import numpy as np

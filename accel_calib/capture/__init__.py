@@ -6,8 +6,8 @@ From samples to still poses. The node and recordings use the same rule.
 
 `detector` is the entry point; it joins still chunks to dwells. `chunks` sums the samples over
 short intervals of header time, and `rule` decides whether the sensor is still in each chunk, from
-the arithmetic in `window`. `dwell` accumulates a dwell and accepts or rejects it. `poses` makes
-the pose table.
+the arithmetic in `window` and `trend`. `dwell` accumulates a dwell and accepts or rejects it.
+`poses` makes the pose table.
 
 """
 

@@ -5,7 +5,7 @@
 Dwells: still stretches, averaged and tested.
 
 Mean and standard deviation are those of all samples. The number of samples is divided by the
-excess of the noise of the mean (see `window`), so that std/√count is the noise of the mean along
+excess of the noise of the mean (see `trend`), so that std/√count is the noise of the mean along
 the force (see below). A short dwell is not enough to estimate the excess, which is a property
 of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
 excess. Samples that are rounded to steps cause an error of the mean. Averaging does not remove
@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from .chunks import chained, Chunks, CONTEXT, Records, summed, SUMS
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
-from .window import excess_of_means, Line, lines_through, strength_of, Trend
+from .trend import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
 
 FIGURES = np.dtype([

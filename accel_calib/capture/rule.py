@@ -45,16 +45,15 @@ from numpy.typing import NDArray
 
 from .chunks import blank, chained, Chunks, SUMS
 from .settings import CaptureSettings
+from .trend import oscillation, Trend
 from .window import (
     at_least,
     at_least_any,
     clipped,
     columns_of,
-    oscillation,
     rounding,
     Stretch,
     stretch,
-    Trend,
     windows,
 )
 from ..table import Floats

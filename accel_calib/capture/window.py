@@ -2,350 +2,34 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Windows over chunks: means, variances, slopes, oscillations, and lower limits of the variance.
-
-**Sliding sums.** Sums, maxima and slopes over sliding windows. The cost grows with the logarithm
-of the length.
-
-A window of length L is composed of windows of length 1, 2, 4, …. The result of a window therefore
-depends only on the values in the window, not on earlier values or on the division into blocks.
-
-**Slope.** With k = 0 … L-1 and t = k - (L-1)/2, the least squares slope is Σ t x / Σ t², computed
-from Σ x and Σ k x. The power of the residuals r and the product of neighbours are computed without
-the residuals, from Σ x² and Σ x x' (x' is the next value). With m the mean, T = Σ t x and b the
-slope:
-
-    Σ r²   = Σ x² - L m² - b T
-    Σ r r' = Σ x x' - m (2 Σ x - x_0 - x_L-1) + (L-1) m²
-             - b (2 T - (t_L-1 + 1)(x_L-1 - x_0)) + b² Σ t t'
-
-**Noise of a mean.** Noise of the mean of correlated samples, and significance of slopes.
-
-Both use the means of K consecutive cells of equal length (chunks, or joined chunks).
-
-**Slope.** Least squares over the cells: slope = Σ t x / Σ t², with t centred. For independent
-samples, a cell mean has the variance w = (variance of the samples) / (samples per cell), and the
-slope has the variance w / Σ t². For correlated samples this is multiplied by a factor estimated
-from the residuals r: their power over w, times (1 + ρ)/(1 - ρ) for a correlation ρ between
-neighbours (the sum of the correlations of an AR(1) process [1]_). Power and ρ are pooled over the
-axes, because K cells of one axis are too few. They are at least those of white noise.
-
-**Oscillation.** A frequency f explains the share Σ p² / Σ r² of the residuals r of the line. Here
-p is the least squares fit of a cos(2πft) + b sin(2πft), with a and b for each axis. The largest
-share over all f is near 1 if one frequency dominates (periodogram of Lomb and Scargle [4]_). Over
-36 cells of three axes it is about 0.14 for white noise, and about 0.3 for noise with a correlation
-time of two cells, because the spectrum of noise has no peak.
+Windows over chunks: means, variances, trends, and lower limits of the variance.
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
 
     e² = q² Σ_k exp(-4π² k² σ²/q²) / (2π² k²)                                 (1)
 
-and the mean variance v of the rounded samples is σ² + q²/12 - e² [3]_. So v determines σ and e².
+and the mean variance v of the rounded samples is σ² + q²/12 - e² [1]_. So v determines σ and e².
 For σ < 0.2 q the samples take two values at most, and v = q σ/√π. For a larger σ the first term of
 (1) is enough, and e² is found by iteration.
 
-**Mean.** The variance of the mean of a correlated series is the sum of its autocovariances divided
-by its length. Sample autocovariances at long lags are noise. The sum therefore ends where a pair
-Γ_j = γ_2j + γ_2j+1 is not positive (initial positive sequence, Geyer [2]_). Subtracting the mean
-removes the variance of the mean from each autocovariance; it is added again.
-
 References
 ----------
-.. [1] G. E. P. Box, G. M. Jenkins, G. C. Reinsel, Time Series Analysis, 3rd ed., section 2.1.
-.. [2] C. J. Geyer, Practical Markov Chain Monte Carlo, Statistical Science 7 (1992) 473-483.
-.. [3] B. Widrow, I. Kollár, Quantization Noise, Cambridge 2008, chapter 4.
-.. [4] J. D. Scargle, Studies in Astronomical Time Series Analysis II, Astrophysical Journal 263
-   (1982) 835-853.
+.. [1] B. Widrow, I. Kollár, Quantization Noise, Cambridge 2008, chapter 4.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import CHUNKS_PER_WINDOW, Records
+from .trend import lines, over_axes, sliding_max, sliding_sum, strength_of, Trend
 from ..table import Floats
-
-
-class Line(NamedTuple):
-    """
-    Least squares lines through windows, in units of one step.
-
-    Parameters
-    ----------
-    slope : (..., n) array
-        Slope per step.
-    square, neighbours : (..., n) array
-        Sums of the squared residuals, and of the products of neighbouring residuals.
-    time_square : float or array
-        Σ t².
-    length : int or array
-        Length of the windows.
-
-    """
-
-    slope: Floats
-    square: Floats
-    neighbours: Floats
-    time_square: float | Floats
-    length: int | Floats
-
-
-def sliding_sum(values: Floats, length: int) -> Floats:
-    """Return the sums over windows of this length along the last axis: (..., n - length + 1)."""
-    return _folded(values, length, np.add)
-
-
-def sliding_max(values: Floats, length: int) -> Floats:
-    """Return the maxima over windows of this length."""
-    return _folded(values, length, np.maximum)
-
-
-def lines(values: Floats, length: int) -> Line:
-    """Return the lines through all windows of this length, (axes, n - length + 1)."""
-    if values.shape[-1] == length:
-        centred = values - values.sum(axis=1, keepdims=True) / length
-        return lines_through(centred[:, np.newaxis], np.array([length]))
-    total, weighted = _weighted(values, length)
-    first, last = values[..., :1 - length], values[..., length - 1:]
-    square = sliding_sum(values * values, length)
-    product = sliding_sum(values[..., :-1] * values[..., 1:], length - 1)
-    time = np.arange(length) - 0.5 * (length - 1)
-    time_square = float(np.sum(time**2))
-    moment = weighted - 0.5 * (length - 1) * total
-    slope = moment / time_square
-    mean = total / length
-    # Relative to the mean: digits of a small noise on a large mean are lost only once.
-    square -= total * mean
-    square -= slope * moment
-    product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
-    product -= slope * (2.0 * moment - (time[-1] + 1.0) * (last - first))
-    product += slope * slope * float(np.sum(time[1:] * time[:-1]))
-    return Line(slope, np.maximum(square, 0.0), product, time_square,
-                length)
-
-
-def lines_through(centred: Floats, sizes: Floats) -> Line:
-    """
-    Return one line through each series.
-
-    Parameters
-    ----------
-    centred : (axes, k, K) array
-        Values of each series minus their mean, and 0 after the end of a series.
-    sizes : (k,) array
-        Lengths of the series.
-
-    """
-    index = np.arange(centred.shape[2])
-    inside = index < sizes[:, np.newaxis]
-    time = (index - 0.5 * (sizes[:, np.newaxis] - 1.0)) * inside
-    time_square = np.einsum('kt,kt->k', time, time)
-    slope = np.einsum('akt,kt->ak', centred, time) / time_square
-    left = centred - slope[:, :, np.newaxis] * time
-    return Line(slope, np.einsum('akt,akt->ak', left, left),
-                np.einsum('akt,akt->ak', left[:, :, 1:], left[:, :, :-1]), time_square, sizes)
-
-
-def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats]) -> Floats:
-    count = values.shape[-1] - length + 1
-    found: Floats | None = None
-    size, start = 1, 0
-    while True:
-        if length & size:
-            part = values[..., start:start + count]
-            found = part if found is None else fold(found, part)
-            start += size
-        if start == length:
-            return np.asarray(found)
-        values = fold(values[..., :-size], values[..., size:])
-        size *= 2
-
-
-def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
-    """Return the sums Σ x and Σ k x over the windows."""
-    count = values.shape[-1] - length + 1
-    weighted = np.zeros_like(values)
-    total_found = np.zeros((*values.shape[:-1], count))
-    found = np.zeros_like(total_found)
-    size, start = 1, 0
-    while True:
-        if length & size:
-            part = values[..., start:start + count]
-            found = found + weighted[..., start:start + count] + start * part
-            total_found = total_found + part
-            start += size
-        if start == length:
-            return total_found, found
-        weighted = weighted[..., :-size] + weighted[..., size:] + size * values[..., size:]
-        values = values[..., :-size] + values[..., size:]
-        size *= 2
-
-
-_FEWEST_PERIODS = 2.0
-"""Number of periods in a window below which a drift resembles an oscillation."""
-
-_BATCH = 4096
-"""Number of windows of which the oscillation is computed at a time, to bound the memory."""
-
-
-def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
-    """
-    Return the largest share of the residuals of the lines that one frequency explains.
-
-    Parameters
-    ----------
-    values : (axes, n) array
-        Values of the axes.
-    length : int
-        Length of the windows.
-    index : (m,) array of int
-        First value of each window.
-
-    Returns
-    -------
-    (m,) array
-        The shares, 0 to 1, over all axes together.
-
-    """
-    line, waves = _waves(length)
-    found = np.empty(len(index))
-    for start in range(0, len(index), _BATCH):
-        part = index[start:start + _BATCH, np.newaxis] + np.arange(length)
-        window = values[:, part]
-        window = window - window.mean(axis=2, keepdims=True)
-        window -= (window @ line)[..., np.newaxis] * line
-        power = np.sum((window @ waves)**2, axis=0).reshape(len(part), -1, 2).sum(axis=2)
-        found[start:start + _BATCH] = (power.max(axis=1)
-                                       / (np.sum(window**2, axis=(0, 2)) + _TINY))
-    return found
-
-
-@cache
-def _waves(length: int) -> tuple[Floats, Floats]:
-    """Return the unit line, and (length, 2 f) orthonormal pairs of waves of f frequencies."""
-    time = np.arange(length) - 0.5 * (length - 1)
-    smooth = np.column_stack([np.full(length, length**-0.5), time / np.sqrt(np.sum(time**2))])
-    found = []
-    for periods in np.arange(_FEWEST_PERIODS, 0.5 * length, 0.5):
-        angle = 2.0 * np.pi * periods / length * time
-        pair = np.column_stack([np.cos(angle), np.sin(angle)])
-        found.append(np.linalg.qr(pair - smooth @ (smooth.T @ pair))[0])
-    return smooth[:, 1], np.concatenate(found, axis=1)
-
-
-_CORRELATION_MAX = 0.9
-_TINY = 1e-300
-
-
-class Trend(NamedTuple):
-    """
-    A slope over cells, and its significance.
-
-    Parameters
-    ----------
-    slope : (3, ...) array
-        Slope in the unit of the cells per second.
-    strength : (...) array
-        Sum over the axes of (slope / its standard error)².
-    excess : (...) array
-        Ratio of the variance of a mean to that of white noise, at least 1.
-    error : (...) array
-        Standard error of the slope of the noisiest axis, for independent samples.
-
-    """
-
-    slope: Floats
-    strength: Floats
-    excess: Floats
-    error: Floats
-
-
-def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
-    """
-    Return slopes with their significance.
-
-    Parameters
-    ----------
-    line : Line
-        Lines through cells, (3, ...).
-    spacing : float or array
-        Time between cells [s].
-    white : (3, ...) array
-        Variance of a cell mean for independent samples.
-
-    """
-    size = line.length
-    white = white + _TINY
-    slope, weight = line.slope / spacing, 1.0 / white
-    square = _over_axes(line.square * weight)
-    neighbours = _over_axes(line.neighbours * weight)
-    correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
-    power = np.maximum(square / (3.0 * (size - 2)), 1.0)
-    excess = power * (1.0 + correlation) / (1.0 - correlation)
-    time_square = line.time_square * spacing**2
-    strength = _over_axes(slope * slope * weight) * time_square / excess
-    error = np.sqrt(np.maximum(np.maximum(white[0], white[1]), white[2]) / time_square)
-    return Trend(slope, strength, excess, error)
-
-
-def _over_axes(values: Floats) -> Floats:
-    return np.asarray(values[0] + values[1] + values[2])
-
-
-def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
-    """
-    Return the excess of each series: the variance of its mean over that of white noise.
-
-    Parameters
-    ----------
-    centred : (3, k, K) array
-        Means of consecutive cells minus their common mean, and 0 after the end of a series.
-    sizes : (k,) array
-        Lengths of the series.
-    white : (3, k) array
-        Variance of a cell mean for independent samples; axes with 0 are ignored.
-
-    Returns
-    -------
-    (k,) array
-        The excess; 1 for a series of fewer than 4 cells.
-
-    """
-    axes = white > 0.0
-    scaled = centred / np.sqrt(np.where(axes, white, np.inf))[:, :, np.newaxis]
-    covariance = _autocovariance(scaled, sizes, np.maximum(axes.sum(axis=0), 1))
-    found = _long_run(covariance, sizes)
-    return np.where(axes.any(axis=0) & (sizes >= 4), found, 1.0)
-
-
-def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
-    """Return (k, lags) autocovariances, by a Fourier transform with zero padding."""
-    length = centred.shape[2]
-    padded = 1 << (2 * length - 1).bit_length()
-    power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)
-    lags = np.arange(max(length // 2, 2))
-    terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0)
-    return np.asarray(np.fft.irfft(power, padded, axis=1)[:, lags]
-                      / (terms * axes[:, np.newaxis]))
-
-
-def _long_run(covariance: Floats, sizes: Floats) -> Floats:
-    pairs = covariance[:, 0:-1:2] + covariance[:, 1::2]
-    usable = np.arange(pairs.shape[1]) < (sizes // 2 // 2)[:, np.newaxis]
-    kept = np.logical_and.accumulate((pairs > 0.0) & usable, axis=1)
-    found = 2.0 * np.sum(np.where(kept, pairs, 0.0), axis=1) - covariance[:, 0]
-    lost = (4.0 * kept.sum(axis=1) - 1.0) / sizes
-    return np.asarray(np.maximum(found, 0.0) / np.maximum(1.0 - lost, 0.25))
-
 
 RELATIVE = 1e-6
 """Smallest ratio of standard deviation to reading, for data without noise."""
@@ -453,14 +137,14 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
     square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
     white += _DIGITS * square.repeat(3, axis=0)
     line = lines(cells, length)
-    scatter = _over_axes(line.square) / length
+    scatter = over_axes(line.square) / length
     line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
                          neighbours=_grouped(line.neighbours))
     found = strength_of(line, spacing, _grouped(white))
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
     return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
-                   cells[:3], scatter, _over_axes(white))
+                   cells[:3], scatter, over_axes(white))
 
 
 def _grouped(values: Floats) -> Floats:
