@@ -181,7 +181,7 @@ class _Port:
         self._name, self._baud = name, baud
         self.problem = ''
         self._port: Any = None
-        self._rest = b''
+        self._rest, self._is_cut = b'', True
         self._tried = time.monotonic()
         self._open()
 
@@ -192,10 +192,12 @@ class _Port:
             self._port = None
 
     def lines(self) -> Iterator[list[str]]:
-        """Yield complete lines, or none after a moment."""
+        """Yield complete lines, or none after a moment; the first one, maybe cut, is left out."""
         while True:
             *lines, rest = (self._rest + self._read()).split(b'\n')
             self._rest = rest[-_LONGEST_LINE:]
+            if lines and self._is_cut:
+                lines, self._is_cut = lines[1:], False
             yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
                    for line in lines]
 
@@ -221,7 +223,7 @@ class _Port:
             found: bytes = self._port.read(self._port.in_waiting or 1)
         except OSError as err:
             self.close()
-            self._rest = b''
+            self._rest, self._is_cut = b'', True
             self.problem = (f'{self._name} does not send any more ({err}): connect the sensor '
                             'again; the page continues when it is back, and the poses are kept')
             return b''
@@ -248,11 +250,10 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
     begin = tried = time.monotonic()
     problem = InputError(f'{name} sends no lines, expected one line for each sample',
                          'check the sensor and its program')
-    first = True
     for new in lines:
         now = time.monotonic()
-        if new and first:  # it can be cut
-            new, first, begin, tried = new[1:], False, now, now
+        if new and not head:
+            begin = tried = now
         head += new
         if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES:
             tried = now

@@ -30,7 +30,7 @@ class LineReader:
     name : str
         Name of the port, for messages.
     head : sequence of str
-        The first lines. The very first one should be left out, because it can be cut.
+        The first complete lines.
     seconds : float
         Time in which they arrived, for lines without times [s].
     options : LogOptions
