@@ -22,6 +22,8 @@ from accel_calib.session.store import MOST_STEPS
 
 _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
 _FEWEST = 4
+_UNCHANGED = 'offset by (+0.00, +0.00, +0.00) mg, gain by up to 0.000 %, mounting by 0.00°'
+_DATE_S = 1.0  # resolution of the date of a calibration
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,10 @@ class Call:
 
 @dataclass(frozen=True)
 class Made:
-    """A calibration: the number of the call that made it, and what the call made of it."""
+    """A calibration: number and end of the call that made it, and what the call made of it."""
 
     number: int
-    by: str
+    ended: float
     levelled: bool
     full: bool
 
@@ -93,9 +95,10 @@ def _new(state: State, call: Call, number: int) -> Iterator[State]:
             call.name == 'set_heading' and not kept):
         return
     full = fits or (before is not None and before.full)
-    yield _with_step(state, Made(number, call.name, kept or not fits, full))
-    if not fits and state.used == state.stored is not None and state.stored.by == call.name:
-        yield state  # the same rest again
+    yield _with_step(state, Made(number, call.ended, kept or not fits, full))
+    if state.used == state.stored is not None and _UNCHANGED in call.words and not (
+            fits and call.begun - state.stored.ended > _DATE_S):
+        yield state  # the same rest or poses again: an equal file is not a step
 
 
 def _save(state: State, call: Call, number: int) -> Iterator[State]:
