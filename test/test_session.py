@@ -289,6 +289,22 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert 'dropped 1 message of another sensor' in driver.finding('stream').words
 
 
+@pytest.mark.parametrize('units, per_g', [('native', 16384.0), ('m/s2', 9.80665)])
+def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
+        units: str, per_g: float) -> None:
+    driver, shown = Driver(units=units), []
+    time = np.arange(600) / RATE
+    noise = 0.002 * np.random.default_rng(1).normal(size=(len(time), 3))
+    turn, lean = 0.8 * time, 0.3 * np.sin(0.5 * time)
+    up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
+    for block in np.array_split((up + noise) * per_g, 120):
+        driver.feed(block)
+        shown.append(driver.session.progress().still)
+    assert not any(shown)
+    driver.feed((np.array([0.6, 0.0, 0.8]) + noise[:150]) * per_g)
+    assert driver.session.progress().still
+
+
 def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
         home: Path, readings: Readings) -> None:
     driver = Driver()

@@ -409,7 +409,7 @@ class Commands:
             return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
                               'hold the sensor still; if it is still, restart the node with the '
                               'right units')
-        if not session.live.detector.still:
+        if not session.live.still:
             return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
                               'check ~/still')
         return InputError(f'the sensor has been still for less than {least:g} s',

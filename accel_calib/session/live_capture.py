@@ -258,6 +258,17 @@ class LiveCapture:
         self._looked = self._known_until = self._was_still = 0.0
         self._judged_at = float('inf')
 
+    @property
+    def still(self) -> bool:
+        """
+        Return whether the sensor is still.
+
+        Before the first rest, the noise of the sensor is not known, and motion can be taken for
+        noise. The first rest must therefore be as long as a pose.
+
+        """
+        return self.detector.still and self._rest is not None
+
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
         Add samples, and yield the changes, each before the next samples are added.

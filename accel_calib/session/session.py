@@ -244,7 +244,7 @@ class Session:
     def _report_still(self) -> None:
         # Without messages, or without a clock, nobody knows whether the sensor rests.
         blind = max(self.statistics.age, self.statistics.stopped) > SILENT
-        if (self.live.detector.still and not blind) is not self._still:
+        if (self.live.still and not blind) is not self._still:
             self._still = not self._still
             self._still_since = self.statistics.stamp - self.settings.still_window
             self._events.append(Still(self._still))
@@ -578,7 +578,7 @@ class Session:
         breaks = detector.interruptions
         rest_ago = math.nan
         if active.rest is not None:
-            rest_ago = 0.0 if detector.still else max(
+            rest_ago = 0.0 if self.live.still else max(
                 0.0, self.statistics.stamp - active.rest.end)
         return Health(
             sensor=self.sensor, state=self._state(), problem=self.problem, topic=self.topic,
