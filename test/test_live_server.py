@@ -16,7 +16,8 @@ import time
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.live import messages, server
+from accel_calib.live import link, messages, server
+from accel_calib.live import viewer as live_viewer
 from accel_calib.live.host import Host
 from accel_calib.session import CalibratorSettings, Log
 from accel_calib.simulate import model_with, simulate_recording
@@ -303,6 +304,27 @@ def test_the_seventeenth_viewer_is_refused_until_another_ends(bench: Bench) -> N
     assert all(viewer.code is None for viewer in viewers[1:])
 
 
+def test_viewers_without_the_token_do_not_keep_its_owner_out(bench: Bench) -> None:
+    guests = [bench.viewer(token='') for _ in range(16)]
+    owners = [bench.viewer() for _ in range(2)]
+    assert [owner.got[0]['may'] for owner in owners] == [True, True]
+    wait(lambda: guests[0].code is not None and guests[1].code is not None)
+    assert all(guest.code is None for guest in guests[2:])
+    assert bench.viewer(token='').code == 1013
+
+
+def test_connections_that_say_nothing_do_not_keep_anybody_out(bench: Bench) -> None:
+    silent = [socket.create_connection(('127.0.0.1', bench.port)) for _ in range(40)]
+    for each in silent:
+        each.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\n'
+                      'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+                      'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n').encode())
+        assert b'101' in each.recv(100)
+    assert bench.viewer().got[0]['may']
+    for each in silent:
+        each.close()
+
+
 def test_a_viewer_that_comes_back_gets_the_lines_it_missed(bench: Bench) -> None:
     viewer = bench.viewer()
     wait(lambda: viewer.of('log'))
@@ -341,7 +363,7 @@ def test_a_command_that_runs_is_not_begun_again(turned: Bench) -> None:
 
 def test_a_stuck_viewer_is_closed_and_the_others_go_on(
         bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, '_STUCK_S', 1.0)
+    monkeypatch.setattr(live_viewer, 'STUCK_S', 1.0)
     other = bench.viewer()
     with socket.socket() as stuck:
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -365,7 +387,7 @@ def masked(text: bytes) -> bytes:
 
 
 def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, '_HELLO_S', 0.3)
+    monkeypatch.setattr(live_viewer, '_HELLO_S', 0.3)
     with socket.create_connection(('127.0.0.1', bench.port)) as silent:
         silent.sendall(f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\nUpgrade: websocke'
                        't\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
@@ -429,7 +451,7 @@ def test_numbers_that_are_not_known_are_null() -> None:
 
 
 def test_the_link_names_a_reachable_address() -> None:
-    assert server._reachable('127.0.0.1') == '127.0.0.1'
-    assert server._reachable('robot.local') == 'robot.local'
-    assert server._reachable('0.0.0.0') not in ('0.0.0.0', '')
-    assert '█' in server.qr_code('http://127.0.0.1:8080/#abc')
+    assert link.reachable('127.0.0.1') == '127.0.0.1'
+    assert link.reachable('robot.local') == 'robot.local'
+    assert link.reachable('0.0.0.0') not in ('0.0.0.0', '')
+    assert '█' in link.qr_code('http://127.0.0.1:8080/#abc')

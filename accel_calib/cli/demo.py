@@ -12,7 +12,7 @@ from typing import Any, TYPE_CHECKING
 from . import options
 from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
-from ..live.server import check_installed
+from ..live.link import check_installed
 
 if TYPE_CHECKING:
     from rich.table import Table

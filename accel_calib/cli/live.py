@@ -12,7 +12,7 @@ import sys
 from . import options
 from .terminal import ended, Output
 from ..live.host import Host
-from ..live.server import check_installed, qr_code
+from ..live.link import check_installed, qr_code
 from ..live.sources import open_source, Source
 from ..session import CalibratorSettings
 

@@ -4,13 +4,11 @@
 """
 The server of the live page, on its own thread with its own event loop.
 
-**Viewers.** Each viewer has a task that sends what is new for it: the newest progress, poses and
-state, and the log lines that it does not have. Nothing is queued for a viewer. One that takes no
-data misses progress, and is closed after `_STUCK_S`; a viewer that comes back gets the rest.
-
 **Who may.** Everybody who reaches the server can look. Commands and exports need the token in the
-fragment of the link, which browsers do not send. Host and Origin are checked, so that a page of
-another site cannot use the server through the browser of a user. Files come from a fixed list.
+fragment of the link, which browsers do not send. If there are too many viewers, one with the token
+takes the place of one without it, so that nobody can keep its owner out. Host and Origin are
+checked, so that a page of another site cannot use the server through the browser of a user. Files
+come from a fixed list.
 
 """
 
@@ -20,13 +18,10 @@ import asyncio
 from base64 import b64encode
 from collections import deque
 from concurrent.futures import Future
-import errno
 from hashlib import sha256
 import hmac
 from importlib.resources import files
-import io
 from ipaddress import ip_address
-import math
 import secrets
 import socket
 from threading import Thread
@@ -34,7 +29,8 @@ from typing import Any, Protocol, TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from . import messages
-from ..errors import InputError
+from .link import check_installed, not_bound, reachable
+from .viewer import STUCK_S, TooManyError, Viewer
 from ..files.exports import Exported, FORMATS
 from ..report.sheet import SCRIPT
 from ..session.worker import Answer
@@ -46,7 +42,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 _VIEWERS = 16
-"""Largest number of viewers, and of commands of a viewer that wait for their answers."""
+"""Largest number of viewers, and of connections that have not said hello yet."""
 
 _LINES = 500
 """Number of log lines that are kept."""
@@ -57,14 +53,8 @@ _RATE_HZ = 20
 _RARELY_S = 0.2
 """Interval at which the server looks for viewers while there is none [s]."""
 
-_STUCK_S = 10.0
-"""Time after which a viewer that takes no data, or does not answer, is closed [s]."""
 
-_HELLO_S = 5.0
-"""Time within which a new viewer must say hello [s]."""
 
-_BUFFER = 65536
-"""Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
 
 _KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript',
           '.svg': 'image/svg+xml', '.png': 'image/png'}
@@ -125,8 +115,8 @@ class PageServer:
     ----------
     token : str
         What commands and exports need.
-    viewers : set of _Viewer
-        The viewers.
+    viewers : list of Viewer
+        The viewers that have said hello, the oldest first.
 
     Raises
     ------
@@ -146,7 +136,8 @@ class PageServer:
         self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
         self._history: deque[messages.Message] = deque(
             maxlen=int(messages.HISTORY_S * _RATE_HZ))
-        self.viewers: set[_Viewer] = set()
+        self.viewers: list[Viewer] = []
+        self._new: list[Viewer] = []
         self._hosts: frozenset[str] = frozenset()
         self._versions: frozenset[int] = frozenset()
         page = files(__package__) / 'page'
@@ -175,7 +166,7 @@ class PageServer:
             started.result()
         except OSError as error:
             self._thread.join()
-            raise _not_bound(error, self._host, self._port) from error
+            raise not_bound(error, self._host, self._port) from error
 
     def close(self) -> None:
         """Close all viewers, and stop serving."""
@@ -194,7 +185,7 @@ class PageServer:
     @property
     def link(self) -> str:
         """Address of the page with the token, for a browser."""
-        host = _reachable(self._host)
+        host = reachable(self._host)
         return f'http://{f"[{host}]" if ":" in host else host}:{self._port}/#{self.token}'
 
     def _call(self, function: Callable[[], object]) -> None:
@@ -228,7 +219,7 @@ class PageServer:
         started.set_result(None)
         self._look()
         await self._over.wait()
-        for viewer in list(self.viewers):
+        for viewer in [*self.viewers, *self._new]:
             viewer.abort()
         await runner.cleanup()
 
@@ -278,10 +269,6 @@ class PageServer:
         if not self._lines or self._lines[-1][0] <= number:
             return []
         return [line for line in self._lines if line[0] > number]
-
-    def why_not(self, token: str) -> str:
-        """Return why commands are not accepted with this token; empty if they are."""
-        return '' if self._is_token(token) else _WRONG_TOKEN if token else _NO_TOKEN
 
     def welcome(self, why: str) -> str:
         """Return the answer to ``hello``; the parameter is as in `messages.welcome`."""
@@ -371,172 +358,54 @@ class PageServer:
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         """Serve a viewer until it ends."""
-        from aiohttp import web, WSCloseCode
+        from aiohttp import web
         socket_ = web.WebSocketResponse(
-            heartbeat=_STUCK_S / 1.5, max_msg_size=messages.LARGEST, compress=False)
+            heartbeat=STUCK_S / 1.5, max_msg_size=messages.LARGEST, compress=False)
         await socket_.prepare(request)
-        if len(self.viewers) >= _VIEWERS:
-            await socket_.close(code=WSCloseCode.TRY_AGAIN_LATER, message=(
-                f'{_VIEWERS} viewers are connected already; close one of them').encode())
-            return socket_
-        viewer = _Viewer(self, socket_, request)
-        self.viewers.add(viewer)
+        viewer = Viewer(self, socket_, request)
+        if len(self._new) >= _VIEWERS:
+            self._close(self._new[0])
+        self._new.append(viewer)
         try:
             await viewer.run()
         finally:
-            self.viewers.discard(viewer)
+            self._forget(viewer)
         return socket_
+
+    def _close(self, viewer: Viewer) -> None:
+        """Close a viewer in favour of another one."""
+        viewer.abort()
+        self._forget(viewer)
+
+    def _forget(self, viewer: Viewer) -> None:
+        for each in (self._new, self.viewers):
+            if viewer in each:
+                each.remove(viewer)
+
+    def admit(self, viewer: Viewer, token: str) -> None:
+        """
+        Admit a viewer that has said hello, and set why it only looks.
+
+        Raises
+        ------
+        TooManyError
+            If there are too many viewers, and none without the token if this one has it.
+
+        """
+        viewer.why = '' if self._is_token(token) else _WRONG_TOKEN if token else _NO_TOKEN
+        if len(self.viewers) >= _VIEWERS:
+            guests = [each for each in self.viewers if each.why]
+            if viewer.why or not guests:
+                raise TooManyError(f'{_VIEWERS} viewers are connected already', 'close one of '
+                                   'them')
+            self._close(guests[0])
+        self._forget(viewer)
+        self.viewers.append(viewer)
 
     def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:
         """Ask the desk, and call `answer` in this thread."""
         self._desk.ask(command, lambda success, words: self._call(
             lambda: answer(success, words)))
-
-
-class _Viewer:
-    """
-    A viewer.
-
-    Parameters
-    ----------
-    server : PageServer
-        The server.
-    websocket : WebSocketResponse
-        Its connection.
-    request : Request
-        The request that opened it.
-
-    """
-
-    def __init__(self, server: PageServer, websocket: Any, request: web.Request) -> None:
-        self._server, self._socket, self._transport = server, websocket, request.transport
-        self._sent: dict[str, messages.Message] = {}
-        self._answers: deque[str] = deque()
-        self._seen = 0
-        self._why, self._asking = _NO_TOKEN, 0
-        self._news = asyncio.Event()
-        self._sending_since = math.inf
-        raw = None if self._transport is None else self._transport.get_extra_info('socket')
-        if raw is not None:
-            raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-
-    def wake(self) -> None:
-        """Note that there is something new."""
-        self._news.set()
-
-    def abort_if_stuck(self, now: float) -> None:
-        """End the connection if it has taken no data for too long; `now` is of the loop [s]."""
-        if now - self._sending_since > _STUCK_S:
-            self.abort()
-
-    def abort(self) -> None:
-        """End the connection without waiting."""
-        if self._transport is not None:
-            self._transport.abort()
-
-    async def run(self) -> None:
-        """Serve the viewer until it ends."""
-        from aiohttp import WSCloseCode
-        sending: asyncio.Task[None] | None = None
-        try:
-            hello = await self._next(_HELLO_S)
-            if isinstance(hello, messages.Hello):
-                sending = asyncio.create_task(self._send_all(hello))
-                while request := await self._next(None):
-                    if isinstance(request, messages.Ask):
-                        self._ask(request)
-        except InputError as error:
-            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
-                                     message=str(error).encode())
-        except asyncio.TimeoutError:
-            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
-                                     message=b'no hello came; load the page again')
-        finally:
-            if sending is not None:
-                sending.cancel()
-
-    async def _next(self, timeout: float | None) -> messages.Hello | messages.Ask | None:
-        """Return the next message of the viewer; None: it has ended."""
-        from aiohttp import WSMsgType
-        message = await self._socket.receive(timeout=timeout)
-        return messages.request_of(message.data) if message.type is WSMsgType.TEXT else None
-
-    def _ask(self, request: messages.Ask) -> None:
-        """Run a command, if the viewer may."""
-        def answer(success: bool, words: str) -> None:
-            self._asking -= 1
-            self._answers.append(messages.text_of(messages.answer(request.id, success, words)))
-            self.wake()
-
-        if self._asking + len(self._answers) >= _VIEWERS:
-            raise InputError(f'{_VIEWERS} commands wait for their answers', 'load the page again')
-        self._asking += 1
-        if self._why:
-            answer(False, self._why)
-        elif request.command not in messages.COMMANDS:
-            answer(False, f'the page asks for {request.command[:40]!r}, expected one of '
-                   f'{", ".join(messages.COMMANDS)}; load the page again')
-        else:
-            self._server.ask(request.command, answer)
-
-    async def _send_all(self, hello: messages.Hello) -> None:
-        """Send what is new, until the viewer ends or takes no data."""
-        self._why, self._seen = self._server.why_not(hello.token), hello.seen
-        try:
-            await self._send(self._server.welcome(self._why))
-            while True:
-                self._news.clear()
-                await self._send_new()
-                await self._news.wait()
-        except ConnectionError:
-            self.abort()
-
-    async def _send_new(self) -> None:
-        """Send the log lines, the newest message of each kind, and then the answers."""
-        answers = len(self._answers)  # later ones may be about a state that is not sent yet
-        for number, text in self._server.lines_after(self._seen):
-            await self._send(text)
-            self._seen = number
-        for kind in ('state', 'poses', 'progress'):
-            newest = self._server.newest(kind)
-            if newest is not None and newest[0] is not self._sent.get(kind):
-                self._sent[kind] = newest[0]
-                await self._send(newest[1])
-        for _ in range(answers):
-            await self._send(self._answers.popleft())
-
-    async def _send(self, text: str) -> None:
-        self._sending_since = asyncio.get_running_loop().time()
-        await self._socket.send_str(text)  # waits only if the buffers are full
-        self._sending_since = math.inf
-
-
-def check_installed() -> None:
-    """
-    Check that aiohttp is installed.
-
-    Raises
-    ------
-    InputError
-        If it is not.
-
-    """
-    try:
-        import aiohttp  # noqa: F401
-    except ImportError as error:
-        raise InputError('aiohttp is not installed, but the live page needs it',
-                         "run pip install 'accel_calib[live]'") from error
-
-
-def qr_code(link: str) -> str:
-    """Return a link as a QR code for a terminal; empty if segno is not installed."""
-    try:
-        import segno
-    except ImportError:
-        return ''
-    drawn = io.StringIO()
-    segno.make(link, micro=False).terminal(out=drawn, compact=True)
-    return drawn.getvalue()
 
 
 async def _secure(request: web.Request, response: web.StreamResponse) -> None:
@@ -548,31 +417,3 @@ async def _secure(request: web.Request, response: web.StreamResponse) -> None:
 def _kind_of(name: str) -> str:
     """Return the type of a file of the page; empty for other files."""
     return _KINDS.get(f'.{name.rpartition(".")[2]}', '')
-
-
-def _not_bound(error: OSError, host: str, port: int) -> InputError:
-    """Return the error for an address that cannot be used."""
-    if error.errno == errno.EADDRINUSE:
-        return InputError(f'the port {port} of {host} is in use, so there is no live page',
-                          'stop the other program, or choose another port')
-    return InputError(f'the live page cannot be served at {host}, port {port}: '
-                      f'{error.strerror or error}', 'choose an address of this machine, and a '
-                      'port above 1023')
-
-
-def _reachable(host: str) -> str:
-    """Return an address for a link: that of the network if the server listens everywhere."""
-    try:
-        address = ip_address(host)
-    except ValueError:
-        return host
-    if not address.is_unspecified:
-        return host
-    family, outside = ((socket.AF_INET, '192.0.2.1') if address.version == 4
-                       else (socket.AF_INET6, '2001:db8::1'))
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect((outside, 9))  # sends nothing, but chooses the interface
-        except OSError:
-            return socket.gethostname()
-        return str(probe.getsockname()[0])

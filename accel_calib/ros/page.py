@@ -63,7 +63,8 @@ class Page:
         if not settings.web_port:
             return
         from ..live.exchange import Exchange, PERIOD
-        from ..live.server import PageServer, qr_code
+        from ..live.link import qr_code
+        from ..live.server import PageServer
         exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
                             self._stream.flush)
         try:

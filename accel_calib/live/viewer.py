@@ -1,0 +1,169 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A viewer of the live page: a WebSocket connection.
+
+A task of the viewer sends what is new for it: the newest progress, poses and state, the log lines
+that it does not have, and the answers to its commands. Nothing else is queued. A viewer that takes
+no data misses progress, and is closed after `STUCK_S`; a viewer that comes back gets the rest.
+
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+import math
+import socket
+from typing import Any, TYPE_CHECKING
+
+from . import messages
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from aiohttp import web
+
+    from .server import PageServer
+
+STUCK_S = 10.0
+"""Time after which a viewer that takes no data, or does not answer, is closed [s]."""
+
+_HELLO_S = 5.0
+"""Time within which a new viewer must say hello [s]."""
+
+_COMMANDS = 16
+"""Largest number of commands of a viewer that wait for their answers."""
+
+_BUFFER = 65536
+"""Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
+
+
+class TooManyError(InputError):
+    """There are too many viewers."""
+
+
+class Viewer:
+    """
+    A viewer.
+
+    Parameters
+    ----------
+    server : PageServer
+        The server.
+    websocket : WebSocketResponse
+        Its connection.
+    request : Request
+        The request that opened it.
+
+    Attributes
+    ----------
+    why : str
+        Why it only looks; empty: its commands are accepted. Set when it is admitted.
+
+    """
+
+    def __init__(self, server: PageServer, websocket: Any, request: web.Request) -> None:
+        self._server, self._socket, self._transport = server, websocket, request.transport
+        self._sent: dict[str, messages.Message] = {}
+        self._answers: deque[str] = deque()
+        self._seen = 0
+        self.why, self._asking = '', 0
+        self._news = asyncio.Event()
+        self._sending_since = math.inf
+        raw = None if self._transport is None else self._transport.get_extra_info('socket')
+        if raw is not None:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+
+    def wake(self) -> None:
+        """Note that there is something new."""
+        self._news.set()
+
+    def abort_if_stuck(self, now: float) -> None:
+        """End the connection if it has taken no data for too long; `now` is of the loop [s]."""
+        if now - self._sending_since > STUCK_S:
+            self.abort()
+
+    def abort(self) -> None:
+        """End the connection without waiting."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    async def run(self) -> None:
+        """Serve the viewer until it ends."""
+        from aiohttp import WSCloseCode
+        sending: asyncio.Task[None] | None = None
+        try:
+            hello = await self._next(_HELLO_S)
+            if isinstance(hello, messages.Hello):
+                self._seen = hello.seen
+                self._server.admit(self, hello.token)
+                sending = asyncio.create_task(self._send_all())
+                while request := await self._next(None):
+                    if isinstance(request, messages.Ask):
+                        self._ask(request)
+        except TooManyError as error:
+            await self._socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=str(error).encode())
+        except InputError as error:
+            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
+                                     message=str(error).encode())
+        except asyncio.TimeoutError:
+            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
+                                     message=b'no hello came; load the page again')
+        finally:
+            if sending is not None:
+                sending.cancel()
+
+    async def _next(self, timeout: float | None) -> messages.Hello | messages.Ask | None:
+        """Return the next message of the viewer; None: it has ended."""
+        from aiohttp import WSMsgType
+        message = await self._socket.receive(timeout=timeout)
+        return messages.request_of(message.data) if message.type is WSMsgType.TEXT else None
+
+    def _ask(self, request: messages.Ask) -> None:
+        """Run a command, if the viewer may."""
+        def answer(success: bool, words: str) -> None:
+            self._asking -= 1
+            self._answers.append(messages.text_of(messages.answer(request.id, success, words)))
+            self.wake()
+
+        if self._asking + len(self._answers) >= _COMMANDS:
+            raise InputError(f'{_COMMANDS} commands wait for their answers', 'load the page again')
+        self._asking += 1
+        if self.why:
+            answer(False, self.why)
+        elif request.command not in messages.COMMANDS:
+            answer(False, f'the page asks for {request.command[:40]!r}, expected one of '
+                   f'{", ".join(messages.COMMANDS)}; load the page again')
+        else:
+            self._server.ask(request.command, answer)
+
+    async def _send_all(self) -> None:
+        """Send what is new, until the viewer ends or takes no data."""
+        try:
+            await self._send(self._server.welcome(self.why))
+            while True:
+                self._news.clear()
+                await self._send_new()
+                await self._news.wait()
+        except ConnectionError:
+            self.abort()
+
+    async def _send_new(self) -> None:
+        """Send the log lines, the newest message of each kind, and then the answers."""
+        answers = len(self._answers)  # later ones may be about a state that is not sent yet
+        for number, text in self._server.lines_after(self._seen):
+            await self._send(text)
+            self._seen = number
+        for kind in ('state', 'poses', 'progress'):
+            newest = self._server.newest(kind)
+            if newest is not None and newest[0] is not self._sent.get(kind):
+                self._sent[kind] = newest[0]
+                await self._send(newest[1])
+        for _ in range(answers):
+            await self._send(self._answers.popleft())
+
+    async def _send(self, text: str) -> None:
+        self._sending_since = asyncio.get_running_loop().time()
+        await self._socket.send_str(text)  # waits only if the buffers are full
+        self._sending_since = math.inf
