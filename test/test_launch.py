@@ -20,7 +20,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from accel_calib.session.settings import CalibratorSettings, default_of
+from accel_calib.session.settings import CalibratorSettings, default_of, WEB_PORT
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -286,7 +286,7 @@ def test_each_parameter_argument_sets_a_parameter_of_its_type(name: str, started
 
 
 def test_web_serves_the_live_page(started: Any) -> None:
-    assert started(web='true').node.values() == {'web_port': 8080}
+    assert started(web='true').node.values() == {'web_port': WEB_PORT}
     assert started(web='true', web_port='9000').node.values() == {'web_port': 9000}
     assert started(web_port='9000').node.values() == {}
     assert DEFAULTS['web_port'] == 0
@@ -343,7 +343,7 @@ def test_two_imus_have_their_own_topics_and_share_the_thermometer(started: Any) 
 def test_two_imus_have_live_pages_at_different_ports(started: Any) -> None:
     path = ROOT / 'launch' / 'two_imus.launch.py'
     assert [node.values() for node in started(path, web='true').nodes] == [
-        {'web_port': 8080}, {'web_port': 8081}]
+        {'web_port': WEB_PORT}, {'web_port': WEB_PORT + 1}]
 
 
 @pytest.mark.parametrize('namespace', ['', 'robot'])

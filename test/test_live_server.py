@@ -435,7 +435,7 @@ def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) 
     try:
         viewer = bench.viewer()
         wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
-        assert 'the port has ended' in viewer.state['problem']
+        wait(lambda: 'the port has ended' in viewer.state['problem'])
         assert not viewer.ask('fit')['success']
     finally:
         bench.close()

@@ -289,7 +289,7 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert 'dropped 1 message of another sensor' in driver.finding('stream').words
 
 
-@pytest.mark.parametrize('units, per_g', [('native', 16384.0), ('m/s2', 9.80665)])
+@pytest.mark.parametrize(('units', 'per_g'), [('native', 16384.0), ('m/s2', 9.80665)])
 def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
         units: str, per_g: float) -> None:
     driver, shown = Driver(units=units), []

@@ -13,6 +13,7 @@ from . import options
 from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
 from ..live.link import check_installed
+from ..session import WEB_PORT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -24,9 +25,6 @@ _EXAMPLE = 'accel-calib demo --hidden temperature'
 HIDDEN = ('temperature', 'temperature-lag', 'gain-temperature', 'quadratic')
 """What the sensor can hide; `accel_calib.ros.demo_hidden` has the effects."""
 
-_WEB_PORT = 8080
-"""Port of the live page."""
-
 CHECK_FAILED = 1
 """Exit status if the effect is not found, or the error does not shrink."""
 
@@ -37,7 +35,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('--hidden', choices=HIDDEN, help='let the sensor hide this effect, and show '
                       'that ~/refine finds it and that the corrected topic gets better')
     made.add_argument('--web', action='store_true', help='calibrate on the live page instead, '
-                      f'at port {_WEB_PORT}, until Ctrl-C')
+                      f'at port {WEB_PORT}, until Ctrl-C')
     options.add_json(made)
     made.set_defaults(run=run)
 
@@ -58,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if args.web:
         check_installed()
         with ended() as is_over:
-            demonstrate_page(_WEB_PORT, report, is_over)
+            demonstrate_page(WEB_PORT, report, is_over)
         return 0
     if args.hidden is not None:
         found = demonstrate_hidden(args.hidden, report)

@@ -14,7 +14,7 @@ from .terminal import ended, Output
 from ..live.host import Host
 from ..live.link import check_installed, qr_code
 from ..live.sources import open_source, Source
-from ..session import CalibratorSettings
+from ..session import CalibratorSettings, WEB_PORT
 
 _EXAMPLE = 'accel-calib live /dev/ttyUSB0 --baud 115200 -o calibration.yaml'
 
@@ -28,8 +28,8 @@ def add_to(made: argparse.ArgumentParser) -> None:
     made.add_argument('-o', '--output', type=Path, default=Path('calibration.yaml'),
                       metavar='FILE', help='calibration to continue and to store (default: '
                       '%(default)s)')
-    made.add_argument('--port', type=_port, default=8080, help='port of the page; 0: any free '
-                      'port (default: %(default)s)')
+    made.add_argument('--port', type=_port, default=WEB_PORT, help='port of the page; 0: any '
+                      'free port (default: %(default)s)')
     made.add_argument('--host', default='127.0.0.1', metavar='ADDRESS', help='address at which '
                       'the page is served; 0.0.0.0: to the whole network, without encryption '
                       '(default: %(default)s)')

@@ -64,7 +64,7 @@ from ..errors import (
 )
 from ..estimate.fit import judge
 from ..model import Model
-from ..table import check_values, COLUMNS, Floats, Poses
+from ..table import check_values, COLUMNS, Floats, LARGEST, Poses
 from ..units import UNIT_NAMES, Units
 
 try:  # eight times as fast, but not in every build of PyYAML
@@ -92,11 +92,8 @@ _NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
 _OTHERS = 10_000
 """More values than a calibration has beside its poses."""
 
-_LARGEST = 1e30
-"""Largest magnitude of the values of effects and of their covariance; far beyond all sensors."""
-
 _PER_G: Mapping[str, tuple[float, float]] = {
-    'm/s2': (0.1, 100.0), 'g': (1.0, 1.0), 'native': (1.0 / _LARGEST, _LARGEST)}
+    'm/s2': (0.1, 100.0), 'g': (1.0, 1.0), 'native': (1.0 / LARGEST, LARGEST)}
 """Range of 1 g, by unit; for m/s² gravity on planets and moons."""
 
 _LONGEST_NAME = 4096
@@ -312,7 +309,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         sensor=text_at(content, 'sensor', _LONGEST_NAME),
         stream=text_at({'stream': '', **content}, 'stream', _LONGEST_NAME),
         frame=choice_at(content, 'frame', FRAMES), date=text_at(content, 'date', _LONGEST_NAME),
-        covariance=array_at(content, 'covariance', (size, size), finite=False, most=_LARGEST),
+        covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(mapping_at(content, 'quality')),
         poses=_poses(mapping_at(content, 'poses')),
         rejected=tuple(Rejected(whole_at(each, 'row'), text_at(each, 'reason'))
@@ -331,7 +328,7 @@ def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
         if key not in effect.values and key not in _ABOUT_EFFECT:
             raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
                              f'{", ".join(effect.values)}')
-    return np.array([number_at(known, part, _LARGEST) for part in effect.values])
+    return np.array([number_at(known, part, LARGEST) for part in effect.values])
 
 
 def _from_version_1(calibration: Calibration) -> Calibration:

@@ -24,9 +24,6 @@ from ..report.page import calibration_page, STORED
 from ..session import Health, Job, Log, Session, ShowPoses
 from ..session.worker import Answer, CallSoon, Worker
 
-PERIOD = 0.05
-"""Interval between two messages of progress [s]."""
-
 Show = Callable[[messages.Message], object]
 """Function that shows a message to all viewers."""
 
@@ -65,7 +62,6 @@ class Exchange:
         self._log, self._flush = log, flush
         self.show: Show = lambda message: None
         self.problem = ''
-        self._running: list[str] = []
         self._shown: Calibration | None = None
         self._rating: Rating | None = None
         self._number = 0
@@ -96,7 +92,7 @@ class Exchange:
             self._take(session.commands.present)
         self.show(messages.state(
             session.health() if health is None else health, self.problem, shown=self._shown,
-            preview=session.preview is not None, busy=self._running[0] if self._running else '',
+            preview=session.preview is not None, busy=next(iter(self._worker.running), ''),
             rating=self._rating, page=self._number))
 
     def _take(self, calibration: Calibration | None) -> None:
@@ -131,7 +127,7 @@ class Exchange:
         self._call_soon(lambda: self._export(name, answer))
 
     def _ask(self, name: str, answer: Answer) -> None:
-        if name in self._running:
+        if name in self._worker.running:
             answer(False, f'{name} is still running; wait for its answer')
             return
 
@@ -140,14 +136,12 @@ class Exchange:
             return _command(self._session, name)
 
         def done(success: bool, words: str) -> None:
-            self._running.remove(name)
             self._log(Log('info' if success else 'warning', words))
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
-        self._running.append(name)
-        self._worker.do(command, done)
-        if self._running:
+        self._worker.do(name, command, done)
+        if self._worker.running:
             self.show_state()
 
     def _draw(self, answer: Answer) -> None:
@@ -191,7 +185,8 @@ class Exchange:
             made.append(found)
             return ''
 
-        self._worker.do(command, lambda success, words: answer(made[0] if success else words))
+        self._worker.do('export', command,
+                        lambda success, words: answer(made[0] if success else words))
 
 
 def _command(session: Session, name: str) -> str | Job:

@@ -22,19 +22,18 @@ from typing import Protocol
 
 import numpy as np
 
-from .exchange import Exchange, PERIOD
+from .exchange import Exchange
+from .messages import PERIOD
 from .server import PageServer
 from ..errors import AccelCalibError, system_error
-from ..session import CalibratorSettings, Job, Log, LogFilter, Session, ShowPoses
+from ..session import BATCH, CalibratorSettings, Job, Log, LogFilter, Session, ShowPoses
+from ..session.events import Severity
 from ..session.stream_statistics import SILENT
 from ..session.worker import Worker
 from ..table import Floats
 
 _TICK = 1.0
 """Interval between two checks of the stream [s]."""
-
-_BATCH = 0.3
-"""Interval at which samples are passed to the session [s], as in the node."""
 
 
 class Samples(Protocol):
@@ -156,12 +155,15 @@ class Host:
         try:
             yield from self._source.blocks
         except AccelCalibError as error:
-            self._end(Log('error', str(error)))
+            self._end('error', str(error))
         except OSError as error:
-            self._end(Log('error', str(system_error(error))))
+            self._end('error', str(system_error(error)))
         else:
-            self._end(Log('info', f'{self._source.name} has ended: fit and save, or end the '
-                          'program'))
+            self._end('info', f'{self._source.name} has ended: fit and save, or end the program')
+
+    def _end(self, severity: Severity, words: str) -> None:
+        """Show why no more samples come."""
+        self._show_problem(words, Log(severity, words))
 
     def _report_source(self) -> None:
         """Show and log that the source is interrupted, or is back."""
@@ -171,14 +173,15 @@ class Host:
             problem = (f'{self._source.name} sends no samples: check the board, its cable and its '
                        'program; the page continues when they arrive, and the poses are kept')
         if bool(problem) != bool(self.exchange.problem):
-            self._log(Log('warning', problem) if problem else
-                      Log('info', f'{self._source.name} is back; continue with the next pose'))
+            self._show_problem(problem, Log('warning', problem) if problem else Log(
+                'info', f'{self._source.name} is back; continue with the next pose'))
         self.exchange.problem = problem
 
-    def _end(self, why: Log) -> None:
-        """Show why no more samples come."""
-        self.exchange.problem = why.words
-        self._log(why)
+    def _show_problem(self, problem: str, line: Log) -> None:
+        """Show what is wrong, or that nothing is, and log it."""
+        self.exchange.problem = problem
+        self.exchange.show_state()
+        self._log(line)
 
     def _work(self, wait: float = 0.0) -> None:
         """Run the tasks so far, waiting for the first one [s], and do what is due."""
@@ -188,7 +191,7 @@ class Host:
             while True:
                 self._tasks.get_nowait()()
         now = monotonic()
-        if now - self._passed >= _BATCH:
+        if now - self._passed >= BATCH:
             self._passed = now
             self._flush()
         if now - self._ticked >= _TICK:

@@ -47,6 +47,9 @@ EXPORTS = tuple(name for name, each in FORMATS.items() if not each.needs_noise)
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
 
+PERIOD = 0.05
+"""Interval between two messages of progress [s]."""
+
 HISTORY_S = 60.0
 """Time for which a new viewer gets the history [s]."""
 
@@ -177,8 +180,7 @@ def state(health: Health, problem: str, *, shown: Calibration | None, preview: b
         'problem': problem or _problem(health), 'calibration': health.calibration,
         'preview': preview, 'levelled': shown is not None and shown.is_levelled,
         'file': health.file, 'busy': busy,
-        'rating': None if rating is None else {
-            'rating': rating.name, 'reason': rating.reason, 'advice': rating.next},
+        'rating': None if rating is None else _rating(rating),
         'result': None if shown is None else _result(shown),
         'page': '' if shown is None else f'/calibration.html?{page}'}
 
@@ -188,6 +190,12 @@ def _problem(health: Health) -> str:
     found = [each for each in findings(health) if each.level > Level.OK and (
         each.name != 'calibration' or health.calibration or health.problem)]
     return max(found, key=lambda each: each.level).words if found else ''
+
+
+def _rating(rating: Rating) -> Message:
+    """Return a rating; with a good one, the page itself knows the next action."""
+    return {'rating': rating.name, 'reason': rating.reason,
+            'advice': rating.next if rating.name != 'GOOD' else ''}
 
 
 def _result(calibration: Calibration) -> Message:

@@ -47,14 +47,8 @@ _VIEWERS = 16
 _LINES = 500
 """Number of log lines that are kept."""
 
-_RATE_HZ = 20
-"""Largest rate of the messages of progress."""
-
 _RARELY_S = 0.2
 """Interval at which the server looks for viewers while there is none [s]."""
-
-
-
 
 _KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript',
           '.svg': 'image/svg+xml', '.png': 'image/png'}
@@ -135,7 +129,7 @@ class PageServer:
         self._newest: dict[str, tuple[messages.Message, str]] = {}
         self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
         self._history: deque[messages.Message] = deque(
-            maxlen=int(messages.HISTORY_S * _RATE_HZ))
+            maxlen=int(messages.HISTORY_S / messages.PERIOD))
         self.viewers: list[Viewer] = []
         self._new: list[Viewer] = []
         self._hosts: frozenset[str] = frozenset()
@@ -237,7 +231,7 @@ class PageServer:
         loop = asyncio.get_running_loop()
         wait = _RARELY_S
         if self.viewers:
-            wait = 1.0 / _RATE_HZ
+            wait = messages.PERIOD
             if self._history:
                 self._take(self._history[-1])
             for viewer in list(self.viewers):

@@ -62,8 +62,9 @@ class Page:
         settings = self._session.settings
         if not settings.web_port:
             return
-        from ..live.exchange import Exchange, PERIOD
+        from ..live.exchange import Exchange
         from ..live.link import qr_code
+        from ..live.messages import PERIOD
         from ..live.server import PageServer
         exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
                             self._stream.flush)

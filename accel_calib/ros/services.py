@@ -73,7 +73,7 @@ class Services:
         send = service.send_response
 
         def send_response(response: Any, header: Any) -> None:
-            self._worker.do(command, lambda success, words: send(
+            self._worker.do(name, command, lambda success, words: send(
                 self._response(success, words), header))
 
         service.send_response = send_response

@@ -38,17 +38,8 @@ from ..messages.layout import (
     THREE,
 )
 from ..one_reading import Triple
-from ..session import CalibratorSettings, Session
+from ..session import BATCH, CalibratorSettings, Session
 from ..session.active_calibration import output_scale
-
-_TOGETHER = 0.3
-"""
-Batch interval of the session [s], and interval between counts of the subscribers.
-
-A batch takes several ms on a slow machine, and messages that arrive in this time wait. At 1 kHz
-and 3 batches per second, these are less than 1 % of the messages.
-
-"""
 
 _NO_LAYOUT = Layout(b'', 0, -1)
 _NO_BIAS = np.zeros(3)
@@ -166,7 +157,7 @@ class Stream:
         self._temperatures.append(self._temperature)
         self._arrived = now
         if due:
-            self._due = now + _TOGETHER
+            self._due = now + BATCH
             self.flush()
 
     def _prepare(self) -> None:

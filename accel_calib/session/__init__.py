@@ -14,8 +14,8 @@ and the state. `settings` defines the parameters.
 
 from .events import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
 from .health import Finding, findings, Health, worst
-from .session import Session
-from .settings import CalibratorSettings
+from .session import BATCH, Session
+from .settings import CalibratorSettings, WEB_PORT
 
-__all__ = ['CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log', 'LogFilter',
-           'Mounting', 'Session', 'ShowPoses', 'Still', 'findings', 'worst']
+__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Event', 'Finding', 'Health', 'Job', 'Log',
+           'LogFilter', 'Mounting', 'Session', 'ShowPoses', 'Still', 'findings', 'worst']

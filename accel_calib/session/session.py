@@ -42,6 +42,15 @@ from ..one_reading import Triple
 from ..table import Floats, Poses
 from ..units import Units, units_of
 
+BATCH = 0.3
+"""
+Interval at which messages are passed to a session [s].
+
+A batch takes several ms on a slow machine, and messages that arrive in this time wait. At 1 kHz
+and 3 batches per second, these are less than 1 % of the messages.
+
+"""
+
 _AGAIN = 10.0
 """Shortest time between two equal log lines about single messages or a silent stream [s]."""
 

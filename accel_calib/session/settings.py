@@ -31,6 +31,9 @@ from ..units import STANDARD_GRAVITY, UNIT_NAMES, UnitName
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+WEB_PORT = 8080
+"""Usual port of the live page."""
+
 _WIDTH = 99
 _COMMENT = '    # '
 
@@ -248,7 +251,7 @@ class CalibratorSettings:
         0.01, 'Smallest lasting change of |a| at rest for a warning; it must also exceed the '
         'stated uncertainty of the calibration [m/s²]', limits=(0.0, 100.0), live=True)
     web_port: int = parameter(
-        0, 'Port of the live page, such as 8080. 0: no page', limits=(0, 65535))
+        0, f'Port of the live page, such as {WEB_PORT}. 0: no page', limits=(0, 65535))
     web_host: str = parameter(
         '127.0.0.1', 'Address at which the live page is served. 0.0.0.0: to the whole network, '
         'without encryption')

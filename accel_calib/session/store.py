@@ -45,7 +45,7 @@ from ..files import (
     write_table,
 )
 from ..files.regular import check_regular
-from ..table import Poses
+from ..table import LARGEST, Poses
 from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
@@ -63,9 +63,6 @@ _OTHER_PLACE = (errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, e
 
 _UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENOENT, errno.ELOOP)
 """Errors of a file that later attempts cannot read either; it is renamed before writing."""
-
-_LARGEST = 1e30
-"""Largest magnitude of a number of the pose table; larger ones overflow in the fit."""
 
 _LARGEST_TABLE = 32 * 2**20
 """Largest pose table of a store: 100,000 poses have half of it [bytes]."""
@@ -397,10 +394,10 @@ def _check_sizes(poses: Poses, path: Path) -> None:
         if key == 'label':
             continue
         size = np.abs(values).reshape(len(poses), -1)
-        bad = np.any((size > _LARGEST) | ((key == 'count') & (size < 1.0 / _LARGEST)), axis=1)
+        bad = np.any((size > LARGEST) | ((key == 'count') & (size < 1.0 / LARGEST)), axis=1)
         if np.any(bad):
             raise InputError(f'{path}: row {int(np.argmax(bad)) + 1} has an impossible {key}, '
-                             f'expected less than {_LARGEST:g}', 'new poses start a new table')
+                             f'expected less than {LARGEST:g}', 'new poses start a new table')
 
 
 def _renamed(path: Path) -> str:

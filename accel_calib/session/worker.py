@@ -49,6 +49,11 @@ class Worker:
     report : callable
         Function that logs an unexpected error.
 
+    Attributes
+    ----------
+    running : list of str
+        Names of the commands that are not answered, the oldest first.
+
     """
 
     def __init__(self, call_soon: CallSoon, on_events: Callable[[], None],
@@ -60,11 +65,17 @@ class Worker:
         self._computed: deque[Callable[[], None]] = deque()
         self._jobs: deque[tuple[Job, Answer]] = deque()
         self._commands: deque[tuple[Callable[[], str | Job], Answer]] = deque()
+        self.running: list[str] = []
         self._is_busy = self._closed = False
 
-    def do(self, command: Callable[[], str | Job], answer: Answer) -> None:
+    def do(self, name: str, command: Callable[[], str | Job], answer: Answer) -> None:
         """Call a command when the jobs before it are done, run its job, and call `answer`."""
-        self._commands.append((command, answer))
+        def done(success: bool, words: str) -> None:
+            self.running.remove(name)
+            answer(success, words)
+
+        self.running.append(name)
+        self._commands.append((command, done))
         self._advance()
 
     def run(self, job: Job, answer: Answer) -> None:
