@@ -97,7 +97,7 @@ async def watch(port: int) -> list[int]:
         async with client.ws_connect(f'http://127.0.0.1:{port}/stream', max_msg_size=0) as stream:
             await stream.send_json({'hello': {'token': '', 'seen': 0}})
             while not over.is_set():
-                await stream.receive(timeout=_LONGEST_WAIT)
+                await stream.receive_str(timeout=_LONGEST_WAIT)
                 count += 1
         return count
 

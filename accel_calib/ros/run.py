@@ -102,9 +102,9 @@ def _spin(node: str, came: int) -> None:
     executor = _executor()
     executor.add_node(instance)
     sys.setswitchinterval(_SWITCH)
-    gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
     try:
         instance.start()
+        gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
         ended = Future()
         Thread(target=_end, args=(came, ended), daemon=True).start()
         while instance.context.ok() and not ended.done():
