@@ -579,3 +579,11 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
             {**values, 'offset_temperature': values['offset_temperature'][:3]}))))
     np.testing.assert_allclose(gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
+    slow = np.append(values['offset_temperature'][:3], [2.0 * lag, of_sensor])
+    offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
+    driver.session.preview = offered
+    driver.session.set_temperature(warm[-1])
+    corrected = offered.apply(np.tile(still, (150, 1)), time=time,
+                              temperature=np.repeat(warm, 60))[-1]
+    assert driver.session.progress().corrected == pytest.approx(
+        np.linalg.norm(corrected) / GRAVITY, abs=1e-3)

@@ -563,11 +563,13 @@ class Session:
             if self.statistics.newest is None:
                 return Newest()
             reading = tuple(self.statistics.newest.tolist())
-        known = {'time': self.statistics.stamp, **self.active.temperatures.columns}
+        calibration, plan = self.preview or self.active.calibration, self.guide.plan
+        known = {'time': self.statistics.stamp}
+        if calibration is not None:
+            known |= self.active.temperatures.columns_of(calibration.model)
         if math.isfinite(self.statistics.temperature):
             known['temperature'] = self.statistics.temperature
-        plan = self.guide.plan
-        return self._newest.described(reading, self.preview or self.active.calibration, known,
+        return self._newest.described(reading, calibration, known,
                                       () if plan is None else plan.zero)
 
     def _log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:

@@ -75,6 +75,13 @@ class TemperatureHistory:
         """Return the present columns of the followed model; empty if it needs none."""
         return {} if self._stream is None else self._stream.value
 
+    def columns_of(self, model: Model) -> Mapping[str, float]:
+        """Return the present columns of any model; those of another one are computed anew."""
+        if _key(model) == _key(self._followed):
+            return self.columns
+        stream = self.stream(model)
+        return {} if stream is None else stream.value
+
     def stream(self, model: Model) -> ThermalStream | None:
         """Return the lag and rate for a model after this history; None if it needs none."""
         stream = thermal_stream(model)
