@@ -49,11 +49,11 @@ _NOISE = 0.002
 class TurnedSensor:
     """A sensor that is turned by hand; it is the source of a host. Its time runs faster."""
 
-    name, sensor = 'simulated', 'imu_link'
+    name = 'simulated'
     problem = str
 
-    def __init__(self, speed: float = 6.0) -> None:
-        self.speed = speed
+    def __init__(self, speed: float = 6.0, sensor: str = 'imu_link') -> None:
+        self.speed, self.sensor = speed, sensor
         self.silent = False
         self._model = model_with(TRUTH)
         self._rng = np.random.default_rng(5)
@@ -154,11 +154,12 @@ def direction_of(sides: str) -> Floats:
 
 
 @contextmanager
-def live_page(folder: Path, *, speed: float = 6.0) -> Iterator[LivePage]:
+def live_page(folder: Path, *, speed: float = 6.0, name: str = 'imu_link', file: str = 'imu.yaml',
+              web_host: str = '127.0.0.1') -> Iterator[LivePage]:
     """Serve the page of a simulated sensor; the calibration is stored in this folder."""
-    sensor, lines, over = TurnedSensor(speed), list[Log](), Event()
-    host = Host(sensor, CalibratorSettings(calibration_file=str(folder / 'imu.yaml')),
-                lines.append)
+    sensor, lines, over = TurnedSensor(speed, name), list[Log](), Event()
+    host = Host(sensor, CalibratorSettings(calibration_file=str(folder / file),
+                                           web_host=web_host), lines.append)
     thread = Thread(target=host.run, args=(over.is_set,), name='host')
     thread.start()
     try:
@@ -188,11 +189,13 @@ class Viewers:
         self._browser = browser
         self.complaints: list[str] = []
 
-    def visit(self, link: str, size: tuple[int, int] = (1000, 900), **options: object) -> Page:
-        """Open a page in a context of its own."""
+    def visit(self, link: str, size: tuple[int, int] = (1000, 900), *, script: str = '',
+              **options: object) -> Page:
+        """Open a page in a context of its own; `script` runs before those of the page."""
         context = self._browser.new_context(
             viewport={'width': size[0], 'height': size[1]}, **options)  # type: ignore[arg-type]
         page = context.new_page()
+        page.add_init_script(script)
         page.on('console', lambda line: self.complaints.append(line.text)
                 if line.type in ('error', 'warning') else None)
         page.on('pageerror', lambda error: self.complaints.append(str(error)))

@@ -71,6 +71,15 @@ def fit(page: Page) -> None:
     expect(answer(page)).not_to_contain_text('~/')  # a page has buttons, and no services
 
 
+def accept(page: Page) -> None:
+    button(page, 'Accept').click()
+    expect(page.locator('#offer')).to_be_hidden(timeout=PATIENCE)
+
+
+def emphasised(page: Page) -> list[str]:
+    return page.locator('button.primary:visible').all_inner_texts()
+
+
 def log_numbers(page: Page) -> list[str]:
     return [str(line.get_attribute('data-number')) for line in page.locator('#log li').all()]
 
@@ -100,7 +109,45 @@ def test_a_calibration_that_is_taken_back_is_not_stored(
     button(page, 'Take back').click()
     expect(page.locator('#offer')).to_be_hidden(timeout=PATIENCE)
     expect(answer(page)).to_contain_text('discarded')
+    expect(page.locator('#next')).to_have_text('Press Fit')
     assert not (tmp_path / 'imu.yaml').exists()
+
+
+def test_the_page_names_the_next_action_until_nothing_is_left(
+        with_poses: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(with_poses.link, SIZES[0])
+    title, words = page.locator('#next'), page.locator('#advice')
+    expect(page.locator('#poses')).to_have_text(re.compile('^14'))
+    fit(page)
+    expect(title).to_have_text('Good. Accept it?')
+    assert emphasised(page) == ['Accept']
+    accept(page)
+    expect(title).to_have_text('Set level')
+    assert emphasised(page) == ['Set level']
+    with_poses.sensor.turn_to(np.array([0.0, 0.0, 1.0]))
+    expect(page.locator('#ring')).to_have_attribute('data-kind', 'captured', timeout=PATIENCE)
+    expect(title).to_have_text('Set level')  # although this rest is a pose more
+    button(page, 'Set level').click()
+    expect(page.locator('#offer')).to_be_visible(timeout=PATIENCE)
+    accept(page)
+    expect(title).to_have_text('Done')
+    expect(words).to_contain_text('Nothing more')
+    assert emphasised(page) == []
+    expect(button(page, 'Set heading')).to_be_visible()
+    assert '--' not in page.locator('main').inner_text()
+
+
+def test_more_poses_after_a_calibration_lead_to_the_next_fit(
+        with_poses: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(with_poses.link)
+    fit(page)
+    accept(page)
+    expect(page.locator('#next')).to_have_text('Set level')
+    poses = page.locator('#poses')
+    for count, direction in ((15, [0.6, 0.8, 0.0]), (16, [-0.6, 0.0, 0.8])):
+        with_poses.sensor.turn_to(np.array(direction))
+        expect(poses).to_have_text(re.compile(f'^{count}'), timeout=PATIENCE)
+    expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'), timeout=PATIENCE)
 
 
 def test_the_keyboard_alone_performs_a_fit(with_poses: LivePage, viewers: Viewers) -> None:
@@ -116,6 +163,18 @@ def test_the_keyboard_alone_performs_a_fit(with_poses: LivePage, viewers: Viewer
     page.keyboard.press('Enter')
     expect(page.locator('#offer')).to_be_visible(timeout=PATIENCE)
     expect(button(page, 'Fit')).to_be_focused()
+
+
+def test_the_keyboard_scrolls_the_log(live: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(live.link, SIZES[1])
+    live.follow(page, 5)
+    page.locator('#log summary').click()
+    page.keyboard.press('Tab')
+    lines = page.locator('#log ol')
+    expect(lines).to_be_focused()
+    page.keyboard.press('ArrowDown')
+    page.wait_for_timeout(500.0)
+    assert lines.evaluate('(each) => each.scrollTop') > 0.0
 
 
 def test_a_wrong_token_shows_everything_and_changes_nothing(
@@ -216,6 +275,125 @@ def test_a_sensor_that_falls_silent_is_noticed(live: LivePage, viewers: Viewers)
     live.sensor.silent = True
     expect(page.locator('#ring')).to_have_attribute('data-kind', 'silent', timeout=PATIENCE)
     expect(page.locator('#problem')).to_be_visible()
+
+
+def test_a_lost_connection_is_what_the_page_shows_in_large(
+        live: LivePage, browser: Browser) -> None:
+    viewers = Viewers(browser)  # a lost connection is an error in the console
+    page = viewers.visit(live.link)
+    expect(page.locator('#next')).to_have_text(re.compile(' up$'))
+    page.context.set_offline(True)
+    expect(page.locator('#next')).to_have_text('No connection', timeout=PATIENCE)
+    expect(page.locator('#wanted')).to_be_hidden()
+    page.context.set_offline(False)
+    expect(page.locator('#next')).to_have_text(re.compile(' up$'), timeout=PATIENCE)
+    viewers.close()
+
+
+def test_a_fit_of_one_viewer_blocks_the_buttons_of_the_other(
+        with_poses: LivePage, viewers: Viewers) -> None:
+    first, second = (viewers.visit(with_poses.link) for _ in range(2))
+    second.evaluate("""() => {
+      const button = document.querySelector('[data-command=refine]');
+      window.seen = [];
+      new MutationObserver(() => window.seen.push(button.getAttribute('aria-disabled')))
+        .observe(button, { attributeFilter: ['aria-disabled'] });
+    }""")
+    fit(first)
+    expect(second.locator('#offer')).to_be_visible()
+    expect(button(second, 'Refine')).to_have_attribute('aria-disabled', 'false')
+    assert 'true' in second.evaluate('window.seen')
+
+
+_SPOKEN = """
+window.spoken = [];
+speechSynthesis.speak = (utterance) => window.spoken.push(utterance.text);
+"""
+
+
+def test_speech_names_captured_poses_and_the_next_one_if_it_is_switched_on(
+        live: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(live.link, script=_SPOKEN)
+    expect(page.locator('#next')).to_have_text(re.compile(' up$'))
+    live.follow(page, 1)
+    assert page.evaluate('window.spoken') == []
+    speech = button(page, 'Speech')
+    speech.click()
+    expect(speech).to_have_attribute('aria-pressed', 'true')
+    live.follow(page, 2)
+    assert page.evaluate('window.spoken')[-1] == (
+        f'Pose 2 captured. {page.locator("#next").inner_text()}.')
+    speech.click()
+    live.follow(page, 3)
+    assert len(page.evaluate('window.spoken')) == 2
+
+
+def test_a_browser_without_a_voice_says_so(live: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(live.link, script="""
+      speechSynthesis.speak = (utterance) => utterance.onerror({ error: 'voice-unavailable' });
+    """)
+    button(page, 'Speech').click()
+    expect(answer(page)).to_contain_text('does not speak')
+    expect(button(page, 'Speech')).to_have_attribute('aria-pressed', 'false')
+
+
+def test_a_browser_without_speech_and_wake_lock_shows_the_page(
+        live: LivePage, viewers: Viewers) -> None:
+    page = viewers.visit(live.link, script="""
+      delete window.speechSynthesis;
+      delete Navigator.prototype.wakeLock;
+    """)
+    assert not page.evaluate('"speechSynthesis" in window || "wakeLock" in navigator')
+    expect(button(page, 'Speech')).to_be_hidden()
+    live.follow(page, 1)
+
+
+def test_the_screen_stays_on_while_the_page_is_connected(
+        live: LivePage, browser: Browser) -> None:
+    viewers = Viewers(browser)  # a lost connection is an error in the console
+    page = viewers.visit(live.link, script="""
+      const request = WakeLock.prototype.request;
+      WakeLock.prototype.request = async function (kind) {
+        const lock = await request.call(this, kind);
+        const show = () => { document.documentElement.dataset.awake = `${!lock.released}`; };
+        lock.addEventListener('release', show);
+        show();
+        return lock;
+      };
+    """)
+    root = page.locator('html')
+    expect(root).to_have_attribute('data-awake', 'true')
+    page.context.set_offline(True)
+    expect(root).to_have_attribute('data-awake', 'false', timeout=PATIENCE)
+    page.context.set_offline(False)
+    expect(root).to_have_attribute('data-awake', 'true', timeout=PATIENCE)
+    viewers.close()
+
+
+_MARKUP = '<img src=x onerror="document.title=1"><b>\u202e\x07\n</b>' + 'w' * 200
+
+
+def test_markup_in_names_is_shown_as_text(tmp_path: Path, viewers: Viewers) -> None:
+    with live_page(tmp_path, name=_MARKUP, file='<img src=x onerror=alert(1)>.yaml') as live:
+        page = viewers.visit(live.link, SIZES[0])
+        expect(page.locator('#sensor')).to_contain_text('<img src=x')
+        live.follow(page)
+        fit(page)
+        accept(page)
+        expect(answer(page)).to_contain_text('<img')
+        page.locator('#log summary').click()
+        page.get_by_text('Calibration page').click()
+        frame = page.frame_locator('#report iframe')
+        expect(frame.get_by_role('heading', level=1)).to_contain_text('<img', timeout=PATIENCE)
+        assert frame.locator('img[src=x]').count() == page.locator('img').count() == 0
+        assert page.title() != '1'
+        assert page.evaluate('document.documentElement.scrollWidth') <= SIZES[0][0]
+
+
+def test_the_page_is_served_over_ipv6(tmp_path: Path, viewers: Viewers) -> None:
+    with live_page(tmp_path, web_host='::1') as live:
+        assert live.link.startswith('http://[::1]:')
+        live.follow(viewers.visit(live.link), 1)
 
 
 def test_the_sound_switch_is_remembered(live: LivePage, viewers: Viewers) -> None:

@@ -11,7 +11,7 @@ import { SIDES } from './words.js';
 
 const HALF = [0.75, 0.55, 0.34];  // half the size along x, y and z
 const EXTENT = 1.02;  // half the height of the drawing, in the unit of HALF
-const AXES = { x: -0.72, y: 0.68, length: 0.23 };  // where the axes are drawn, and their length
+const AXES = { margin: 0.36, farthest: 1.15, y: 0.68, length: 0.23 };  // where the axes are drawn
 
 const axisVector = (axis, length) => [0, 1, 2].map((k) => (k === axis ? length : 0));
 
@@ -33,9 +33,10 @@ export function drawBox(canvas, attitude) {
       if (seen(axisVector(axis, sign)).depth > 1e-6) drawSide(context, axis, sign, name, seen);
     }
   }
+  const left = -Math.min(AXES.farthest, width / (2 * scale) - AXES.margin);
   [0, 1, 2].map((axis) => ({ axis, end: seen(axisVector(axis, 1)) }))
     .sort((a, b) => a.end.depth - b.end.depth)
-    .forEach(({ axis, end }) => drawAxis(context, axis, end));
+    .forEach(({ axis, end }) => drawAxis(context, axis, end, left));
 }
 
 function drawSide(context, axis, sign, name, seen) {
@@ -76,9 +77,9 @@ function drawName(context, name, right, down, at) {
   context.restore();
 }
 
-function drawAxis(context, axis, { x, y, depth }) {
+function drawAxis(context, axis, { x, y, depth }, left) {
   context.save();
-  context.translate(AXES.x, AXES.y);
+  context.translate(left, AXES.y);
   context.globalAlpha = depth < -0.05 ? 0.5 : 1;
   context.strokeStyle = colour(`axis-${'xyz'[axis]}`);
   context.fillStyle = colour('ink');

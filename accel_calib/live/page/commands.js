@@ -6,13 +6,21 @@
 import { token } from './connection.js';
 import { buttonOf, withButtons } from './words.js';
 
+const SHOWN = 10000;  // time for which the answer of a command that succeeded is shown [ms]
+const MOVED = ['set_level', 'refine'];  // the last one comes first
+
 const element = (id) => document.getElementById(id);
+const buttonFor = (command) => document.querySelector(`#commands [data-command=${command}]`);
 
 export class Commands {
   #connection;
   #announce;
   #buttons = [...document.querySelectorAll('[data-command]')];
   #answer = element('answer');
+  #offer = element('offer');
+  #heading = element('more-commands').querySelector('[data-command=set_heading]');
+  #next = '';
+  #timer = 0;
   #may = false;
   #why = 'there is no connection to the calibrator';
   #busy = '';
@@ -44,6 +52,36 @@ export class Commands {
     this.#mark();
   }
 
+  /** Set whether a calibration is offered, and its rating; the focus stays near its buttons. */
+  setOffer(offered, rating) {
+    this.#offer.dataset.rating = rating?.rating ?? '';
+    const hadFocus = this.#offer.contains(document.activeElement);
+    if (offered) this.hideSuccess();  // the offer says the same, and more
+    this.#offer.hidden = !offered;
+    if (hadFocus && !offered) element('commands').focus({ preventScroll: true });
+  }
+
+  /** Set whether the mounting is levelled; its heading is set after that. */
+  setLevelled(levelled) {
+    this.#heading.hidden = !levelled;
+  }
+
+  /** Emphasise the button of the next command; on a phone it comes to the bottom. */
+  setNext(command) {
+    if (command === this.#next) return;
+    this.#next = command;
+    const focused = document.activeElement;
+    for (const button of MOVED.map(buttonFor)) {
+      element(button.dataset.command === command ? 'main-commands' : 'more-commands')
+        .prepend(button);
+    }
+    for (const button of this.#buttons) {  // Save is Accept while a calibration is offered
+      button.classList.toggle('primary', button.dataset.command === command
+        && button.parentElement.id !== 'more-commands');
+    }
+    if (document.activeElement !== focused) focused.focus({ preventScroll: true });
+  }
+
   /** Set the names of the formats of the export. */
   setFormats(names) {
     element('formats').replaceChildren(...names.map((name) => {
@@ -56,12 +94,20 @@ export class Commands {
     }));
   }
 
+  /** Hide the answer of a command that succeeded; the log keeps it. */
+  hideSuccess() {
+    if (this.#answer.dataset.success === 'true') this.#answer.hidden = true;
+  }
+
+  /** Show an answer, and read it to users of screen readers. */
   show({ success, words }) {
     this.#answer.dataset.success = `${success}`;
     const readable = withButtons(words);
     this.#answer.querySelector('p').textContent = readable;
-    this.#answer.hidden = false;
+    this.#answer.hidden = success && !this.#offer.hidden;  // what is offered is the answer
     this.#announce(readable);
+    clearTimeout(this.#timer);
+    if (success) this.#timer = setTimeout(() => this.hideSuccess(), SHOWN);
   }
 
   async #ask(command) {

@@ -1,12 +1,12 @@
 // Copyright 2026 The accel_calib authors
 // SPDX-License-Identifier: Apache-2.0
 
-// What matters now, in large: the ring of stillness, the words of the next pose, and how far the
-// sensor still has to be turned.
+// What matters now, in large: the ring of stillness, the next action, and how far the sensor still
+// has to be turned.
 
 import { label, text } from './canvas.js';
 import { degreesBetween, unit } from './geometry.js';
-import { capitalised, fixed, sideOf, withButtons } from './words.js';
+import { fixed } from './words.js';
 
 const REACHED = 17;  // a pose within this angle of the next one counts as it [°]
 
@@ -23,10 +23,10 @@ export class Hero {
     this.#captured = true;
   }
 
-  /** Show a progress, and what the calibrator is busy with. */
-  show(progress, state) {
-    if (!progress.still) this.#captured = false;
-    const [kind, words, more] = this.#stillness(progress);
+  /** Show a progress, or null: there is no connection. */
+  show(progress) {
+    if (!progress?.still) this.#captured = false;
+    const [kind, words, more] = progress ? this.#stillness(progress) : ['silent', '–', ''];
     const share = kind === 'moving' || kind === 'silent' ? 0
       : Math.min(1, progress.dwell / Math.max(progress.min_dwell, 0.01));
     this.#ring.dataset.kind = kind;
@@ -34,8 +34,6 @@ export class Hero {
     text(element('ring-words'), words);
     text(element('ring-more'), more);
     label(this.#drawing, `stillness: ${words}${more ? `, ${more}` : ''}`);
-    showGoal(progress, state);
-    showTurn(progress);
   }
 
   /** Return the kind of stillness, its word, and a second line. */
@@ -51,30 +49,25 @@ export class Hero {
   }
 }
 
-/** Return the words in large: the side to point up, or what to do instead. */
-export function goalOf({ direction, advice }, state) {
-  if (state.busy) return `${capitalised(state.busy.replaceAll('_', ' '))} is running …`;
-  if (state.preview) return 'Accept it?';
-  if (direction.length) return `${capitalised(sideOf(direction))} up`;
-  const command = advice.match(/call ~\/(fit|refine)/);
-  if (command) return `Press ${capitalised(command[1])}`;
-  return advice ? 'Done' : 'Waiting';
+/** Show the next action, and the sensor as it is wanted if that is a pose. */
+export function showAction({ title, words, isPose }, progress) {
+  text(element('next'), title);
+  text(element('advice'), words);
+  text(element('count'), progress ? countWords(progress, isPose) : '');
+  showTurn(progress, isPose);
 }
 
-function showGoal(progress, state) {
-  const { poses, total } = progress;
-  text(element('count'), poses < total ? `pose ${poses + 1} of about ${total}`
-    : `${poses} ${poses === 1 ? 'pose' : 'poses'}`);
-  text(element('next'), goalOf(progress, state));
-  text(element('advice'), capitalised(withButtons(progress.advice)));
+function countWords({ poses, total }, isPose) {
+  if (isPose && poses < total) return `pose ${poses + 1} of about ${total}`;
+  return `${poses} ${poses === 1 ? 'pose' : 'poses'}`;
 }
 
-function showTurn({ direction, up }) {
-  const both = direction.length > 0 && up.length > 0;
-  element('wanted').hidden = direction.length === 0;
+function showTurn(progress, isPose) {
+  const both = isPose && progress.up.length > 0;
+  element('wanted').hidden = !isPose;
   element('turn').hidden = !both;
   if (!both) return;
-  const degrees = degreesBetween(unit(direction), unit(up));
+  const degrees = degreesBetween(unit(progress.direction), unit(progress.up));
   element('boxes').dataset.reached = `${degrees < REACHED}`;
   text(element('turn'), degrees < REACHED ? '✓' : `${Math.round(degrees)}°`);
 }

@@ -4,16 +4,19 @@
 // The live page of the calibrator: it takes the messages of the stream and shows them.
 
 import { Attitude, Wanted } from './attitude.js';
+import { Awake } from './awake.js';
 import { Ball } from './ball.js';
 import { drawBox } from './box.js';
 import { label, onColours, text } from './canvas.js';
 import { Chart } from './chart.js';
 import { Commands } from './commands.js';
 import { Connection } from './connection.js';
-import { goalOf, Hero } from './hero.js';
+import { nextAction } from './guide.js';
+import { Hero, showAction } from './hero.js';
 import { LogView } from './log.js';
 import { Result } from './result.js';
 import { Sound } from './sound.js';
+import { Speech } from './speech.js';
 import { countOf, figure, fixed, sideOf, withButtons } from './words.js';
 
 const element = (id) => document.getElementById(id);
@@ -26,8 +29,10 @@ const hero = new Hero();
 const log = new LogView(element('log'));
 const result = new Result();
 const sound = new Sound(element('sound'));
+const awake = new Awake();
 
-let state = { preview: false, busy: '' };
+let state = null;
+let open = false;
 let progress = null;
 let version = '';
 let announced = '';
@@ -35,6 +40,7 @@ let redraw = true;
 
 const connection = new Connection({ message: take, state: showConnection, seen: () => log.seen });
 const commands = new Commands(connection, announce);
+const speech = new Speech(element('speech'), (words) => commands.show({ success: false, words }));
 
 const KINDS = {
   welcome: takeWelcome, progress: takeProgress, poses: ({ up }) => ball.setPoses(up),
@@ -56,22 +62,23 @@ function takeWelcome({ may, why, version: now, history, exports = [] }) {
 }
 
 function takeProgress(now) {
-  const before = progress;
+  const isNew = progress !== null && now.poses > progress.poses;
   progress = { ...now, direction: now.direction ?? [], up: now.up ?? [] };
-  if (before && now.poses > before.poses) {
+  if (isNew) {
     hero.captured();
     sound.captured();
+    commands.hideSuccess();
   }
-  hero.show(progress, state);
+  hero.show(progress);
   if (progress.up.length) attitude.set(progress.up);
   element('box-now').hidden = attitude.matrix === null;
-  text(element('now-words'), attitude.matrix ? 'now'
+  text(element('now-words'), attitude.matrix ? 'now' : now.stillness === null ? ''
     : 'How it is held now is known after about 4 poses. Hold it like the other box.');
   redraw = wanted.set(progress.direction) || redraw;
   ball.set(progress.direction, progress.up);
   chart.add(now.time, now.raw, now.corrected);
   showNumbers(progress);
-  announceProgress(before);
+  guide(isNew);
 }
 
 function takeState(now) {
@@ -81,11 +88,24 @@ function takeState(now) {
   const words = withButtons(now.state);
   text(element('state'), now.source ? `${words} · ${now.source}` : words);
   notice('problem', withButtons(now.problem));
-  element('offer').hidden = !now.preview;
-  text(element('offer-words'), now.rating ? `${now.rating.rating}: ${now.rating.reason}` : '');
+  commands.setOffer(now.preview, now.rating);
   commands.setBusy(now.busy);
+  commands.setLevelled(now.levelled);
   result.show(now);
-  if (progress) hero.show(progress, state);
+  guide(false);
+}
+
+/** Show and announce the next action; `captured`: a pose was captured just now. */
+function guide(captured) {
+  const next = nextAction(progress, state, open);
+  showAction(next, open ? progress : null);
+  commands.setNext(next.command);
+  if (next.title === announced && !captured) return;
+  announced = next.title;
+  const end = /\w$/.test(next.title) ? '.' : '';
+  const words = `${captured ? `Pose ${progress.poses} captured. ` : ''}${next.title}${end}`;
+  announce(words);
+  speech.say(words);
 }
 
 function showNumbers(now) {
@@ -101,7 +121,12 @@ function showConnection(name) {
   notice('connection', {
     connecting: 'Connecting to the calibrator …',
     lost: 'The connection is lost. The page tries again.', open: '' }[name]);
-  if (name === 'lost') commands.allow(false, 'there is no connection to the calibrator');
+  open = name === 'open';
+  awake.keep(open);
+  if (name !== 'lost') return;
+  commands.allow(false, 'there is no connection to the calibrator');
+  hero.show(null);
+  guide(false);
 }
 
 function notice(id, words) {
@@ -112,15 +137,6 @@ function notice(id, words) {
 /** Read a text to users of screen readers. */
 function announce(words) {
   element('live').textContent = words;
-}
-
-/** Announce a captured pose or another advice, and not each message. */
-function announceProgress(before) {
-  const goal = goalOf(progress, state);
-  if (goal === announced) return;
-  announced = goal;
-  const count = before && progress.poses > before.poses ? `Pose ${progress.poses} captured. ` : '';
-  announce(`${count}${goal}.`);
 }
 
 let last = performance.now();

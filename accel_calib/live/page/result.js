@@ -55,8 +55,8 @@ export class Result {
     const [name, reason, advice] = box.children;
     box.dataset.rating = rating.rating;
     text(name, rating.rating);
-    text(reason, withButtons(rating.reason ?? ''));
-    text(advice, withButtons(rating.advice ?? ''));
+    text(reason, withButtons(rating.reason));
+    text(advice, withButtons(rating.advice));
   }
 
   /** Load the page only when it is looked at, because drawing its maps takes time. */

@@ -13,7 +13,8 @@ const NEAR = 0.38;  // half way between a side (0) and an edge (0.71), about
 
 const BUTTONS = {
   capture_pose: 'Capture', undo_pose: 'Undo pose', fit: 'Fit', refine: 'Refine',
-  set_level: 'Set level', save: 'Accept', undo: 'Take back', reset: 'Reset',
+  set_level: 'Set level', set_heading: 'Set heading', save: 'Accept', undo: 'Take back', reset: 'Reset',
+  export: 'Export',
 };
 
 /** Return the side, edge or corner nearest to a direction, such as “left side”. */
