@@ -55,6 +55,8 @@ setup(
         'noise': ['allantools>=2024.4,<2025'],
         # The live page: its server, the QR code of its link, and serial ports.
         'live': ['aiohttp>=3.9.1,<4', 'pyserial>=3.5,<4', 'segno>=1.6,<2'],
+        # Many recordings on a cluster: accel-calib fleet.
+        'fleet': ['dask[distributed]>=2024.2,<2027', 'fsspec>=2024.2', 'pyarrow>=14,<27'],
         # Completion of the command line by the shell.
         'completion': ['argcomplete>=3.1.4,<4'],
         'docs': ['sphinx<10', 'myst-parser<6', 'sphinx-rtd-theme<4'],

@@ -27,7 +27,7 @@ LAYERS = (
     ('files', 'words'),
     ('rating',),
     ('intake', 'pipeline', 'report'),
-    ('api', 'session'),
+    ('api', 'fleet', 'session'),
     ('live',),
     ('ros',),
     ('cli',),

@@ -38,6 +38,7 @@ COMMANDS = {
     'compare': 'test whether calibrations of one sensor agree within their uncertainties',
     'history': 'show offset and gain over the dates of calibrations of one sensor',
     'refine': 'find effects that a calibration lacks, and add them',
+    'fleet': 'calibrate the recordings of many sensors in parallel, on Dask',
     'apply': 'correct a recording with a calibration',
     'export': 'write a calibration in the format of a firmware, an autopilot or another tool',
     'noise': 'find noise density, bias instability and random walk from a long rest',

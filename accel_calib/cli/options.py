@@ -120,10 +120,11 @@ def intake_for(args: argparse.Namespace, path: Path, calibration: Calibration
 
 def _intake(args: argparse.Namespace, path: Path, asked: LogOptions) -> Intake:
     with progress('samples') as moved:
-        return poses_of(path, asked, _settings(args), moved)
+        return poses_of(path, asked, settings(args), moved)
 
 
-def _settings(args: argparse.Namespace) -> dict[str, float]:
+def settings(args: argparse.Namespace) -> dict[str, float]:
+    """Return the settings of the capture, from the options."""
     return {} if args.max_dwell is None else {'max_dwell': args.max_dwell}
 
 

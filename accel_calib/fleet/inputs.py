@@ -1,0 +1,196 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recordings from files, folders, globs, lists and addresses, and their content hash."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+import hashlib
+import os
+from pathlib import Path, PurePosixPath
+import tempfile
+from typing import Any
+
+from ..errors import InputError
+
+_SUFFIXES = ('.csv', '.tsv', '.txt', '.log', '.mcap', '.db3', '.bag', '.ulg', '.bin')
+"""Endings of recordings in a folder; a file that is named itself can have any ending."""
+
+_MAGIC = '*?['
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Input:
+    """
+    A recording that was found.
+
+    Parameters
+    ----------
+    path : str
+        Absolute path, or address such as ``s3://bucket/a.mcap``.
+    inside : str
+        Its path below the folder or glob that was passed, with ``/``.
+
+    """
+
+    path: str
+    inside: str
+
+
+def recordings(given: Iterable[str]) -> Iterator[Input]:
+    """
+    Yield the recordings of files, folders, globs, lists (``@list.txt``) and addresses.
+
+    Parameters
+    ----------
+    given : iterable of str
+        What the user passed.
+
+    Raises
+    ------
+    InputError
+        If one of them does not exist, or holds no recording.
+    OSError
+        If a list or a folder cannot be read.
+
+    """
+    for text in given:
+        if text.startswith('@'):
+            yield from recordings(_lines(Path(text[1:])))
+            continue
+        found = None
+        for found in _addresses(text) if '://' in text else _local(text):
+            yield found
+        if found is None:
+            raise InputError(f'{text} holds no recording, expected at least one that ends with '
+                             f'{", ".join(_SUFFIXES)}', 'correct the name, or put a glob in quotes')
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a list; relative names are relative to the list."""
+    with path.open(encoding='utf-8') as file:
+        for line in filter(None, map(str.strip, file)):
+            if not line.startswith('#'):
+                yield line if '://' in line else str(path.parent / line)
+
+
+def _local(text: str) -> Iterator[Input]:
+    """Yield the recordings of a file, folder or glob of this machine, in order."""
+    path = Path(os.path.abspath(text))
+    if path.exists() and (path.is_file() or _is_bag_folder(path)):
+        yield Input(str(path), path.name)
+    elif path.is_dir():
+        yield from _below(path, path)
+    elif any(letter in text for letter in _MAGIC):
+        root = _root(path)
+        for each in sorted(root.glob(str(path.relative_to(root)))):
+            if each.is_file() or _is_bag_folder(each):
+                yield Input(str(each), each.relative_to(root).as_posix())
+            elif each.is_dir():
+                yield from _below(each, root)
+    else:
+        raise InputError(f'{text} does not exist, expected a recording, a folder, a glob or @LIST',
+                         'correct the name')
+
+
+def _is_bag_folder(path: Path) -> bool:
+    """Return whether a path is the folder of a rosbag2, which is one recording."""
+    return (path / 'metadata.yaml').is_file()
+
+
+def _root(path: Path) -> Path:
+    """Return the folder above the first part with a wildcard."""
+    return next(each for each in reversed(path.parents)
+                if any(letter in path.relative_to(each).parts[0] for letter in _MAGIC))
+
+
+def _below(folder: Path, root: Path) -> Iterator[Input]:
+    """Yield the recordings in a folder and its subfolders, in order; a bag is one recording."""
+    for each in sorted(folder.iterdir()):
+        if each.name.startswith('.'):
+            continue
+        if _is_bag_folder(each) or (each.is_file() and each.suffix.lower() in _SUFFIXES):
+            yield Input(str(each), each.relative_to(root).as_posix())
+        elif each.is_dir():
+            yield from _below(each, root)
+
+
+def _addresses(text: str) -> Iterator[Input]:
+    """Yield the recordings of an address, in order."""
+    system, path = _system(text)
+    protocol = text.partition('://')[0]
+    if any(letter in path for letter in _MAGIC):
+        parts = PurePosixPath(path).parts
+        first = next(k for k, part in enumerate(parts)
+                     if any(letter in part for letter in _MAGIC))
+        root, found = PurePosixPath(*parts[:first]), system.glob(path)
+    elif system.isfile(path):
+        root, found = PurePosixPath(path).parent, [path]
+    else:
+        root = PurePosixPath(path)
+        found = [each for each in system.find(path) if each.lower().endswith(_SUFFIXES)]
+    for each in sorted(found):
+        yield Input(f'{protocol}://{each.lstrip("/") if protocol != "file" else each}',
+                    PurePosixPath(each).relative_to(root).as_posix())
+
+
+def _system(text: str) -> tuple[Any, str]:
+    """Return the file system of an address, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs
+
+        system, path = url_to_fs(text)
+    except (ImportError, ValueError) as err:
+        raise InputError(f'{text} cannot be opened: {err}', 'install fsspec and its package for '
+                         'this kind of address, such as s3fs for s3://') from err
+    return system, path
+
+
+@contextmanager
+def on_disk(path: str) -> Iterator[Path]:
+    """Yield a recording as a local path; an address is copied to a temporary folder."""
+    if '://' not in path:
+        yield Path(path)
+        return
+    system, inside = _system(path)
+    with tempfile.TemporaryDirectory(prefix='accel_calib-') as folder:
+        local = Path(folder) / PurePosixPath(inside).name
+        system.get_file(inside, str(local))
+        yield local
+
+
+def content_hash(path: Path) -> str:
+    """
+    Return a hash of the content of a file, or of all files of a folder with their names.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+
+    Returns
+    -------
+    str
+        128 bits as hexadecimal text.
+
+    """
+    made = hashlib.blake2b(digest_size=16)
+    if path.is_file():
+        _add(made, path)
+        return made.hexdigest()
+    for each in sorted(path.rglob('*')):
+        if each.is_file():
+            name = each.relative_to(path).as_posix().encode()
+            made.update(b'%d:%b%d:' % (len(name), name, each.stat().st_size))
+            _add(made, each)
+    return made.hexdigest()
+
+
+def _add(made: Any, path: Path) -> None:
+    with path.open('rb') as file:
+        while block := file.read(_BLOCK):
+            made.update(block)

@@ -1,0 +1,197 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A run over the recordings of a fleet, on Dask.
+
+The program submits a limited number of tasks, and submits the next one when one is done. Its
+memory and that of the scheduler therefore do not grow with the number of recordings.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING, TypeVar
+
+from .inputs import Input
+from .sensors import merge_sensor, write_sensors
+from .store import Row, Store
+from .task import calibrate_recording, Done, Options, unread_row
+from ..errors import InputError
+from ..files import Progress
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_Item = TypeVar('_Item')
+
+_AHEAD = 4
+"""Tasks in the queue per worker thread: enough that none waits for the program."""
+
+_CONNECT_S = 30.0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """
+    What a run did.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+        Number of recordings by status: ok, error, unread, skipped.
+    sensors : tuple of dict
+        The rows of all sensors.
+
+    """
+
+    counts: Counter[str]
+    sensors: tuple[Row, ...]
+
+
+@contextmanager
+def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
+    """
+    Connect to a scheduler, or start a cluster on this machine with one thread per worker.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler; empty: a cluster on this machine.
+    workers : int, optional
+        Number of workers on this machine; by default one per core.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, or the scheduler cannot be reached.
+
+    """
+    try:
+        from distributed import Client, LocalCluster
+        import pyarrow  # noqa: F401
+    except ImportError as err:
+        raise InputError(f'{err.name} is not installed, expected Dask and pyarrow',
+                         "run pip install 'accel_calib[fleet]'") from err
+    if address:
+        try:
+            client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError) as err:
+            raise InputError(f'no scheduler answers at {address}: {err}', 'start dask scheduler, '
+                             'or correct --scheduler') from err
+        with client:
+            yield client
+        return
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=':0',
+                      silence_logs='ERROR') as local, \
+            Client(local, set_as_default=False) as client:
+        yield client
+
+
+def run(client: Client, found: Sequence[Input], options: Options, store: Store,
+        progress: Progress = lambda done, count: None) -> Summary:
+    """
+    Calibrate recordings, and bring the data set up to date.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        As `cluster` yields it.
+    found : sequence of Input
+        The recordings.
+    options : Options
+        How to calibrate them.
+    store : Store
+        The results.
+    progress : function of two int
+        Called with the number of recordings done and of all recordings.
+
+    Returns
+    -------
+    Summary
+        What was done.
+
+    Raises
+    ------
+    InputError
+        If another program writes to the store, or the scheduler is gone.
+    OSError
+        If a result cannot be written.
+
+    """
+    with store.locked():
+        _merge(client, store)  # what an interrupted run left
+        counts: Counter[str] = Counter()
+        unread: list[Row] = []
+        for item, result in _mapped(client, calibrate_recording, found, options, store):
+            done = _of_dead(item, options, result) if isinstance(result, Exception) else result
+            counts[done.status] += 1
+            unread += [] if done.row is None else [done.row]
+            progress(sum(counts.values()), len(found))
+        store.replace_unread(unread)
+        return Summary(counts, tuple(_merge(client, store)))
+
+
+def _merge(client: Client, store: Store) -> list[Row]:
+    """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
+    rows, names = [], store.waiting()
+    for _, result in _mapped(client, merge_sensor, names, store):
+        if isinstance(result, Exception):
+            raise result
+        rows.append(result)
+    found = write_sensors(store, rows)
+    for name in names:
+        store.finish(name)
+    return found
+
+
+def _of_dead(item: Input, options: Options, error: Exception) -> Done:
+    """Return the result of a recording on which workers died; raise other errors."""
+    from distributed import KilledWorker
+
+    if not isinstance(error, KilledWorker):
+        raise error
+    return Done('', 'unread', unread_row(item, options, InputError(
+        'the workers that calibrated this recording died, expected them to finish',
+        'give the workers more memory, and run again')))
+
+
+def _mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
+            ) -> Iterator[tuple[_Item, Any]]:
+    """Yield each item with the result of a function, or its exception, as they are done."""
+    from concurrent.futures import CancelledError
+
+    from distributed import as_completed
+
+    rest, waiting = iter(items), {}
+    done = as_completed(loop=client.loop)
+
+    def submit() -> bool:
+        for item in rest:
+            future = client.submit(function, item, *others, pure=False)
+            waiting[future] = item
+            done.add(future)
+            return True
+        return False
+
+    limit = _AHEAD * max(sum(client.nthreads().values()), 1)
+    while len(waiting) < limit and submit():
+        pass
+    while waiting:
+        future = next(done)
+        item = waiting.pop(future)
+        try:
+            result = future.result()
+        except CancelledError as err:
+            raise InputError(f'the scheduler {client.scheduler.addr} is gone; expected it to stay '
+                             'until the end', 'start it again, and run the same command: done '
+                             'recordings are skipped') from err
+        except Exception as err:  # the caller decides
+            result = err
+        del future  # so that the scheduler forgets it
+        submit()
+        yield item, result
