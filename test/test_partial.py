@@ -21,7 +21,7 @@ from accel_calib.calibrate import (
     verify,
 )
 from accel_calib.calibrate.gate import gated
-from accel_calib.calibrate.partial import carried, typical_spread
+from accel_calib.calibrate.partial import carried, common_sensors, typical_spread
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate.closed_form import along_quadrics
 from accel_calib.estimate.fit import estimate
@@ -115,7 +115,7 @@ def test_many_poses_over_the_sphere_outweigh_the_prior():
     poses = simulate_poses(common_sensor(rng), spread_directions(24), rng)
     full = fit_poses(poses, G, model='10')
     start = with_vector(MODELS['10'], np.zeros(9))
-    found = estimate(start, poses.take(slice(None)), typical_spread())
+    found = estimate(start, poses.take(slice(None)), common_sensors())
     deviation = np.sqrt(np.diag(full.covariance))
     assert np.all(np.abs(found.model.vector - full.model.vector) < 0.1 * deviation)
     assert found.dof == 15

@@ -25,6 +25,7 @@ from .calibration import (
 )
 from .checks import check_units, FLAT
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
+from .fleet_prior import fit_with_fleet, FleetPrior
 from .gate import gated
 from .levelling import ARBITRARY_HEADING, level, set_heading, with_given_mounting
 from .mounting import FrameName, FRAMES
@@ -43,10 +44,10 @@ from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_M
 
 __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES',
            'NOT_LOCATED', 'PRIOR', 'STORED_METHODS', 'UNCHECKED', 'USES_LIMIT', 'Calibration',
-           'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside', 'Quality',
-           'Rejected', 'SampleNoise', 'Verification',
-           'carried_words', 'check_sensor', 'check_units', 'converted', 'directions_of',
-           'fit_partial', 'fit_poses', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
+           'FleetPrior', 'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside',
+           'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
+           'check_units', 'converted', 'directions_of', 'fit_partial', 'fit_poses',
+           'fit_with_fleet', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
            'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples', 'outlook',
            'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
            'with_given_mounting', 'with_rest_noise']

@@ -61,7 +61,7 @@ from .unknown_orientation import copy_warning, only_norm, PRIOR, rejected_by
 from ..effects import EFFECTS
 from ..errors import counted, InputError, RefusedFitError
 from ..estimate.equations import variance_factor
-from ..estimate.fit import estimate, Fit, judge, NotConvergedError
+from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Prior
 from ..estimate.outliers import LARGEST_SHARE, originals
 from ..model import Model, MODELS, sensor_force, with_vector
 from ..sphere import unit
@@ -90,7 +90,7 @@ _LEAST_FACTOR = 1e-6
 _LARGEST_ERROR_G = 0.5
 """Largest error of |reading| of a common sensor [g], five times the typical offset."""
 
-_FIRST_NOISE_G = 0.1
+FIRST_NOISE_G = 0.1
 _NOISE_STEP = 3.0
 """Noise of the first fit [g], and the factor by which it is reduced."""
 
@@ -107,6 +107,12 @@ _LEAST_FACTOR = 1e-6
 def typical_spread() -> Floats:
     """Return the (9,) standard deviations of the values of model 10 over common sensors."""
     return np.array([EFFECTS[name].typical for name in _EFFECTS for _ in EFFECTS[name].parameters])
+
+
+def common_sensors() -> Prior:
+    """Return the distribution of the values of model 10 over common sensors."""
+    spread = typical_spread()
+    return Prior(np.zeros(len(spread)), np.diag(spread ** 2))
 
 
 def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = ''
@@ -137,7 +143,7 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
         If no row is a plausible reading at rest.
 
     """
-    sound, rejected = _usable(poses, units, 'a mounting')
+    sound, rejected = usable(poses, units, 'a mounting')
     fit = judge(Model({}), only_norm(in_g(sound, units)))
     quality = quality_of(fit, units, unit(sound.reading))
     calibration = Calibration(
@@ -187,14 +193,14 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
         If the poses determine model 10.
 
     """
-    sound, rejected = _usable(poses, units, 'a partial fit')
+    sound, rejected = usable(poses, units, 'a partial fit')
     directions = unit(sound.reading)
     if determines(_NAME, directions):
         raise ValueError(f'the {len(sound)} poses determine model {_NAME}, expected poses near '
                          'one direction: use fit_poses')
     poses_g = only_norm(in_g(sound, units))
     original = originals(poses_g)
-    fit, kept = _without_knocked(poses_g, np.unique(original))
+    fit, kept, _ = without_knocked(poses_g, np.unique(original), common_sensors())
     out = rejected_by(fit.model, poses_g.take(~np.isin(original, kept)))
     calibration = Calibration(
         _NAME, PRIOR, fit.model, units, sensor or poses.sensor, 'ros', date, fit.covariance,
@@ -203,11 +209,11 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     about = carried(calibration)
     calibration = replace(calibration, reason=_known_words(about),
                           warnings=(_open_words(about), *copy_warning(original, poses_g),
-                                    *_fit_warnings(fit)))
+                                    *partial_warnings(fit)))
     return with_rest_noise(gated(calibration), poses)
 
 
-def _usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected, ...]]:
+def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected, ...]]:
     """Return the plausible poses, without doubtful ones if others are left, and the other rows."""
     if units.name == 'native':
         raise InputError(f'the readings are in native units, and {what} does not determine their '
@@ -245,24 +251,47 @@ class _Likely:
     log_evidence: float
 
 
-def _without_knocked(poses_g: Poses, kept: NDArray[np.intp]) -> tuple[Fit, NDArray[np.intp]]:
-    """Fit poses without those that were knocked; return the indices of the poses kept."""
+def without_knocked(poses_g: Poses, kept: NDArray[np.intp], prior: Prior,
+                    noise_g: float = FIRST_NOISE_G, share: float = LARGEST_SHARE
+                    ) -> tuple[Fit, NDArray[np.intp], float]:
+    """
+    Fit poses without those that were knocked.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        Poses in g.
+    kept : (k,) array of int
+        Indices of the poses to fit, without copies.
+    prior : Prior
+        Distribution of the values over sensors.
+    noise_g : float
+        Largest noise that is tried [g].
+    share : float
+        Largest share of knocked poses.
+
+    Returns
+    -------
+    Fit, (k,) array of int, float
+        The fit, the poses kept, and the logarithm of the evidence.
+
+    """
     total = len(kept)
-    now = best = _likely(poses_g, kept, 0)
-    for knocked in range(1, int(LARGEST_SHARE * total) + 1):
+    now = best = _likely(poses_g, kept, 0, prior, noise_g)
+    for knocked in range(1, int(share * total) + 1):
         away = _away(now.fit) / now.factor
         farthest = np.argsort(-away, kind='stable')[:_TRIED]
         if now.factor == 1.0 and away[farthest[0]] < _SUSPICIOUS:
             break
-        now = max((_likely(poses_g, np.delete(now.kept, each), knocked) for each in farthest),
-                  key=lambda each: each.log_evidence)
+        now = max((_likely(poses_g, np.delete(now.kept, each), knocked, prior, noise_g)
+                   for each in farthest), key=lambda each: each.log_evidence)
         best = max(best, now, key=lambda each: each.log_evidence)
     fit = best.fit
     factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
     if best.factor > 1.0:
         factor = max(factor, best.factor)
-    fit = estimate(fit.model, fit.poses_g, typical_spread(), max(factor, _LEAST_FACTOR))
-    return fit, best.kept
+    fit = estimate(fit.model, fit.poses_g, prior, max(factor, _LEAST_FACTOR))
+    return fit, best.kept, best.log_evidence
 
 
 def _away(fit: Fit) -> Floats:
@@ -271,17 +300,18 @@ def _away(fit: Fit) -> Floats:
     return fit.by_pose.residual[:, 0] ** 2 / np.maximum(own, _LEAST_OWN)
 
 
-def _likely(poses_g: Poses, kept: NDArray[np.intp], knocked: int) -> _Likely:
+def _likely(poses_g: Poses, kept: NDArray[np.intp], knocked: int, prior: Prior,
+            noise_g: float) -> _Likely:
     """Return the fit with the most probable variance factor; the other poses were knocked."""
-    used, spread = poses_g.take(kept), typical_spread()
-    model, factors = with_vector(_EFFECTS, np.zeros(len(spread))), _factors(used)
+    used = poses_g.take(kept)
+    model, factors = with_vector(_EFFECTS, prior.mean), _factors(used, noise_g)
     found = []
     for factor in factors:
         try:
-            fit = estimate(model, used, spread, factor)
+            fit = estimate(model, used, prior, factor)
         except NotConvergedError:  # poses as precise as this contradict every common sensor
             break
-        model, evidence = fit.model, _log_evidence(fit, factor)
+        model, evidence = fit.model, _log_evidence(fit, factor, prior)
         if factor == 1.0:
             evidence += _AS_STATED
         scale = float(np.median(fit.equations.scale))
@@ -292,22 +322,22 @@ def _likely(poses_g: Poses, kept: NDArray[np.intp], knocked: int) -> _Likely:
     return max(found, key=lambda each: each.log_evidence)
 
 
-def _factors(poses_g: Poses) -> list[float]:
+def _factors(poses_g: Poses, noise_g: float) -> list[float]:
     """Return the variance factors to try, from that of a large noise to 1."""
     scale = float(np.median(judge(Model({}), poses_g).equations.scale))
-    steps = int(np.ceil(max(np.log(_FIRST_NOISE_G / scale) / np.log(_NOISE_STEP), 0.0)))
+    steps = int(np.ceil(max(np.log(noise_g / scale) / np.log(_NOISE_STEP), 0.0)))
     return [_NOISE_STEP ** (2.0 * step) for step in range(steps, -1, -1)]
 
 
-def _log_evidence(fit: Fit, factor: float) -> float:
+def _log_evidence(fit: Fit, factor: float, prior: Prior) -> float:
     """Return the logarithm of the probability of the readings with this variance factor."""
-    columns = fit.columns * typical_spread()
+    columns = fit.columns @ prior.root
     deviation = 0.0 if fit.prior is None else float(np.sum(fit.prior.residual ** 2))
     spread = factor * np.eye(len(columns)) + columns @ columns.T
     return -((fit.chi2 + deviation) / factor + float(np.linalg.slogdet(spread)[1])) / 2.0
 
 
-def _fit_warnings(fit: Fit) -> tuple[str, ...]:
+def partial_warnings(fit: Fit) -> tuple[str, ...]:
     """Return the warnings about the noise of the poses."""
     found = fit_warnings(fit, 0.0)
     if fit.dof > 0:

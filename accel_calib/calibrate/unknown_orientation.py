@@ -51,7 +51,10 @@ METHODS = get_args(Method)
 PRIOR = 'prior'
 """Method of a calibration whose values are partly those of a common sensor; see `.partial`."""
 
-STORED_METHODS = (*METHODS, PRIOR)
+FLEET = 'fleet'
+"""Method of a calibration whose values are partly those of a fleet; see `.fleet_prior`."""
+
+STORED_METHODS = (*METHODS, PRIOR, FLEET)
 """Methods of stored calibrations; the user selects one of `METHODS`."""
 
 _LEVEL = 0.03

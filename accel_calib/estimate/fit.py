@@ -14,8 +14,8 @@ here: native readings can have any offset, and known orientations any rotation.
 
 **Prior.** Poses that do not determine all values are fitted with the spread of common sensors.
 
-Each value then has an additional row, 0 = value / spread, in units of the noise (maximum a
-posteriori). The rows are part of the cost and of JᵀJ, but not of the residuals of the poses: chi²
+Each value then has an additional row, 0 = (value - mean) / spread for independent values, in units
+of the noise (maximum a posteriori). The rows are part of the cost and of JᵀJ, but not of the residuals of the poses: chi²
 and the degrees of freedom are those of the poses. The number of values that the poses determine is
 the sum of their leverages. The covariance is the posterior covariance, and includes the prior.
 The variance factor of the noise is given, because it determines the weight of the prior.
@@ -373,7 +373,35 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
 
 
-def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
+@dataclass(frozen=True)
+class Prior:
+    """
+    Normal distribution of the values of model 10 over sensors, before any pose.
+
+    Parameters
+    ----------
+    mean : (9,) array
+        Means [g].
+    covariance : (9, 9) array
+        Covariance [g²], positive definite.
+
+    """
+
+    mean: Floats
+    covariance: Floats
+
+    @cached_property
+    def root(self) -> Floats:
+        """Return L, (9, 9), with L Lᵀ the covariance."""
+        return np.linalg.cholesky(self.covariance)
+
+    @cached_property
+    def whitening(self) -> Floats:
+        """Return L⁻¹, (9, 9), which converts deviations to independent units."""
+        return np.linalg.inv(self.root)
+
+
+def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
              factor: float | None = None) -> Fit:
     """
     Fit a model.
@@ -384,9 +412,9 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
         Effects with their start values, ΔR = I.
     poses_g : Poses
         Poses in g, of known, shared or unknown orientation, with the context of the effects.
-    prior : (q,) array, optional
-        Standard deviation of each fitted value over common sensors, whose mean is zero. The
-        effects are then those of model 10. By default there is no prior.
+    prior : Prior, optional
+        Distribution of the fitted values over sensors. The effects are then those of model 10. By
+        default there is no prior.
     factor : float, optional
         Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
         that of the residuals in the covariance.
@@ -404,7 +432,7 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
     """
     fitted, noise = start.fitted, noise_of(poses_g)
     vector = start.vector.copy()
-    weight = None if prior is None else np.sqrt(1.0 if factor is None else factor) / prior
+    weight = np.sqrt(1.0 if factor is None else factor)
 
     def model_at(values: Floats) -> Model:
         vector[fitted] = values
@@ -416,7 +444,7 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
             try:
                 near = equations(model, poses_g, noise)
                 return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
-                                   values, weight)
+                                   values, prior, weight)
             except np.linalg.LinAlgError:
                 return NOWHERE
 
@@ -433,12 +461,13 @@ def estimate(start: Model, poses_g: Poses, prior: Floats | None = None,
                free_of(start), at_bound, own, factor)
 
 
-def _with_prior(point: Point, values: Floats, weight: Floats | None) -> Point:
+def _with_prior(point: Point, values: Floats, prior: Prior | None, weight: float) -> Point:
     """Return a point with the rows of the prior at these values after those of the poses."""
-    if weight is None:
+    if prior is None:
         return point
-    return Point(np.concatenate([point.residual, -values * weight]),
-                 np.vstack([point.columns, np.diag(weight)]), point.source, _SINGULAR_WITH_PRIOR)
+    rows = prior.whitening * weight
+    return Point(np.concatenate([point.residual, rows @ (prior.mean - values)]),
+                 np.vstack([point.columns, rows]), point.source, _SINGULAR_WITH_PRIOR)
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:

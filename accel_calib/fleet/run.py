@@ -12,17 +12,20 @@ memory and that of the scheduler therefore do not grow with the number of record
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
-from .sensors import merge_sensor, write_sensors
+from .prior import PRIOR_COLUMNS, PRIOR_FILE, priors_of
+from .sensors import merge_sensor, read_sensors, write_sensors
 from .store import Row, Store
 from .task import calibrate_recording, Done, Options, unread_row
+from ..calibrate.fleet_prior import FleetPrior
 from ..errors import InputError
 from ..files import Progress
+from ..files.fleet_yaml import write_priors
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -46,11 +49,14 @@ class Summary:
         Number of recordings by status: ok, error, unread, skipped.
     sensors : tuple of dict
         The rows of all sensors.
+    priors : mapping of str to FleetPrior
+        Typical values by model of sensor.
 
     """
 
     counts: Counter[str]
     sensors: tuple[Row, ...]
+    priors: Mapping[str, FleetPrior]
 
 
 @contextmanager
@@ -133,12 +139,18 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             unread += [] if done.row is None else [done.row]
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
-        return Summary(counts, tuple(_merge(client, store)))
+        sensors = tuple(_merge(client, store))
+        priors = priors_of(store.all_rows(PRIOR_COLUMNS))
+        if priors:
+            write_priors(store.folder / PRIOR_FILE, priors)
+        return Summary(counts, sensors, priors)
 
 
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     rows, names = [], store.waiting()
+    if not names:
+        return read_sensors(store)
     for _, result in _mapped(client, merge_sensor, names, store):
         if isinstance(result, Exception):
             raise result

@@ -14,7 +14,6 @@ otherwise the calibration after the step is the odd one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
 
@@ -120,16 +119,15 @@ def _stays(ordered: Sequence[Calibration], before: int, limit: float) -> bool | 
 
 def write_sensors(store: Store, rows: Sequence[Row]) -> list[Row]:
     """Add or replace the rows of sensors, and return the rows of all of them."""
-    path = store.folder / _FILE
-    known = {row['sensor']: row for row in read_sensors(path)}
-    known |= {row['sensor']: row for row in rows}
+    known = {row['sensor']: row for row in (*read_sensors(store), *rows)}
     found = [known[name] for name in sorted(known)]
-    write_parquet(path, found, sensors_schema())
+    write_parquet(store.folder / _FILE, found, sensors_schema())
     return found
 
 
-def read_sensors(path: Path) -> list[Row]:
-    """Return the rows of a file of sensors; none if there is no file."""
+def read_sensors(store: Store) -> list[Row]:
+    """Return the rows of all sensors; none if there is no file."""
     import pyarrow.parquet as pq
 
+    path = store.folder / _FILE
     return pq.ParquetFile(path).read().to_pylist() if path.exists() else []

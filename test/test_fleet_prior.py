@@ -1,0 +1,162 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Few poses are fitted with the typical values of a fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accel_calib.calibrate import Calibration, fit_poses, fit_with_fleet, FleetPrior
+from accel_calib.errors import InputError
+from accel_calib.files import read_calibration, write_calibration
+from accel_calib.files.fleet_yaml import read_prior, write_priors
+from accel_calib.fleet.prior import estimated, priors_of
+from accel_calib.model import Model, MODELS, sensor_force, with_vector
+from accel_calib.simulate import simulate_poses
+from accel_calib.sphere import OVER_THE_SPHERE, spread_directions, unit
+from accel_calib.table import Poses
+from accel_calib.units import Units
+
+IN_G = Units('g', 1.0)
+MEAN = np.array([0.010, -0.015, 0.030, 0.010, 0.012, -0.020, 0.004, 0.000, -0.003])
+SPREAD = np.repeat([0.020, 0.008, 0.006], 3)
+
+
+def a_sensor(rng: np.random.Generator, factor: float = 1.0) -> Model:
+    return with_vector(MODELS['10'], MEAN + factor * SPREAD * rng.normal(size=9))
+
+
+def poses_of(sensor: Model, count: int, rng: np.random.Generator) -> Poses:
+    directions = unit(spread_directions(count) + 0.05 * rng.normal(size=(count, 3)))
+    return simulate_poses(sensor, directions, rng)
+
+
+def error_mg(calibration: Calibration, sensor: Model) -> float:
+    """Return the RMS error of the corrected |a| over the sphere [mg]."""
+    mat_w, vec_v = sensor.linear_part
+    corrected = sensor_force(calibration.model, OVER_THE_SPHERE @ mat_w.T + vec_v, {})
+    return 1e3 * float(np.sqrt(np.mean((np.linalg.norm(corrected, axis=1) - 1.0) ** 2)))
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.fixture(scope='module')
+def fleet() -> FleetPrior:
+    """Return the typical values of 40 sensors, two of which are unlike the others."""
+    rng = np.random.default_rng(1)
+    fits = [fit_poses(poses_of(a_sensor(rng, 8.0 if k in (3, 17) else 1.0), 20, rng), IN_G,
+                      model='10') for k in range(40)]
+    found = estimated(np.array([each.model.vector for each in fits]),
+                      np.array([each.covariance for each in fits]))
+    return FleetPrior('', len(fits), found)
+
+
+def test_the_typical_values_are_those_of_the_fleet_without_the_odd_sensors(
+        fleet: FleetPrior) -> None:
+    spread = np.sqrt(np.diag(fleet.prior.covariance))
+    assert np.all(np.abs(fleet.prior.mean - MEAN) < 3.0 * SPREAD / np.sqrt(40))
+    assert np.all((0.6 * SPREAD < spread) & (spread < 1.6 * SPREAD))
+
+
+def test_six_poses_with_the_fleet_have_half_the_error(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(2)
+    without, with_fleet, within = [], [], []
+    for _ in range(10):
+        sensor = a_sensor(rng)
+        poses = poses_of(sensor, 6, rng)
+        fitted = fit_with_fleet(poses, IN_G, fleet)
+        without.append(error_mg(fit_poses(poses, IN_G), sensor))
+        with_fleet.append(error_mg(fitted, sensor))
+        deviation = np.sqrt(np.diag(fitted.covariance))
+        within += (np.abs(fitted.model.vector - sensor.vector) / deviation).tolist()
+    assert rms(with_fleet) < 0.6 * rms(without)
+    assert 0.5 < rms(within) < 1.6
+
+
+def test_a_sensor_unlike_the_fleet_is_not_pulled_in(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(3)
+    without, with_fleet, pulled = [], [], []
+    for _ in range(10):
+        values = a_sensor(rng).vector + np.eye(9)[2] * 0.25  # 12 spreads in z
+        sensor = with_vector(MODELS['10'], values)
+        poses = poses_of(sensor, 6, rng)
+        fitted = fit_with_fleet(poses, IN_G, fleet)
+        without.append(error_mg(fit_poses(poses, IN_G), sensor))
+        with_fleet.append(error_mg(fitted, sensor))
+        pulled.append(float(fitted.offset[2] - values[2]) / 0.25)
+    assert rms(with_fleet) < rms(without)
+    assert abs(np.mean(pulled)) < 0.08
+
+
+def test_many_poses_outweigh_the_fleet(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(4)
+    sensor = with_vector(MODELS['10'], MEAN + 6.0 * SPREAD * np.tile([1.0, -1.0, 1.0], 3))
+    poses = poses_of(sensor, 18, rng)
+    fitted, alone = fit_with_fleet(poses, IN_G, fleet), fit_poses(poses, IN_G, model='10')
+    assert np.all(np.abs(fitted.model.vector - alone.model.vector)
+                  < 0.3 * np.sqrt(np.diag(alone.covariance)))
+
+
+def test_the_calibration_states_the_fleet_and_is_stored(fleet: FleetPrior, tmp_path: Path
+                                                         ) -> None:
+    rng = np.random.default_rng(5)
+    fitted = fit_with_fleet(poses_of(a_sensor(rng), 6, rng), IN_G, fleet, sensor='imu')
+    write_calibration(tmp_path / 'a.yaml', fitted)
+    stored = read_calibration(tmp_path / 'a.yaml')
+    assert stored.method == 'fleet'
+    assert stored.reason == '6 poses with the typical values of 40 sensors'
+    np.testing.assert_allclose(stored.covariance, fitted.covariance, rtol=1e-6)
+
+
+def test_typical_values_are_computed_by_model_of_sensor() -> None:
+    rng = np.random.default_rng(6)
+    rows = [{'sensor': f'{model}_{k}', 'sensor_model': model,
+             'prior_values': (mean + 0.01 * rng.normal(size=9)).tolist(),
+             'prior_covariance': (1e-8 * np.eye(9)).ravel().tolist()}
+            for model, mean, count in (('A', 0.0, 12), ('B', 0.1, 12), ('C', 0.0, 4))
+            for k in range(count) for _ in range(2)]
+    found = priors_of([*rows, {'sensor': 'x', 'sensor_model': 'A', 'prior_values': None,
+                               'prior_covariance': None}])
+    assert {name: each.sensors for name, each in found.items()} == {'A': 12, 'B': 12}
+    assert np.mean(found['B'].prior.mean) == pytest.approx(0.1, abs=0.005)
+
+
+def test_the_file_keeps_the_values_and_asks_for_the_model(fleet: FleetPrior, tmp_path: Path
+                                                           ) -> None:
+    path = tmp_path / 'fleet.yaml'
+    write_priors(path, {'A': FleetPrior('A', 40, fleet.prior)})
+    np.testing.assert_allclose(read_prior(path).prior.covariance, fleet.prior.covariance)
+    with pytest.raises(InputError, match="has A, expected the model 'B'"):
+        read_prior(path, 'B')
+
+
+@pytest.mark.parametrize(('old', 'new', 'words'), [
+    ('format: 1', 'format: 2', 'has format 2, expected 1'),
+    ('offset.x', 'offset.q', 'names are'),
+    ('mean:', 'mean_of:', "'mean'"),
+    ('models:', 'other:', "'models'"),
+])
+def test_a_damaged_file_is_refused(fleet: FleetPrior, tmp_path: Path, old: str, new: str,
+                                    words: str) -> None:
+    path = tmp_path / 'fleet.yaml'
+    write_priors(path, {'': fleet})
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=words):
+        read_prior(path)
+
+
+def test_a_covariance_that_is_none_is_refused(fleet: FleetPrior, tmp_path: Path) -> None:
+    path = tmp_path / 'fleet.yaml'
+    write_priors(path, {'': fleet})
+    first = repr(float(fleet.prior.covariance[0, 0]))
+    path.write_text(path.read_text().replace(first, f'-{first}'))
+    with pytest.raises(InputError, match='positive definite'):
+        read_prior(path)
+
+
