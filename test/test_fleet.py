@@ -7,17 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+import json
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
+import time
 from typing import Any
-
-import numpy as np
-import pytest
 
 from accel_calib.api import simulate
 from accel_calib.errors import InputError
 from accel_calib.files import read_calibration, write_table
+import numpy as np
+import pytest
 
 pytest.importorskip('distributed')
 pq = pytest.importorskip('pyarrow.parquet')
@@ -183,6 +186,34 @@ def test_two_programs_do_not_write_to_one_folder(client: Any, tmp_path: Path) ->
     store = Store(tmp_path / 'out')
     with store.locked(), pytest.raises(InputError, match='another program'):
         run(client, [], QUICK, store)
+
+
+def test_a_run_whose_scheduler_is_gone_ends_with_an_error_and_is_continued(
+        client: Any, tmp_path: Path) -> None:
+    folder, store = write_fleet(tmp_path / 'in', 3, 4), Store(tmp_path / 'out')
+    command = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--port', '0', '--host',
+               '127.0.0.1', '--no-dashboard', '--scheduler-file', str(tmp_path / 'address.json')]
+    scheduler = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    worker = subprocess.Popen(
+        [sys.executable, '-m', 'distributed.cli.dask_worker', '--no-nanny', '--nthreads', '1',
+         '--no-dashboard', '--scheduler-file', str(tmp_path / 'address.json'),
+         '--death-timeout', '20'], stderr=subprocess.DEVNULL)
+    try:
+        while not (tmp_path / 'address.json').exists():
+            assert scheduler.poll() is None
+            time.sleep(0.1)
+        address = json.loads((tmp_path / 'address.json').read_text())['address']
+        with pytest.raises(InputError, match='the scheduler .* is gone'), cluster(address) as far:
+            far.wait_for_workers(1, timeout=60)
+            run(far, found_in(folder), QUICK, store,
+                lambda done, count: scheduler.kill() if done == 2 else None)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+    summary = run(client, found_in(folder), QUICK, store)
+    assert summary.counts['skipped'] >= 2
+    assert len(rows_of(store.folder)) == len({row['key'] for row in rows_of(store.folder)}) == 12
 
 
 def test_killed_workers_lose_and_double_nothing(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ import re
 from . import options
 from .terminal import progress, working
 from ..errors import counted
-from ..fleet import cluster, Options, recordings, run as run_fleet, Store, Summary
+from ..fleet import cluster, Options, recordings, Store, Summary
+from ..fleet import run as run_fleet
 
 _EXAMPLE = "accel-calib fleet recordings/ -o results/\n  accel-calib fleet 's3://fleet/*/*.mcap' " \
            '-o results/ --scheduler tcp://10.0.0.1:8786'
