@@ -48,7 +48,7 @@ def write_fleet(folder: Path, robots: int, dates: int) -> Path:
     for robot in range(robots):
         for month in range(1, dates + 1):
             write_poses(folder / f'robot_{robot}' / f'2026-{month:02d}-03.csv',
-                        OFFSET + [0.001 * robot, 0.0, 0.0], seed=100 * robot + month)
+                        OFFSET + np.eye(3)[0] * 0.001 * robot, seed=100 * robot + month)
     return folder
 
 
@@ -131,7 +131,7 @@ def test_a_recording_that_could_not_be_read_is_tried_again(client: Any, tmp_path
 
 def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
         client: Any, tmp_path: Path) -> None:
-    moved = OFFSET + [0.0, 0.0, 0.02]
+    moved = OFFSET + np.eye(3)[2] * 0.02
     for k, (changed, odd) in enumerate([(OFFSET, OFFSET), (OFFSET, moved), (moved, OFFSET),
                                         (moved, OFFSET)], 1):
         write_poses(tmp_path / 'in' / 'changed' / f'2026-{k:02d}-01.csv', changed, seed=k)
@@ -139,10 +139,12 @@ def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
     summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
     changes = {row['sensor'].split('/')[0]: row['changes'] for row in summary.sensors}
     (change,), (single,) = changes['changed'], changes['odd']
-    assert change['for_good'] and change['date'].startswith('2026-03')
+    assert change['for_good']
+    assert change['date'].startswith('2026-03')
     assert change['parameter'] == 'offset.z'
     assert change['change'] == pytest.approx(0.02, abs=5.0 * change['sd'])
-    assert not single['for_good'] and single['date'].startswith('2026-02')
+    assert not single['for_good']
+    assert single['date'].startswith('2026-02')
 
 
 def test_addresses_are_read_like_files(client: Any, tmp_path: Path) -> None:
@@ -203,10 +205,11 @@ def test_a_run_whose_scheduler_is_gone_ends_with_an_error_and_is_continued(
             assert scheduler.poll() is None
             time.sleep(0.1)
         address = json.loads((tmp_path / 'address.json').read_text())['address']
-        with pytest.raises(InputError, match='the scheduler .* is gone'), cluster(address) as far:
+        with cluster(address) as far:
             far.wait_for_workers(1, timeout=60)
-            run(far, found_in(folder), QUICK, store,
-                lambda done, count: scheduler.kill() if done == 2 else None)
+            with pytest.raises(InputError, match='the scheduler .* is gone'):
+                run(far, found_in(folder), QUICK, store,
+                    lambda done, count: scheduler.kill() if done == 2 else None)
     finally:
         for process in (scheduler, worker):
             process.kill()

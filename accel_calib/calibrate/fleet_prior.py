@@ -5,9 +5,9 @@
 Fit of few poses with the typical values of a fleet (empirical Bayes).
 
 A fleet of sensors of one model has the values of model 10 with the mean m and the covariance P
-over its sensors. A few sensors are unlike the others. The values of a sensor are therefore normally
-distributed about m with one of several covariances: those of the fleet, s² P with a small s, or
-those of common sensors (`.partial`), with the probability `_UNLIKE`.
+over its sensors. A few sensors are unlike the others. The values of a sensor are therefore
+normally distributed about m with one of several covariances: those of the fleet, s² P with a small
+s, or those of common sensors (`.partial`), with the probability `_UNLIKE`.
 
 The poses are fitted with each of them, and the most probable one is used: the evidence of the
 readings times the probability of the covariance. The readings of a sensor that is unlike the fleet
@@ -22,7 +22,7 @@ values without the fleet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,8 +49,8 @@ _UNLIKE = {1.0: 0.008, 4.0: 0.002}
 _LARGEST_NOISE_G = 0.02
 """Largest error of poses that is tried [g]; larger ones are knocked poses, not noise."""
 
-_UNLIKE_WORDS = ('the sensor is unlike the fleet, so the typical values of the fleet are not used: '
-                 'take more poses')
+_UNLIKE_WORDS = ('the sensor is unlike the fleet, so the typical values of the fleet are not '
+                 'used: take more poses')
 
 
 @dataclass(frozen=True)

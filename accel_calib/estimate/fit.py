@@ -14,10 +14,11 @@ here: native readings can have any offset, and known orientations any rotation.
 
 **Prior.** Poses that do not determine all values are fitted with the spread of common sensors.
 
-Each value then has an additional row, 0 = (value - mean) / spread for independent values, in units
-of the noise (maximum a posteriori). The rows are part of the cost and of JᵀJ, but not of the residuals of the poses: chi²
-and the degrees of freedom are those of the poses. The number of values that the poses determine is
-the sum of their leverages. The covariance is the posterior covariance, and includes the prior.
+The values then have additional rows, 0 = L⁻¹ (values - mean) with L Lᵀ their covariance, in units
+of the noise (maximum a posteriori). The rows are part of the cost and of JᵀJ, but not of the
+residuals of the poses: chi² and the degrees of freedom are those of the poses. The number of
+values that the poses determine is the sum of their leverages. The covariance is the posterior
+covariance, and includes the prior.
 The variance factor of the noise is given, because it determines the weight of the prior.
 
 **Solver.** Damped least squares (Levenberg 1944, Marquardt 1963) within bounds.

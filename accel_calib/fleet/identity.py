@@ -74,7 +74,8 @@ def as_folder(sensor: str) -> str:
         name = name.replace('.', '%2E')
     if len(name) <= _LONGEST_FOLDER:
         return name
-    return f'{name[:_LONGEST_FOLDER]}~{hashlib.blake2b(sensor.encode(), digest_size=8).hexdigest()}'
+    rest = hashlib.blake2b(sensor.encode(), digest_size=8).hexdigest()
+    return f'{name[:_LONGEST_FOLDER]}~{rest}'
 
 
 def date_of(found: Input, poses: Poses | None, modified_s: float | None) -> tuple[str, str]:
@@ -104,7 +105,8 @@ def date_of(found: Input, poses: Poses | None, modified_s: float | None) -> tupl
     if matches:
         year, _, month, day, *clock = matches[-1].groups()
         try:
-            when = datetime(int(year), int(month), int(day), *(int(part or 0) for part in clock),
+            hour, minute, second = (int(part or 0) for part in clock)
+            when = datetime(int(year), int(month), int(day), hour, minute, second,
                             tzinfo=timezone.utc)
             return when.isoformat(timespec='seconds'), 'path'
         except ValueError:  # such as 30 February

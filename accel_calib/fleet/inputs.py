@@ -67,7 +67,8 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
             yield found
         if found is None:
             raise InputError(f'{text} holds no recording, expected at least one that ends with '
-                             f'{", ".join(_SUFFIXES)}', 'correct the name, or put a glob in quotes')
+                             f'{", ".join(_SUFFIXES)}',
+                             'correct the name, or put a glob in quotes')
 
 
 def _lines(path: Path) -> Iterator[str]:

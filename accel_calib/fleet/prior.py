@@ -104,7 +104,7 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     count, size = values.shape
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
-    covariance = np.diag(spread ** 2)
+    covariance: Floats = np.diag(spread ** 2)
     for _ in range(_STEPS):
         before = covariance
         mean, covariance = _step(values, covariances, mean, covariance)

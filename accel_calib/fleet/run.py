@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
+from .page import write_fleet_page
 from .prior import PRIOR_COLUMNS, PRIOR_FILE, priors_of
 from .sensors import merge_sensor, read_sensors, write_sensors
 from .store import Row, Store
@@ -143,6 +144,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         priors = priors_of(store.all_rows(PRIOR_COLUMNS))
         if priors:
             write_priors(store.folder / PRIOR_FILE, priors)
+        write_fleet_page(store, sensors)
         return Summary(counts, sensors, priors)
 
 

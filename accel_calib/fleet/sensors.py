@@ -71,7 +71,8 @@ def merge_sensor(name: str, store: Store) -> Row:
     store.merge(name)
     rows = store.of_sensor(name)
     good = [row for row in rows if row['calibration']][-_MOST_COMPARED:]
-    about: Row = {'sensor': unquote(name), 'recordings': len(rows), 'calibrations': len(good),
+    about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': unquote(name),
+                  'recordings': len(rows), 'calibrations': len(good),
                   'errors': sum(row['status'] != 'ok' for row in rows), 'changes': [],
                   'sensor_model': rows[-1]['sensor_model'] if rows else ''}
     if good:

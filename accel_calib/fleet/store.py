@@ -5,9 +5,9 @@
 The results of a fleet on a disk: a Parquet data set, written so that each result is there once.
 
 A worker writes a row to ``pending/<sensor>/<key>.json``. `Store.merge` adds the rows of a sensor
-to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending rows when
-all that depends on them is written. Each step replaces files atomically, and the rows are merged
-by content. So a run can stop anywhere, and the next run merges the same rows again.
+to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending rows
+when all that depends on them is written. Each step replaces files atomically, and the rows are
+merged by content. So a run can stop anywhere, and the next run merges the same rows again.
 
 """
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 UNREAD = '~unread'
-"""Sensor of the recordings that could not be read in the last run; `as_folder` has no such name."""
+"""Folder of the rows of recordings that could not be read; no sensor has this folder."""
 
 _DATA = 'data.parquet'
 _TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
