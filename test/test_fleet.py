@@ -19,15 +19,14 @@ from typing import Any
 from accel_calib.api import simulate
 from accel_calib.errors import InputError
 from accel_calib.files import read_calibration, write_table
+from accel_calib.fleet import cluster, Input, Options, recordings, run, Store
+from accel_calib.fleet.identity import as_folder, date_of, sensor_of
+from accel_calib.fleet.inputs import content_hash
 import numpy as np
 import pytest
 
 pytest.importorskip('distributed')
 pq = pytest.importorskip('pyarrow.parquet')
-
-from accel_calib.fleet import cluster, Input, Options, recordings, run, Store  # noqa: E402
-from accel_calib.fleet.identity import as_folder, date_of, sensor_of  # noqa: E402
-from accel_calib.fleet.inputs import content_hash  # noqa: E402
 
 OFFSET = np.array([0.01, -0.02, 0.03])
 QUICK = Options(refined=False)

@@ -5,12 +5,9 @@
 
 from __future__ import annotations
 
+from accel_calib.fleet.page import not_agreeing, odd_sensors, overview, shared_effects
 import numpy as np
 import pytest
-
-pytest.importorskip('scipy')
-
-from accel_calib.fleet.page import not_agreeing, odd_sensors, overview, shared_effects  # noqa: E402
 
 NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain.xy', 'gain.xz',
          'gain.yz')

@@ -102,8 +102,8 @@ def test_many_poses_outweigh_the_fleet(fleet: FleetPrior) -> None:
                   < 0.3 * np.sqrt(np.diag(alone.covariance)))
 
 
-def test_the_calibration_states_the_fleet_and_is_stored(fleet: FleetPrior, tmp_path: Path
-                                                         ) -> None:
+def test_the_calibration_states_the_fleet_and_is_stored(
+        fleet: FleetPrior, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     fitted = fit_with_fleet(poses_of(a_sensor(rng), 6, rng), IN_G, fleet, sensor='imu')
     write_calibration(tmp_path / 'a.yaml', fitted)
@@ -126,8 +126,8 @@ def test_typical_values_are_computed_by_model_of_sensor() -> None:
     assert np.mean(found['B'].prior.mean) == pytest.approx(0.1, abs=0.005)
 
 
-def test_the_file_keeps_the_values_and_asks_for_the_model(fleet: FleetPrior, tmp_path: Path
-                                                           ) -> None:
+def test_the_file_keeps_the_values_and_asks_for_the_model(
+        fleet: FleetPrior, tmp_path: Path) -> None:
     path = tmp_path / 'fleet.yaml'
     write_priors(path, {'A': FleetPrior('A', 40, fleet.prior)})
     np.testing.assert_allclose(read_prior(path).prior.covariance, fleet.prior.covariance)
@@ -141,8 +141,8 @@ def test_the_file_keeps_the_values_and_asks_for_the_model(fleet: FleetPrior, tmp
     ('mean:', 'mean_of:', "'mean'"),
     ('models:', 'other:', "'models'"),
 ])
-def test_a_damaged_file_is_refused(fleet: FleetPrior, tmp_path: Path, old: str, new: str,
-                                    words: str) -> None:
+def test_a_damaged_file_is_refused(
+        fleet: FleetPrior, tmp_path: Path, old: str, new: str, words: str) -> None:
     path = tmp_path / 'fleet.yaml'
     write_priors(path, {'': fleet})
     path.write_text(path.read_text().replace(old, new))
@@ -157,5 +157,3 @@ def test_a_covariance_that_is_none_is_refused(fleet: FleetPrior, tmp_path: Path)
     path.write_text(path.read_text().replace(first, f'-{first}'))
     with pytest.raises(InputError, match='positive definite'):
         read_prior(path)
-
-

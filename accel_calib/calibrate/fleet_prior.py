@@ -146,4 +146,3 @@ def _reason(fleet: FleetPrior, count: int) -> str:
     name = f' of model {fleet.model}' if fleet.model else ''
     return (f'{counted(count, "pose")} with the typical values of '
             f'{counted(fleet.sensors, "sensor")}{name}')
-

@@ -16,7 +16,7 @@ from ..fleet import cluster, Options, recordings, Store, Summary
 from ..fleet import run as run_fleet
 
 _EXAMPLE = ('accel-calib fleet recordings/ -o results/\n'
-            "  accel-calib fleet 's3://fleet/*/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786")
+            "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786")
 
 
 def add_to(made: argparse.ArgumentParser) -> None:
