@@ -351,7 +351,7 @@ def test_both_are_stored_and_read(make, tmp_path):
 
 def test_the_prior_is_no_choice_of_the_user():
     assert METHODS == ('ml', 'algebraic')
-    assert set(STORED_METHODS) == {*METHODS, PRIOR}
+    assert set(STORED_METHODS) == {*METHODS, PRIOR, 'fleet'}
 
 
 def test_a_partial_fit_is_better_than_none_and_refine_completes_it():
