@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib.util import find_spec
 import io
 import os
 from pathlib import Path
@@ -29,7 +30,9 @@ from time import monotonic
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent)]
 
+from accel_calib.api import simulate  # noqa: E402
 from accel_calib.calibrate.pose_planning import next_pose  # noqa: E402
+from accel_calib.files import write_table  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 import numpy as np  # noqa: E402
 from rich.console import Console  # noqa: E402
@@ -315,6 +318,31 @@ def screenshot(page: Path, picture: Path) -> None:
                    check=True, capture_output=True, timeout=120)
 
 
+# The page of a fleet
+
+_ROBOTS, _MONTHS = 40, 8
+
+
+def fleet_picture(folder: Path) -> None:
+    """Calibrate a simulated fleet with an odd sensor, and take a picture of its page."""
+    rng = np.random.default_rng(1)
+    for robot in range(_ROBOTS):
+        offset = rng.normal((0.01, -0.015, 0.03), 0.02)
+        gain = rng.normal((0.01, 0.012, -0.02), 0.008)
+        offset[2] += 0.25 * (robot == 17)
+        for month in range(1, _MONTHS + 1):
+            later = np.array([0.002 * month, 0.012 * (robot == 3 and month > 4), 0.0])
+            poses = simulate({'offset': offset + later, 'axis_gain': gain}, poses=14,
+                             units='g', seed=100 * robot + month)
+            path = folder / 'fleet' / f'robot_{robot}' / f'2026-{month:02d}-03.csv'
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_table(path, poses)
+    command = 'accel-calib fleet fleet -o results --no-refine --units g'
+    for _ in _lines_of(command, folder):
+        pass
+    screenshot(folder / 'results' / 'fleet.html', FOLDER / 'fleet.png')
+
+
 # The live page
 
 def live_pictures(folder: Path) -> None:
@@ -353,6 +381,8 @@ def main() -> None:
         page = folder / 'calibration.html'
         if page.exists():
             screenshot(page, FOLDER / 'page.png')
+        if find_spec('distributed') is not None:
+            fleet_picture(folder)
         if shutil.which('chromium'):
             live_pictures(folder)
 

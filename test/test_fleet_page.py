@@ -5,7 +5,28 @@
 
 from __future__ import annotations
 
-from accel_calib.fleet.page import not_agreeing, odd_sensors, overview, shared_effects
+from pathlib import Path
+import re
+from typing import Any
+from urllib.parse import unquote
+
+from accel_calib.api import simulate
+from accel_calib.calibrate import fit_poses, FleetPrior
+from accel_calib.compare import history_of
+from accel_calib.estimate.fit import Prior
+from accel_calib.files import write_calibration
+from accel_calib.fleet.identity import as_folder
+from accel_calib.fleet.overview import (
+    Months,
+    not_agreeing,
+    odd_sensors,
+    overview,
+    shared_effects,
+)
+from accel_calib.fleet.page import write_fleet_page
+from accel_calib.fleet.sensors import drift_of, merge_sensor
+from accel_calib.fleet.store import schema, Store, write_parquet
+from accel_calib.units import Units
 import numpy as np
 import pytest
 
@@ -61,3 +82,157 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     np.testing.assert_allclose(known.values['']['s'], 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 1, 'BAD': 1, 'error': 1}
     assert len(known.errors) == 1
+
+
+def test_a_value_that_is_known_badly_is_not_odd() -> None:
+    """Most sensors have no cross-axis gain, so that its spread over the fleet is zero."""
+    values = {f's{k}': np.zeros(9) for k in range(60)}
+    sds = {name: np.zeros(9) for name in values}
+    for name, size in (('s3', 3.0), ('s4', 30.0)):
+        values[name][6], sds[name][6] = size * 2e-4, 2e-4
+    assert [each[:2] for each in odd_sensors(values, sds)] == [('s4', 'gain.xy')]
+
+
+def test_months_have_the_quantiles_of_all_calibrations() -> None:
+    rng = np.random.default_rng(4)
+    months = Months(rng)
+    for _ in range(3000):
+        months.add('2026-03', rng.normal(size=9))
+    months.add('2026-04', np.zeros(9))  # too few to state quantiles
+    names, found = months.quantiles((0.05, 0.5, 0.95))
+    assert names == ['2026-03']
+    np.testing.assert_allclose(found[0].mean(axis=1), [-1.645, 0.0, 1.645], atol=0.1)
+
+
+def calibrations_of(offsets: list[float], rng: np.random.Generator) -> list[Any]:
+    """Return calibrations of a sensor with these offsets in x [g], one a month."""
+    return [fit_poses(simulate({'offset': (each, 0.0, 0.0)}, poses=16, units='g',
+                               seed=int(rng.integers(1 << 30))), Units('g', 1.0), model='10',
+                      date=f'2026-{month:02d}-03T00:00:00+00:00')
+            for month, each in enumerate(offsets, 1)]
+
+
+def test_the_drift_of_a_sensor_is_stated_with_its_uncertainty() -> None:
+    rng = np.random.default_rng(5)
+    drift = drift_of(history_of(calibrations_of([0.010 * k / 12.0 for k in range(8)], rng)))
+    assert drift is not None
+    assert drift['parameter'] == 'offset.x'
+    assert abs(drift['per_year'] - 0.010) < 4.0 * drift['sd'] < 0.002
+    assert drift['p_value'] < 1e-3
+    steady = drift_of(history_of(calibrations_of([0.01] * 8, rng)))
+    assert steady is not None
+    assert steady['p_value'] > 0.01
+    assert drift_of(history_of(calibrations_of([0.01] * 2, rng))) is None
+
+
+@pytest.mark.parametrize(('drift', 'steps', 'expected'), [
+    (0.0, [0] * 8, []),
+    (0.002, [0] * 8, []),
+    (0.0, [0, 0, 0, 0, 1, 1, 1, 1], [(4, True)]),
+    (0.002, [0, 0, 0, 0, 1, 1, 1, 1], [(4, True)]),
+    (0.0, [0, 0, 0, 1, 0, 0, 0, 0], [(3, False)]),
+    (0.002, [0, 0, 0, 1, 0, 0, 0, 0], [(3, False)]),
+    (0.0, [0, 0, 0, 0, 0, 0, 0, 1], [(7, None)]),
+    (0.0, [0, 1, 1], [(1, True)]),
+])
+def test_a_step_is_told_from_a_steady_drift(
+        tmp_path: Path, drift: float, steps: list[int], expected: list[tuple[int, bool]]) -> None:
+    """Each calibration drifts by `drift` and may be off by 12 mg."""
+    store, rng = Store(tmp_path), np.random.default_rng(7)
+    calibrations = calibrations_of([drift * k + 0.012 * step for k, step in enumerate(steps)], rng)
+    for k, each in enumerate(calibrations):
+        write_calibration(tmp_path / f'{k}.yaml', each)
+        store.add({**dict.fromkeys(schema().names), 'sensor': 's', 'key': str(k), 'status': 'ok',
+                   'content': str(k), 'date': each.date, 'recording': f'{k}.csv',
+                   'calibration': f'{k}.yaml'})
+    row = merge_sensor('s', store)
+    assert [(each['recording'], each['for_good']) for each in row['changes']] == [
+        (f'{k}.csv', for_good) for k, for_good in expected]
+    assert all(each['parameter'] == 'offset.x' for each in row['changes'])
+    if drift:
+        assert row['drift']['parameter'] == 'offset.x'
+        assert row['drift']['per_year'] == pytest.approx(12.0 * drift, rel=0.08)
+    elif len(steps) > 3:
+        assert row['drift']['p_value'] > 0.01
+
+
+def write_store(folder: Path, count: int, dates: int = 6, name: str = 'robot_{}/imu_link'
+                ) -> tuple[Store, list[dict[str, Any]]]:
+    """Write a fleet: all drift in x, sensor 5 is odd in z, sensor 3 changes in y for good."""
+    rng, store, sensors = np.random.default_rng(6), Store(folder), []
+    nothing = dict.fromkeys(schema().names)
+    for k in range(count):
+        mean = np.array([0.01, -0.015, 0.3 if k == 5 else 0.03, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        mean += 0.01 * rng.normal(size=9)
+        rows = []
+        for date in range(dates):
+            values = mean + 3e-4 * rng.normal(size=9) + 0.002 * date * np.eye(9)[0]
+            values[1] += 0.012 if k == 3 and date >= dates // 2 else 0.0
+            rows.append({
+                **nothing, 'key': f'{k}-{date}', 'recording': f'logs/{k}_{date}.mcap',
+                'sensor_model': 'A', 'date': f'2026-{date + 1:02d}-03T09:00:00+00:00',
+                'status': 'ok', 'rating': 'GOOD', 'calibration': f'{k}-{date}.yaml',
+                'parameters': [], **dict(zip(NAMES, values.tolist(), strict=True)),
+                **{f'{each}.sd': 3e-4 for each in NAMES}})
+        _write_rows(store, name.format(k), rows)
+        change = {'key': rows[dates // 2]['key'], 'date': rows[dates // 2]['date'],
+                  'p_value': 1e-9, 'parameter': 'offset.y', 'change': 0.012, 'sd': 4e-4,
+                  'for_good': True, 'recording': rows[dates // 2]['recording']}
+        sensors.append({'sensor': unquote(as_folder(name.format(k))), 'calibrations': dates,
+                        'last': rows[-1]['date'], 'p_value': 1e-9 if k == 3 else 0.5,
+                        'changes': [change] if k == 3 else [], 'drift': None})
+    return store, sensors
+
+
+def _write_rows(store: Store, sensor: str, rows: list[dict[str, Any]]) -> None:
+    folder = store.rows / f'sensor={as_folder(sensor)}'
+    folder.mkdir(parents=True)
+    write_parquet(folder / 'data.parquet', rows, schema())
+
+
+def page_of(store: Store, sensors: list[dict[str, Any]], **options: Any) -> str:
+    write_fleet_page(store, sensors, **options)
+    return (store.folder / 'fleet.html').read_text(encoding='utf-8')
+
+
+def test_the_page_draws_the_values_the_drift_and_the_sensors_that_changed(tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    store, sensors = write_store(tmp_path, 30)
+    prior = FleetPrior('A', 30, Prior(np.full(9, 0.0123), np.eye(9) * 0.02 ** 2))
+    page = page_of(store, sensors, priors={'A': prior})
+    figures = re.findall(r'<figure>.*?</figure>', page, re.DOTALL)
+    texts = [' '.join(re.findall(r'>([^<]+)<', figure)) for figure in figures]
+    (histogram,) = (text for text in texts if 'Zero-g offset [mg]' in text)
+    assert 'robot_5/imu_link' in histogram
+    assert 'robot_6/imu_link' not in histogram
+    assert any('Zero-g offset minus its median' in text for text in texts)
+    (changed,) = (text for text in texts if 'robot_3/imu_link' in text)
+    assert 'logs/3_3.mcap: offset y +12.00 ± 0.40 mg, for good' in changed
+    assert '12.3' in page.partition('Typical values')[2]
+    assert 'other sensors not shown' in page
+
+
+def test_the_page_needs_no_script_and_no_other_file(tmp_path: Path) -> None:
+    store, sensors = write_store(tmp_path, 6)
+    page = page_of(store, sensors)
+    assert '<script' not in page
+    assert not re.search(r'(src|href)="(?!#)', page)
+    assert not re.search(r'\son\w+=', page)
+    ids = re.findall(r'\sid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_the_page_of_many_sensors_is_hardly_larger(tmp_path: Path) -> None:
+    few = page_of(*write_store(tmp_path / 'few', 20))
+    many = page_of(*write_store(tmp_path / 'many', 400))
+    assert len(many) < 1.3 * len(few)
+
+
+def test_names_of_sensors_are_text_not_markup(tmp_path: Path) -> None:
+    page = page_of(*write_store(tmp_path, 8, name='<b onclick="x">$x_{}^$</b>' + 'long ' * 60))
+    assert '<b ' not in page
+    assert '&lt;b onclick' in page
+
+
+def test_one_sensor_with_one_calibration_has_a_page(tmp_path: Path) -> None:
+    assert '1 sensor' in page_of(*write_store(tmp_path, 1, 1))

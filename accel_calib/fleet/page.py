@@ -4,182 +4,142 @@
 """
 The page of a fleet: values over the fleet, odd sensors, changes, shared effects, errors.
 
-A sensor is odd in a value if it is so far from the median of its model that one sensor in a
-hundred fleets of this size is as far by chance. The spread is computed from the median distance,
-so that odd sensors do not enlarge it. Of the sensors whose calibrations do not agree, those are
-named that remain with a false discovery rate of `_FALSE` (Benjamini and Hochberg 1995), because a
-test of many sensors finds some by chance.
+The size of the page does not grow with the number of sensors: tables end after `_MOST` lines and
+lists of figures after `_MOST_CHANGED`, `_MOST_ODD` and `_NEWEST` sensors. The page says how many
+it does not show; `sensors.parquet` and the rows of the recordings have all of them.
 
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from itertools import islice
+from urllib.parse import unquote
 
 import numpy as np
 
-from .prior import FEWEST
+from .charts import (
+    change_words,
+    drift_words,
+    lasting_words,
+    Odd,
+    odd_words,
+    of_months,
+    of_sensor,
+    of_values,
+)
+from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
 from .store import Row, Store
 from .. import __version__
+from ..calibrate.fleet_prior import FleetPrior
 from ..compare.parameters import NAMES
-from ..effects import LADDER
 from ..errors import counted
 from ..files.atomic import write_atomically
-from ..report.repeat_charts import in_words, scale_of
-from ..report.sheet import heading, listing, scroll_table, section, sheet
+from ..model import MODELS, parameter_names
+from ..report.drawings import Drawing
+from ..report.repeat_charts import scale_of
+from ..report.sheet import (
+    figures,
+    heading,
+    listing,
+    paragraph,
+    scroll_table,
+    section,
+    sheet,
+)
+from ..report.style import has_matplotlib
 from ..significant import short
-from ..table import Floats
 
 PAGE = 'fleet.html'
-_FALSE = 0.05
-_CHANCE = 0.01
-_MAD = 1.4826
-_EFFICIENCY = 0.37
-"""Efficiency of the median distance as a measure of the spread (Rousseeuw and Croux 1993)."""
 
 _MOST = 200
 """Largest number of lines of a table."""
 
-_COLUMNS = ('sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
-            'parameters', *NAMES)
+_MOST_MODELS = 6
+"""Largest number of models of sensors with figures."""
+
+_MOST_CHANGED, _MOST_ODD, _NEWEST = 6, 4, 2
+"""Largest numbers of sensors whose calibrations are drawn over time."""
+
+_DRIFTS = 0.05
+"""Probability below which a drift is stated."""
+
+_COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
+            'calibration', 'parameters',
+            *(column for name in NAMES for column in (name, f'{name}.sd')))
 
 
-@dataclass(frozen=True)
-class Overview:
+def write_fleet_page(store: Store, sensors: Sequence[Row],
+                     priors: Mapping[str, FleetPrior] | None = None) -> None:
     """
-    What the page shows, collected in one pass over the rows.
+    Write the page.
 
     Parameters
     ----------
-    values : mapping of str to dict
-        Mean of `NAMES` by model of sensor and sensor.
-    effects : mapping of str to dict
-        Values of the newest calibration beyond V and W, by model and sensor.
-    errors : list of dict
-        The first rows with an error.
-    counts : mapping of str to int
-        Recordings by rating, or by status without a rating.
+    store : Store
+        The results.
+    sensors : sequence of dict
+        The rows of all sensors.
+    priors : mapping of str to FleetPrior, optional
+        Typical values by model of sensor.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written. An earlier file is then unchanged.
 
     """
-
-    values: Mapping[str, Mapping[str, Floats]]
-    effects: Mapping[str, Mapping[str, Mapping[str, float]]]
-    errors: Sequence[Row]
-    counts: Mapping[str, int]
-
-
-def overview(rows: Iterable[Row]) -> Overview:
-    """Return what the page shows, from the rows of recordings in order of sensor and date."""
-    sums: dict[str, dict[str, list[Any]]] = defaultdict(dict)
-    effects: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
-    errors: list[Row] = []
-    counts: dict[str, int] = defaultdict(int)
-    for row in rows:
-        counts[row['rating'] or row['status']] += 1
-        if row['status'] != 'ok':
-            errors += [row] if len(errors) < _MOST else []
-            continue
-        if row['rating'] == 'BAD':
-            continue
-        model, sensor = row['sensor_model'] or '', row['sensor']
-        known = sums[model].setdefault(sensor, [0, np.zeros(len(NAMES))])
-        known[0] += 1
-        known[1] = known[1] + [row[name] for name in NAMES]
-        effects[model][sensor] = {each['name']: each['value'] for each in row['parameters']
-                                  if each['name'].partition('.')[0] not in LADDER}
-    values = {model: {sensor: total / count for sensor, (count, total) in of_model.items()}
-              for model, of_model in sums.items()}
-    return Overview(values, effects, errors, counts)
-
-
-def odd_sensors(values: Mapping[str, Floats]) -> list[tuple[str, str, float, float]]:
-    """
-    Return the sensors that are far from the others.
-
-    Parameters
-    ----------
-    values : mapping of str to (9,) array
-        Values by sensor, of one model.
-
-    Returns
-    -------
-    list of (str, str, float, float)
-        Sensor, name of the value, the value, and its distance in spreads; the farthest first.
-
-    """
-    from scipy.special import stdtrit
-
-    if len(values) < FEWEST:
-        return []
-    names, table = list(values), np.array(list(values.values()))
-    away = table - np.median(table, axis=0)
-    spread = _MAD * np.median(np.abs(away), axis=0)
-    far = np.abs(away) / np.maximum(spread, 1e-9)
-    limit = -stdtrit(_EFFICIENCY * len(names), _CHANCE / (2.0 * table.size))
-    found = [(names[i], NAMES[k], float(table[i, k]), float(far[i, k]))
-             for i, k in zip(*np.nonzero(far > limit), strict=True)]
-    return sorted(found, key=lambda each: -each[3])
-
-
-def not_agreeing(sensors: Iterable[Row]) -> list[Row]:
-    """Return the sensors whose calibrations differ, with a false discovery rate of `_FALSE`."""
-    tested = sorted((row for row in sensors if row['p_value'] is not None),
-                    key=lambda row: float(row['p_value']))
-    count = sum(1 for _ in tested)
-    last = max((k for k, row in enumerate(tested, 1) if row['p_value'] <= _FALSE * k / count),
-               default=0)
-    return tested[:last]
-
-
-def shared_effects(effects: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Return a line per value beyond V and W that two or more sensors have, with its range."""
-    found: dict[str, list[float]] = defaultdict(list)
-    for values in effects.values():
-        for name, value in values.items():
-            found[name].append(value)
-    lines = []
-    for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
-        if len(known) < 2:
-            continue
-        low, high = np.quantile(known, [0.1, 0.9])
-        _, factor, unit = scale_of(name)
-        lines.append(f'{len(known)} of {counted(len(effects), "sensor")}: {name} '
-                     f'{short(low * factor)} to {short(high * factor)} {unit}')
-    return lines
-
-
-def write_fleet_page(store: Store, sensors: Sequence[Row]) -> None:
-    """Write the page; raise OSError if the file cannot be written."""
     known = overview(store.all_rows(_COLUMNS))
-    text = sheet('Fleet', _body(known, sensors))
+    text = sheet('Fleet', _body(store, known, sensors, priors or {}), script=False)
     write_atomically(store.folder / PAGE, lambda file: file.write(text))
 
 
-def _body(known: Overview, sensors: Sequence[Row]) -> Iterator[str]:
+def _body(store: Store, known: Overview, sensors: Sequence[Row],
+          priors: Mapping[str, FleetPrior]) -> Iterator[str]:
     """Yield the parts of the page."""
+    differ = not_agreeing(sensors)
     yield heading('Calibrations of a fleet', [
         counted(sum(known.counts.values()), 'recording'), counted(len(sensors), 'sensor'),
         ', '.join(f'{count} {name}' for name, count in sorted(known.counts.items())),
         f'accel_calib {__version__}'])
-    for model, values in sorted(known.values.items()):
-        of_model = f' of model {model}' if model else ''
-        yield section(f'Values{of_model}', _distribution(values))
-        yield section(f'Odd sensors{of_model}', listing(
-            f'{sensor}: {name.replace(".", " ")} {in_words(name, value, 0.0)}, {far:.0f} spreads '
-            'from the median' for sensor, name, value, far in odd_sensors(values)[:_MOST]))
-        yield section(f'Effects that several sensors share{of_model}',
-                      listing(shared_effects(known.effects[model])))
-    yield section('Sensors that changed', _changes(not_agreeing(sensors)))
-    yield section('Recordings without a calibration', scroll_table(
-        ('recording', 'error', 'what to do'),
-        ((row['recording'], row['error'], row['advice']) for row in known.errors))
-        if known.errors else '')
+    if not has_matplotlib():
+        yield paragraph('This page has no figures, because matplotlib is not installed.')
+    odd_names: list[str] = []
+    models = sorted(known.models.items(), key=lambda each: (-len(each[1].values), each[0]))
+    for number, (model, of_model) in enumerate(models):
+        odd = odd_sensors(of_model.values, of_model.deviations)
+        odd_names += [sensor for sensor, _, _, _ in odd]
+        yield from _of_model(model, of_model, odd, f'model{number}', priors.get(model),
+                             drawn=number < _MOST_MODELS)
+    yield paragraph(f'Figures of the {_MOST_MODELS} models with the most sensors are shown, of '
+                    f'{len(models)} models.' if len(models) > _MOST_MODELS else '', 'soft')
+    yield _changes(differ)
+    yield _over_time(store, sensors, differ, odd_names)
+    yield section('Recordings without a calibration', _errors(known))
 
 
-def _distribution(values: Mapping[str, Floats]) -> str:
+def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
+              prior: FleetPrior | None, *, drawn: bool) -> Iterator[str]:
+    """Yield the sections of a model of sensor."""
+    drawn = drawn and has_matplotlib()
+    name = f' (model {model})' if model else ''
+    values = _figures(of_values(f'{prefix}_values', known, odd)) if drawn else ''
+    yield section(f'Values{name}', values, values and paragraph(
+        'Histograms over the sensors. Line: median. Triangles: odd sensors.', 'soft'),
+        _distribution(known.values))
+    yield section(f'Odd sensors{name}', listing(
+        odd_words(known, each) for each in odd[:_MOST]),
+        _not_shown(len(odd) - _MOST, 'odd value'))
+    yield section(f'Effects that several sensors share{name}',
+                  listing(shared_effects(known.effects)))
+    drift = _figures(of_months(f'{prefix}_months', known)) if drawn else ''
+    yield section(f'Drift of all sensors{name}', drift and paragraph(
+        'Difference of each calibration from the median of its sensor, by month: the median, and '
+        'bands with 50 % and 90 % of the calibrations.'), drift)
+    yield section(f'Typical values{name}', _typical(prior) if prior else '')
+
+
+def _distribution(values: Mapping[str, object]) -> str:
     """Return a table of the distribution of each value over the sensors."""
     table = np.array(list(values.values()))
     rows = []
@@ -188,23 +148,101 @@ def _distribution(values: Mapping[str, Floats]) -> str:
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
         rows.append((f'{name.replace(".", " ")} [{unit}]', *map(short, parts)))
     return scroll_table((counted(len(values), 'sensor'), 'smallest', '10 %', 'median', '90 %',
-                         'largest'), rows)
+                         'largest'), rows, 'whole-cells', 'Distribution')
+
+
+def _typical(fleet: FleetPrior) -> str:
+    """Return a table of the typical values and spreads."""
+    spread = np.sqrt(np.diag(fleet.prior.covariance))
+    rows = []
+    for name, mean, sd in zip(parameter_names(MODELS['10']), fleet.prior.mean, spread,
+                              strict=True):
+        _, factor, unit = scale_of(name)
+        rows.append((name.replace('.', ' ').replace('_', ' '), short(mean * factor),
+                     short(sd * factor), unit))
+    words = (f'Model 10, from {counted(fleet.sensors, "sensor")}, in fleet.yaml for --prior of '
+             'fit and refine.')
+    return paragraph(words) + scroll_table(('value', 'typical', 'spread', 'unit'), rows,
+                                           'whole-cells', 'Typical values')
 
 
 def _changes(sensors: Sequence[Row]) -> str:
-    """Return a table of the changes of sensors whose calibrations differ."""
-    rows = []
-    for row in sensors:
-        for change in row['changes']:
-            lasting = {True: 'for good', False: 'this calibration only', None: 'newest'}
-            rows.append((row['sensor'], (change['date'] or '')[:10],
-                         change['parameter'].replace('.', ' '),
-                         _change_words(change), lasting[change['for_good']]))
-    return scroll_table(('sensor', 'first recording after it', 'value', 'change', 'lasts'),
-                        rows[:_MOST]) if rows else ''
+    """Return the section of the sensors whose calibrations differ."""
+    rows = [line for row in sensors for line in _change_lines(row)]
+    if not rows:
+        return ''
+    return section('Sensors that changed', paragraph(
+        f'The calibrations of {counted(len(sensors), "sensor")} differ by more than their '
+        'uncertainty. A change is for good if the next calibration differs from the values before '
+        'it, too.'), scroll_table(
+        ('sensor', 'first recording after it', 'change', 'lasts'), rows[:_MOST], '',
+        'Sensors that changed', long=len(rows) > 20), _not_shown(len(rows) - _MOST, 'line'))
 
 
-def _change_words(change: Mapping[str, Any]) -> str:
-    """Return a change with its standard deviation."""
-    zero = scale_of(change['parameter'])[0]
-    return in_words(change['parameter'], change['change'] + zero, change['sd'])
+def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the changes of a sensor, or its drift."""
+    sensor, drift = row['sensor'], row.get('drift')
+    for change in row['changes']:
+        date, path = (change['date'] or '')[:10], change.get('recording') or ''
+        words, _, _ = change_words(change).rpartition(', ')
+        yield sensor, f'{date} {path}'.strip(), words, lasting_words(change['for_good'])
+    if drift and drift['p_value'] < _DRIFTS:
+        yield sensor, '', f'{drift["parameter"].replace(".", " ")} {drift_words(drift)}', 'drift'
+    elif not row['changes']:
+        yield sensor, '', 'no step or drift that is significant alone', ''
+
+
+def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
+               odd: Sequence[str]) -> str:
+    """Return the figures of single sensors: changed, odd and newest ones."""
+    if not has_matplotlib():
+        return ''
+    by_name = {row['sensor']: row for row in sensors if row['calibrations'] > 1}
+    changed = [row['sensor'] for row in _by_weight(differ)]
+    newest = sorted(by_name, key=lambda name: by_name[name]['last'] or '', reverse=True)
+    chosen: dict[str, None] = {}
+    for names, most in ((changed, _MOST_CHANGED), (odd, _MOST_ODD), (newest, _NEWEST)):
+        chosen |= dict.fromkeys(islice(
+            (name for name in dict.fromkeys(names) if name in by_name and name not in chosen),
+            most))
+    significant = {row['sensor'] for row in differ}
+    folders = {unquote(folder): folder for folder in store.sensors()}
+    drawn = [_drawn(store.of_sensor(folders[name]), f'sensor{number}', by_name[name],
+                    changed=name in significant) for number, name in enumerate(chosen)]
+    return section('Sensors over time', paragraph(
+        'Difference of each calibration from the median of its sensor, with 95 % band. '
+        'Line: the sensor changed for good at this recording. Dotted line: only this calibration '
+        'differs, or it is the newest one. Sensors that changed, odd sensors, and the newest '
+        'recordings.'), _figures(drawn),
+        _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawn else ''
+
+
+def _by_weight(sensors: Iterable[Row]) -> list[Row]:
+    """Return sensors that changed for good first, and otherwise in their order."""
+    return sorted(sensors, key=lambda row: not any(each['for_good'] for each in row['changes']))
+
+
+def _drawn(rows: Sequence[Row], name: str, sensor: Row, *, changed: bool) -> Drawing:
+    """Return the figure of one sensor; its changes are marked if they are significant."""
+    good = [row for row in rows if row['calibration']]
+    return of_sensor(name, sensor['sensor'], good, sensor['changes'] if changed else [])
+
+
+def _errors(known: Overview) -> str:
+    """Return a table of the recordings without a calibration."""
+    if not known.errors:
+        return ''
+    rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
+    count = sum(known.counts[status] for status in ('error', 'unread'))
+    return scroll_table(('recording', 'error', 'what to do'), rows, '', 'Errors',
+                        long=len(rows) > 20) + _not_shown(count - len(rows), 'recording')
+
+
+def _figures(drawn: Iterable[Drawing]) -> str:
+    """Return figures; the browser shows the text of a marker that is pointed at."""
+    return figures(drawn, 'pair', script=False)
+
+
+def _not_shown(count: int, what: str) -> str:
+    """Return how many are not shown; nothing if all are."""
+    return paragraph(f'{counted(count, what)} not shown.', 'soft') if count > 0 else ''

@@ -154,7 +154,7 @@ def _draw_history(title: str, history: History, found: Sequence[Parameter]) -> C
             bar = figure.colorbar(drawn, ax=list(panels), aspect=40, pad=0.02)
             bar.set_label('temperature [°C]')
             bar.outline.set_visible(False)
-        _label_dates(panels[-1], at, dated=dated)
+        label_dates(panels[-1], at, dated=dated)
     return Chart(figure, hover)
 
 
@@ -202,7 +202,7 @@ def _marks(history: History, each: Parameter) -> tuple[Mark, ...]:
     return tuple(marks)
 
 
-def _label_dates(panel: Any, at: Floats, *, dated: bool) -> None:
+def label_dates(panel: Any, at: Floats, *, dated: bool) -> None:
     """Label the axis with dates, or with numbers of runs."""
     if not dated:
         panel.set_xticks(at, [f'{number:.0f}' for number in at])

@@ -186,14 +186,14 @@ HINT = ('<p class="soft hint">Point at a marker to see its values, or select a f
         'tab key and move with the arrow keys.</p>\n')
 
 
-def sheet(title: str, body: Iterable[str]) -> str:
+def sheet(title: str, body: Iterable[str], *, script: bool = True) -> str:
     """Return a page with this title and these parts, as HTML; the title is escaped."""
+    live = ('<div id="tip" role="status" aria-live="polite"></div>\n'
+            f'<script>{SCRIPT}</script>\n') if script else ''
     return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
             f'<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n'
-            f'<body>\n<main>\n{"".join(body)}</main>\n'
-            '<div id="tip" role="status" aria-live="polite"></div>\n'
-            f'<script>{SCRIPT}</script>\n</body>\n</html>\n')
+            f'<body>\n<main>\n{"".join(body)}</main>\n{live}</body>\n</html>\n')
 
 
 def heading(title: str, about: Iterable[str]) -> str:
@@ -216,15 +216,15 @@ def numbers(pairs: Iterable[tuple[str, str]]) -> str:
     return f'<dl class="numbers">{"".join(parts)}</dl>\n'
 
 
-def figures(drawn: Iterable[Drawing], kind: str) -> str:
+def figures(drawn: Iterable[Drawing], kind: str, *, script: bool = True) -> str:
     """Return figures, in a grid of the CSS class `kind`: ``wide`` or ``pair``."""
-    parts = [_figure(drawing) for drawing in drawn]
+    parts = [_figure(drawing, script=script) for drawing in drawn]
     return f'<div class="figures {kind}">\n' + '\n'.join(parts) + '\n</div>\n' if parts else ''
 
 
-def _figure(drawing: Drawing) -> str:
+def _figure(drawing: Drawing, *, script: bool) -> str:
     svg = inline_svg(drawing.chart, drawing.name, drawing.title)
-    if not any(drawing.chart.hover.values()):
+    if not script or not any(drawing.chart.hover.values()):
         return f'<figure>{svg}</figure>'
     label = escape(f'{drawing.title}. Arrow keys move from marker to marker.')
     return f'<figure class="live" tabindex="0" role="group" aria-label="{label}">{svg}</figure>'

@@ -1,0 +1,298 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The figures of a fleet: values over the sensors, drift of all sensors, and single sensors.
+
+The size of a figure does not depend on the number of sensors: the values are histograms, and the
+drift of all sensors is bands of quantiles.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+
+from .overview import OfModel, table_of
+from .store import Row
+from ..compare.parameters import NAMES
+from ..report.drawings import Drawing
+from ..report.repeat_charts import CROSS, GAINS, in_words, label_dates, OFFSETS, scale_of
+from ..report.style import (
+    ACCENT,
+    AFTER,
+    BEFORE,
+    Chart,
+    FAINT,
+    legend_below,
+    Mark,
+    new_figure,
+    PAPER,
+    styled,
+    THIRD,
+)
+from ..significant import short, with_sd
+from ..table import Floats
+
+Odd = tuple[str, str, float, float]
+"""Sensor, name of a value, the value, and its distance from the median in spreads."""
+
+_GROUPS = (('offset', 'Zero-g offset', OFFSETS), ('gain', 'Gain minus 1', GAINS),
+           ('cross', 'Cross-axis gain', CROSS))
+_BAND = 1.96
+_DAY_S = 86400.0
+_PARTS = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of the drift of a fleet."""
+
+_MOST_BARS = 40
+_ROOM = 6.0
+"""Range of a histogram, in distances of the 10 % and 90 % quantiles from the median."""
+
+_NAMED = 3
+"""Largest number of odd sensors whose name is written beside a histogram."""
+
+_LONGEST_NAME = 24
+_NEWEST = 40
+"""Largest number of calibrations in the figure of a sensor: the newest ones."""
+
+_FEW = 12
+"""Number of calibrations up to which each has a marker."""
+
+_FEWEST_MONTHS = 3
+_COLOURS = (AFTER, THIRD, BEFORE)
+
+
+def of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
+    """
+    Yield histograms of each value over the sensors of a model, with the odd sensors.
+
+    Parameters
+    ----------
+    prefix : str
+        Prefix of the names of the figures, unique on the page.
+    known : OfModel
+        The sensors.
+    odd : sequence of Odd
+        The odd sensors, the farthest first.
+
+    """
+    for key, words, names in _GROUPS:
+        yield Drawing(f'{prefix}_{key}', f'{words} over the sensors; triangles: odd sensors',
+                      _draw_values(words, names, known, odd))
+
+
+def _draw_values(title: str, names: Sequence[str], known: OfModel, odd: Sequence[Odd]) -> Chart:
+    hover, table = {}, np.array(list(known.values.values()))
+    with styled():
+        figure = new_figure(3.6)
+        figure.suptitle(f'{title} [{scale_of(names[0])[2]}]', x=0.02, ha='left', fontsize=10.5)
+        panels = figure.subplots(3, 1)
+        for panel, name in zip(panels, names, strict=True):
+            own = [each for each in odd if each[1] == name]
+            _draw_histogram(panel, name, table[:, NAMES.index(name)], own)
+            if own:
+                hover[name] = tuple(Mark(0, odd_words(known, each)) for each in own)
+        panels[1].set_ylabel('sensors')
+    return Chart(figure, hover)
+
+
+def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -> None:
+    """Draw the histogram of a value, and its odd sensors, at the edge if they are far away."""
+    zero, factor, _ = scale_of(name)
+    values = (column - zero) * factor
+    low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
+    reach = _ROOM * max(high - middle, middle - low) or float(np.max(np.abs(values - middle)))
+    shown = values[np.abs(values - middle) <= reach]
+    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, _MOST_BARS))
+    heights, edges = np.histogram(shown, bars)
+    panel.stairs(heights, edges, fill=True, color=AFTER, alpha=0.45)
+    panel.axvline(middle, color=BEFORE, linewidth=1.2)
+    panel.text(0.01, 0.95, name.partition('.')[2], transform=panel.transAxes, va='top')
+    panel.locator_params(axis='y', integer=True, nbins=3)
+    if not odd:
+        return
+    at = (np.array([each[2] for each in odd]) - zero) * factor
+    places = np.clip(at, middle - reach, middle + reach)
+    height = 0.12 * max(float(np.max(heights)), 1.0)
+    panel.plot(places, np.full(len(at), height), 'v', color=ACCENT, gid=name, markersize=7.0,
+               markeredgecolor=PAPER, markeredgewidth=0.4, clip_on=False)
+    for k, (place, value, each) in enumerate(zip(places[:_NAMED], at, odd, strict=False)):
+        beyond = '' if place == value else f' {short(value)} →' if value > place else (
+            f' ← {short(value)}')
+        panel.annotate(f'{_short_name(each[0])}{beyond}', (place, height), (0.0, 6.0 + 10.0 * k),
+                       textcoords='offset points', fontsize=8.0, parse_math=False,
+                       ha='right' if place > middle else 'left')
+
+
+def odd_words(known: OfModel, odd: Odd) -> str:
+    """Return an odd sensor with its value."""
+    sensor, name, value, far = odd
+    sd = float(known.deviations[sensor][NAMES.index(name)])
+    return (f'{sensor}: {name.replace(".", " ")} {in_words(name, value, sd)}, {far:.0f} spreads '
+            'from the median')
+
+
+def _short_name(name: str) -> str:
+    """Return the end of a long name, where the names of a fleet differ most."""
+    return name if len(name) <= _LONGEST_NAME else f'…{name[1 - _LONGEST_NAME:]}'
+
+
+def of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
+    """
+    Yield the drift of all sensors of a model together, as bands of quantiles by month.
+
+    Parameters
+    ----------
+    prefix : str
+        Prefix of the names of the figures, unique on the page.
+    known : OfModel
+        The sensors.
+
+    """
+    months, found = known.months.quantiles(_PARTS)
+    if len(months) < _FEWEST_MONTHS:
+        return
+    days = np.array([datetime.fromisoformat(f'{month}-15').toordinal() for month in months], float)
+    days -= datetime(1970, 1, 1).toordinal()
+    for key, words, names in _GROUPS:
+        yield Drawing(f'{prefix}_{key}', f'{words}: difference from the median of the sensor, by '
+                      'month, with bands of 50 % and 90 % of the calibrations',
+                      _draw_months(words, names, days, found))
+
+
+def _draw_months(title: str, names: Sequence[str], days: Floats, found: Floats) -> Chart:
+    with styled():
+        figure = new_figure(3.9)
+        figure.suptitle(f'{title} minus its median [{scale_of(names[0])[2]}]', x=0.02, ha='left',
+                        fontsize=10.5)
+        panels = figure.subplots(3, 1, sharex=True)
+        for panel, name in zip(panels, names, strict=True):
+            column = found[:, :, NAMES.index(name)] * scale_of(name)[1]
+            panel.grid(visible=True)
+            panel.axhline(0.0, color=FAINT, linewidth=1.2)
+            for low, high, alpha in ((0, 4, 0.18), (1, 3, 0.35)):
+                panel.fill_between(days, column[:, low], column[:, high], color=AFTER,
+                                   alpha=alpha, linewidth=0.0)
+            panel.plot(days, column[:, 2], color=AFTER)
+            panel.set_ylabel(name.partition('.')[2])
+        label_dates(panels[-1], days, dated=True)
+        panels[-1].set_xlabel('month of the recording')
+    return Chart(figure)
+
+
+def of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]
+              ) -> Drawing:
+    """
+    Draw the calibrations of one sensor over time, with bands and its changes.
+
+    Parameters
+    ----------
+    name : str
+        Name of the figure, unique on the page.
+    sensor : str
+        Name of the sensor.
+    rows : sequence of dict
+        Rows of its calibrations, in order of date; the newest are drawn.
+    changes : sequence of mapping
+        Its changes, as in `accel_calib.fleet.sensors`.
+
+    """
+    shown = rows[-_NEWEST:]
+    keys = [row['key'] for row in shown]
+    marked = [change for change in changes if change['key'] in keys]
+    title = f'{sensor}: calibrations over time with 95 % band'
+    return Drawing(name, title, _draw_sensor(sensor, shown, marked))
+
+
+def _draw_sensor(sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]) -> Chart:
+    values, deviations = table_of(rows)
+    groups = [group for group in _GROUPS if group[0] != 'cross' or np.any(
+        deviations[:, [NAMES.index(name) for name in CROSS]])]
+    at, dated = _places(rows)
+    with styled():
+        figure = new_figure(0.9 + 1.15 * len(groups))
+        figure.suptitle(_short_name(sensor), x=0.02, ha='left', fontsize=10.5,
+                        parse_math=False)
+        panels = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
+        for panel, (_, _, names) in zip(panels, groups, strict=True):
+            columns = [NAMES.index(name) for name in names]
+            _draw_group(panel, names, at, values[:, columns], deviations[:, columns])
+            for change in changes:
+                place = at[[row['key'] for row in rows].index(change['key'])]
+                panel.axvline(place, color=ACCENT, linewidth=1.4, linestyle='-'
+                              if change['for_good'] else (0, (2, 3)))
+        hover = _mark_changes(panels[0], rows, at, changes)
+        label_dates(panels[-1], at, dated=dated)
+        panels[-1].set_xlabel('date of the recording' if dated else 'calibration')
+        handles, labels = panels[0].get_legend_handles_labels()
+        legend_below(figure, 3, handles, labels)
+    return Chart(figure, hover)
+
+
+def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, deviations: Floats
+                ) -> None:
+    """Draw three values over time, minus their medians, with bands."""
+    panel.grid(visible=True)
+    for k, name in enumerate(names):
+        _, factor, unit = scale_of(name)
+        middle = (values[:, k] - np.median(values[:, k])) * factor
+        band = _BAND * deviations[:, k] * factor
+        panel.fill_between(at, middle - band, middle + band, color=_COLOURS[k], alpha=0.18,
+                           linewidth=0.0)
+        panel.plot(at, middle, color=_COLOURS[k], linewidth=1.2, label='xyz'[k],
+                   marker='o' if len(at) <= _FEW else None, markersize=2.5)
+    panel.set_ylabel(f'{names[0].partition(".")[0] if names[0] != "gain.xy" else "cross-axis"}\n'
+                     f'[{unit}]')
+
+
+def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
+                  changes: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Mark, ...]]:
+    """Mark the recordings with changes; return the texts of the marks."""
+    if not changes:
+        return {}
+    by_key = {row['key']: k for k, row in enumerate(rows)}
+    places = [by_key[change['key']] for change in changes]
+    panel.plot(at[places], np.full(len(places), panel.get_ylim()[1]), 'v', color=ACCENT,
+               gid='changes', clip_on=False, markeredgecolor=PAPER, markeredgewidth=0.4)
+    return {'changes': tuple(Mark(0, f'{rows[place]["recording"]}: {change_words(change)}')
+                             for place, change in zip(places, changes, strict=True))}
+
+
+def change_words(change: Mapping[str, Any]) -> str:
+    """Return a change with its standard deviation, and whether it lasts."""
+    zero, _, _ = scale_of(change['parameter'])
+    words = in_words(change['parameter'], change['change'] + zero, change['sd'])
+    return f'{change["parameter"].replace(".", " ")} {words}, {lasting_words(change["for_good"])}'
+
+
+def lasting_words(for_good: bool | None) -> str:
+    """Return whether a change lasts."""
+    return {True: 'for good', False: 'this calibration only', None: 'newest'}[for_good]
+
+
+def drift_words(drift: Mapping[str, Any]) -> str:
+    """Return a drift with its standard deviation."""
+    _, factor, unit = scale_of(drift['parameter'])
+    words = with_sd(drift['per_year'] * factor, drift['sd'] * factor)
+    return f'{"" if words.startswith("-") else "+"}{words} {unit} per year'.replace('-', '−', 1)
+
+
+def _places(rows: Sequence[Row]) -> tuple[Floats, bool]:
+    """Return the place of each calibration, and whether it is a date."""
+    days = [_day(row['date']) for row in rows]
+    dated = [day for day in days if day is not None]
+    if len(dated) == len(days) and max(dated) > min(dated):
+        return np.array(dated), True
+    return np.arange(1.0, len(days) + 1.0), False
+
+
+def _day(date: str | None) -> float | None:
+    """Return a date as days since 1970; None without a date."""
+    if not date:
+        return None
+    when = datetime.fromisoformat(date.replace('Z', '+00:00'))
+    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp() / _DAY_S

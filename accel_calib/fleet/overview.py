@@ -1,0 +1,232 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Statistics over a fleet, collected in one pass over the rows of the recordings.
+
+The memory grows with the number of sensors (18 numbers each), not with that of recordings.
+
+**Odd sensors.** A sensor is odd in a value if it is so far from the median of its model that one
+sensor in a hundred fleets of this size is as far by chance. The spread is computed from the median
+distance, so that odd sensors do not enlarge it. The standard deviation of the value itself is
+added, because a sensor that is known badly is often far from the others.
+
+**Changed sensors.** Of the sensors whose calibrations do not agree, those are named that remain
+with a false discovery rate of `_FALSE` (Benjamini and Hochberg 1995), because a test of many
+sensors finds some by chance.
+
+**Drift of the fleet.** The difference of each calibration from the median of its sensor, by month.
+A month keeps a random sample of `_SAMPLE` differences, from which its quantiles are computed.
+
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import numpy as np
+
+from .prior import FEWEST
+from .store import Row
+from ..compare.parameters import NAMES
+from ..effects import LADDER
+from ..errors import counted
+from ..report.repeat_charts import scale_of
+from ..significant import short
+from ..table import Floats
+
+MOST_ERRORS = 200
+"""Largest number of errors that are kept."""
+
+_FALSE = 0.05
+_CHANCE = 0.01
+_MAD = 1.4826
+_EFFICIENCY = 0.37
+"""Efficiency of the median distance as a measure of the spread (Rousseeuw and Croux 1993)."""
+
+_SAMPLE = 400
+"""Differences of a month that are kept."""
+
+_SEED = 1
+
+
+class Months:
+    """
+    The differences of calibrations from the median of their sensor, by month.
+
+    Parameters
+    ----------
+    rng : Generator
+        Chooses the differences that are kept.
+
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._kept: dict[str, Floats] = {}
+        self.counts: dict[str, int] = defaultdict(int)
+
+    def add(self, month: str, differences: Floats) -> None:
+        """Add the (9,) differences of a calibration; each has the same chance to be kept."""
+        kept = self._kept.setdefault(month, np.empty((_SAMPLE, len(NAMES))))
+        place = self.counts[month]
+        self.counts[month] += 1
+        if place >= _SAMPLE:
+            place = int(self._rng.integers(self.counts[month]))
+        if place < _SAMPLE:
+            kept[place] = differences
+
+    def quantiles(self, parts: Sequence[float]) -> tuple[list[str], Floats]:
+        """Return the months with `FEWEST` or more calibrations, and (months, parts, 9) values."""
+        months = [month for month in sorted(self.counts) if self.counts[month] >= FEWEST]
+        return months, np.array([np.quantile(self._kept[month][:self.counts[month]], parts, axis=0)
+                                 for month in months])
+
+
+@dataclass(frozen=True)
+class OfModel:
+    """
+    What is known of the sensors of one model.
+
+    Parameters
+    ----------
+    values, deviations : mapping of str to (9,) array
+        Mean of `NAMES` over the calibrations of a sensor, and its standard deviation, by sensor.
+    effects : mapping of str to dict
+        Values of the newest calibration beyond V and W, by sensor.
+    months : Months
+        Drift of all sensors together.
+
+    """
+
+    values: dict[str, Floats]
+    deviations: dict[str, Floats]
+    effects: dict[str, dict[str, float]]
+    months: Months
+
+
+@dataclass(frozen=True)
+class Overview:
+    """
+    Statistics over a fleet.
+
+    Parameters
+    ----------
+    models : mapping of str to OfModel
+        The sensors by their model.
+    errors : list of dict
+        The first `MOST_ERRORS` rows with an error.
+    counts : mapping of str to int
+        Recordings by rating, or by status without a rating.
+
+    """
+
+    models: dict[str, OfModel] = field(default_factory=dict)
+    errors: list[Row] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    @property
+    def values(self) -> Mapping[str, Mapping[str, Floats]]:
+        """Return the mean of `NAMES` by model and sensor."""
+        return {name: each.values for name, each in self.models.items()}
+
+
+def overview(rows: Iterable[Row]) -> Overview:
+    """Return the statistics of the rows of recordings, in order of sensor and date."""
+    found, rng = Overview(), np.random.default_rng(_SEED)
+    for sensor, of_sensor in groupby(rows, key=lambda row: row['sensor']):
+        by_model: dict[str, list[Row]] = defaultdict(list)
+        for row in of_sensor:
+            found.counts[row['rating'] or row['status']] += 1
+            if row['status'] != 'ok':
+                found.errors.extend([row] if len(found.errors) < MOST_ERRORS else [])
+            elif row['rating'] != 'BAD':
+                by_model[row['sensor_model'] or ''].append(row)
+        for model, good in by_model.items():
+            known = found.models.setdefault(model, OfModel({}, {}, {}, Months(rng)))
+            _add_sensor(known, sensor, good)
+    return found
+
+
+def _add_sensor(known: OfModel, sensor: str, rows: Sequence[Row]) -> None:
+    """Add the calibrations of a sensor to the statistics of its model."""
+    values, deviations = table_of(rows)
+    known.values[sensor] = np.mean(values, axis=0)
+    known.deviations[sensor] = np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows)
+    known.effects[sensor] = {each['name']: each['value'] for each in rows[-1]['parameters']
+                             if each['name'].partition('.')[0] not in LADDER}
+    if len(rows) < 2:
+        return
+    for row, differences in zip(rows, values - np.median(values, axis=0), strict=True):
+        if row.get('date'):
+            known.months.add(row['date'][:7], differences)
+
+
+def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
+    """Return the (n, 9) values of `NAMES` of rows, and their standard deviations."""
+    return (np.array([[row[name] for name in NAMES] for row in rows], float),
+            np.array([[row.get(f'{name}.sd') or 0.0 for name in NAMES] for row in rows], float))
+
+
+def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] | None = None
+                ) -> list[tuple[str, str, float, float]]:
+    """
+    Return the sensors that are far from the others.
+
+    Parameters
+    ----------
+    values : mapping of str to (9,) array
+        Values by sensor, of one model.
+    deviations : mapping of str to (9,) array, optional
+        Their standard deviations; by default 0.
+
+    Returns
+    -------
+    list of (str, str, float, float)
+        Sensor, name of the value, the value, and its distance in spreads; the farthest first.
+
+    """
+    from scipy.special import stdtrit
+
+    if len(values) < FEWEST:
+        return []
+    names, table = list(values), np.array(list(values.values()))
+    own = np.zeros_like(table) if deviations is None else np.array([deviations[name]
+                                                                    for name in names])
+    away = table - np.median(table, axis=0)
+    spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
+    far = np.abs(away) / np.maximum(spread, 1e-9)
+    limit = -stdtrit(_EFFICIENCY * len(names), _CHANCE / (2.0 * table.size))
+    found = [(names[i], NAMES[k], float(table[i, k]), float(far[i, k]))
+             for i, k in zip(*np.nonzero(far > limit), strict=True)]
+    return sorted(found, key=lambda each: -each[3])
+
+
+def not_agreeing(sensors: Iterable[Row]) -> list[Row]:
+    """Return the sensors whose calibrations differ, with a false discovery rate of `_FALSE`."""
+    tested = sorted((row for row in sensors if row['p_value'] is not None),
+                    key=lambda row: float(row['p_value']))
+    count = len(tested)
+    last = max((k for k, row in enumerate(tested, 1) if row['p_value'] <= _FALSE * k / count),
+               default=0)
+    return tested[:last]
+
+
+def shared_effects(effects: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return a line per value beyond V and W that two or more sensors have, with its range."""
+    found: dict[str, list[float]] = defaultdict(list)
+    for values in effects.values():
+        for name, value in values.items():
+            found[name].append(value)
+    lines = []
+    for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
+        if len(known) < 2:
+            continue
+        low, high = np.quantile(known, [0.1, 0.9])
+        _, factor, unit = scale_of(name)
+        lines.append(f'{len(known)} of {counted(len(effects), "sensor")}: {name} '
+                     f'{short(low * factor)} to {short(high * factor)} {unit}')
+    return lines
