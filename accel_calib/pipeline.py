@@ -8,11 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .calibrate import Calibration, fit_poses, FrameName, level_by_rows
+from .calibrate import (
+    Calibration,
+    fit_poses,
+    fit_with_fleet,
+    FleetPrior,
+    FrameName,
+    level_by_rows,
+)
 from .effects import PROCESSES
 from .errors import RefusedFitError
 from .rating import rate, Rating
-from .refine import refine, Refinement
+from .refine import refine, refine_with_fleet, Refinement
 from .significant import short
 from .table import Poses
 from .units import Units
@@ -48,7 +55,7 @@ class Outcome:
 
 def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
                nose_down: int | None = None, frame: FrameName = 'ros', sensor: str = '',
-               refined: bool = True) -> Outcome:
+               refined: bool = True, fleet: FleetPrior | None = None) -> Outcome:
     """
     Fit, refine if the poses can carry it, level and rate.
 
@@ -68,6 +75,8 @@ def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
         Name of the sensor; by default the name in the poses.
     refined : bool
         Look for effects that the calibration lacks, and add them.
+    fleet : FleetPrior, optional
+        Typical values of sensors of the same model, for few poses.
 
     Raises
     ------
@@ -78,10 +87,11 @@ def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
 
     """
     date = now()
-    calibration = fit_poses(poses, units, sensor=sensor, date=date)
+    calibration = (fit_poses(poses, units, sensor=sensor, date=date) if fleet is None
+                   else fit_with_fleet(poses, units, fleet, sensor=sensor, date=date))
     refinement, line = None, 'not refined, as asked'
     if refined:
-        refinement, line = _refinement(poses, units, sensor, date)
+        refinement, line = _refinement(poses, units, sensor, date, fleet)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
     calibration = level_by_rows(calibration, poses, frame, _row(poses, flat), nose_down)
@@ -95,17 +105,19 @@ def _row(poses: Poses, flat: Flat) -> int | None:
     return flat
 
 
-def _refinement(poses: Poses, units: Units, sensor: str, date: str
-                ) -> tuple[Refinement | None, str]:
+def _refinement(poses: Poses, units: Units, sensor: str, date: str,
+                fleet: FleetPrior | None) -> tuple[Refinement | None, str]:
     """Return the search for effects, and a line about it; None if the poses are too few."""
     try:
-        found = refine(poses, units, sensor=sensor, date=date)
+        found = (refine(poses, units, sensor=sensor, date=date) if fleet is None
+                 else refine_with_fleet(poses, units, fleet, sensor=sensor, date=date))
     except RefusedFitError as err:
         return None, f'not refined: {err.message}'
     if found.refusal:
         return found, f'not refined: {found.refusal[0]}'
     if not found.steps:
-        return found, 'not refined: these poses show no further effect'
+        why = 'these poses show no further effect' if fleet is None else found.advice[0]
+        return found, f'not refined: {why}'
     change = f'residual {short(found.gap_mg)} -> {short(found.remaining_gap_mg)} mg'
     added = [step.effect for step in found.steps if step.effect not in PROCESSES]
     only_named = [step.effect for step in found.steps if step.effect in PROCESSES]

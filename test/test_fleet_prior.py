@@ -5,14 +5,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+import json
 from pathlib import Path
 
 from accel_calib.calibrate import Calibration, fit_poses, fit_with_fleet, FleetPrior
+from accel_calib.cli.main import main
 from accel_calib.errors import InputError
-from accel_calib.files import read_calibration, write_calibration
+from accel_calib.files import read_calibration, write_calibration, write_table
 from accel_calib.files.fleet_yaml import read_prior, write_priors
 from accel_calib.fleet.prior import estimated, priors_of
 from accel_calib.model import Model, MODELS, sensor_force, with_vector
+from accel_calib.refine import refine, refine_with_fleet
 from accel_calib.simulate import simulate_poses
 from accel_calib.sphere import OVER_THE_SPHERE, spread_directions, unit
 from accel_calib.table import Poses
@@ -36,8 +40,7 @@ def poses_of(sensor: Model, count: int, rng: np.random.Generator) -> Poses:
 
 def error_mg(calibration: Calibration, sensor: Model) -> float:
     """Return the RMS error of the corrected |a| over the sphere [mg]."""
-    mat_w, vec_v = sensor.linear_part
-    corrected = sensor_force(calibration.model, OVER_THE_SPHERE @ mat_w.T + vec_v, {})
+    corrected = sensor_force(calibration.model, sensor.at({}).reading(OVER_THE_SPHERE), {})
     return 1e3 * float(np.sqrt(np.mean((np.linalg.norm(corrected, axis=1) - 1.0) ** 2)))
 
 
@@ -157,3 +160,86 @@ def test_a_covariance_that_is_none_is_refused(fleet: FleetPrior, tmp_path: Path)
     path.write_text(path.read_text().replace(first, f'-{first}'))
     with pytest.raises(InputError, match='positive definite'):
         read_prior(path)
+
+
+def bent(sensor: Model) -> Model:
+    """Return a sensor with a nonlinearity beyond model 10."""
+    return Model({**sensor.values, 'quadratic': np.array([0.012, -0.010, 0.011])})
+
+
+def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
+        fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(7)
+    poses = poses_of(bent(a_sensor(rng)), 6, rng)
+    result, fitted = refine_with_fleet(poses, IN_G, fleet), fit_with_fleet(poses, IN_G, fleet)
+    np.testing.assert_array_equal(result.calibration.model.vector, fitted.model.vector)
+    assert result.steps == ()
+    assert result.advice[0].startswith('no effects were searched: 6 poses, expected at least 9')
+    assert ('quadratic', 'more poses in more directions') in result.not_testable
+
+
+def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(8)
+    refined, fitted, within = [], [], []
+    for _ in range(5):
+        sensor = bent(a_sensor(rng))
+        poses = poses_of(sensor, 16, rng)
+        result = refine_with_fleet(poses, IN_G, fleet)
+        assert [step.effect for step in result.steps] == ['quadratic']
+        assert result.calibration.method == 'fleet'
+        refined.append(error_mg(result.calibration, sensor))
+        fitted.append(error_mg(fit_with_fleet(poses, IN_G, fleet), sensor))
+        deviation = np.sqrt(np.diag(result.calibration.covariance))
+        within += ((result.calibration.model.vector - sensor.vector) / deviation).tolist()
+    assert rms(refined) < 0.2 * rms(fitted)
+    assert rms(within) < 2.0
+
+
+def test_a_refinement_of_few_noisy_poses_is_better_with_the_fleet(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(9)
+    with_fleet, alone = [], []
+    for _ in range(6):
+        sensor = a_sensor(rng)
+        poses = poses_of(sensor, 11, rng)
+        noisy = poses.with_columns(reading=poses.reading + 0.008 * rng.normal(size=(11, 3)),
+                                   std=np.full((11, 3), 0.08), count=np.full(11, 100.0))
+        with_fleet.append(error_mg(refine_with_fleet(noisy, IN_G, fleet).calibration, sensor))
+        alone.append(error_mg(refine(noisy, IN_G, base='10').calibration, sensor))
+    assert rms(with_fleet) < rms(alone)
+
+
+def test_a_refined_sensor_unlike_the_fleet_is_not_pulled_in(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(10)
+    for _ in range(3):
+        sensor = with_vector(MODELS['10'], a_sensor(rng).vector + np.eye(9)[2] * 0.25)
+        result = refine_with_fleet(poses_of(bent(sensor), 24, rng), IN_G, fleet)
+        assert [step.effect for step in result.steps] == ['quadratic']
+        away = result.calibration.offset[2] - sensor.vector[2]
+        assert abs(away) < 4.0 * np.sqrt(result.calibration.covariance[2, 2]) < 0.01
+        assert any('unlike the fleet' in line for line in result.calibration.warnings)
+
+
+def test_the_command_line_refines_with_the_file_of_the_fleet(
+        fleet: FleetPrior, tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    write_priors(tmp_path / 'fleet.yaml', {name: replace(fleet, model=name) for name in 'AB'})
+    for count, effects in ((6, []), (16, ['quadratic'])):
+        table, out = tmp_path / f'{count}.csv', tmp_path / f'{count}.yaml'
+        write_table(table, poses_of(bent(a_sensor(rng)), count, rng))
+        arguments = ['refine', str(table), '--units', 'g', '--prior', str(tmp_path / 'fleet.yaml')]
+        assert main([*arguments, '--json', str(tmp_path / 'r.json')]) == 2  # which model?
+        assert "expected the model ''" in json.loads((tmp_path / 'r.json').read_text())['error']
+        assert main([*arguments, '--sensor-model', 'B', '-o', str(out), '--report',
+                     str(tmp_path / 'r.html'), '--json', str(tmp_path / 'r.json')]) == 0
+        found = json.loads((tmp_path / 'r.json').read_text())
+        assert [step['effect'] for step in found['steps']] == effects
+        stored = read_calibration(out)
+        assert stored.method == 'fleet'
+        assert 'with the typical values of 40 sensors of model B' in stored.reason
+        arguments[0] = 'calibrate'
+        main([*arguments, '--sensor-model', 'B', '-o', str(out), '--keep-bad', '--json',
+              str(tmp_path / 'c.json')])
+        found = json.loads((tmp_path / 'c.json').read_text())
+        assert read_calibration(out).method == 'fleet'
+        assert ('quadratic' in found['refined']) is bool(effects)
+        assert ('no effects were searched' in found['refined']) is not bool(effects)

@@ -13,6 +13,9 @@ The poses are fitted with each of them, and the most probable one is used: the e
 readings times the probability of the covariance. The readings of a sensor that is unlike the fleet
 contradict the covariances of the fleet. It is then fitted as a common sensor.
 
+A fit that needs no prior, such as a refined one, has its values x with the covariance C. They are
+combined with the fleet to first order (`posterior`): x + K (m - x) with K = C (C + P)⁻¹.
+
 The same readings could come from a usual sensor with very large noise. The noise is therefore
 limited to `_LARGEST_NOISE_G`, and the probability of a noise decreases with its factor on the
 stated noise. For the same reason, poses are left out as knocked only if the poses determine the
@@ -37,7 +40,7 @@ from ..errors import counted, RefusedFitError
 from ..estimate.fit import NotConvergedError, Prior
 from ..estimate.outliers import LARGEST_SHARE, originals
 from ..sphere import unit
-from ..table import Poses
+from ..table import Floats, Poses
 from ..units import Units
 
 _LIKE = {1.0: 0.9, 2.0: 0.07, 4.0: 0.02}
@@ -133,6 +136,46 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
     return with_rest_noise(gated(calibration), poses)
 
 
+def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
+              ) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """
+    Return fitted values with the typical values of a fleet included.
+
+    The covariance of the fleet or of common sensors is chosen that makes the values most probable.
+
+    Parameters
+    ----------
+    values : (p,) array
+        Values of a fit; those of model 10 come first [g].
+    covariance : (p, p) array
+        Their covariance, without a prior.
+    fleet : FleetPrior
+        Typical values of sensors of the same model.
+
+    Returns
+    -------
+    (p,) array, (p, p) array, tuple of str
+        The values, their covariance, and a warning if the sensor is unlike the fleet.
+
+    """
+    count = len(fleet.prior.mean)
+    away = fleet.prior.mean - values[:count]
+    found, best = None, -np.inf
+    for prior, probability, unlike in _priors(fleet.prior):
+        spread = covariance[:count, :count] + prior.covariance
+        evidence = np.log(probability) - (
+            away @ np.linalg.solve(spread, away) + np.linalg.slogdet(spread)[1]) / 2.0
+        if evidence > best:
+            found, best = (spread, unlike), evidence
+    if found is None:
+        raise RefusedFitError('the fitted values are not finite, expected numbers',
+                              'check the poses for mistakes')
+    spread, unlike = found
+    gain = np.linalg.solve(spread, covariance[:count]).T
+    left = covariance - gain @ covariance[:count]
+    return values + gain @ away, (left + left.T) / 2.0, (_UNLIKE_WORDS,) * unlike
+
+
 def _priors(fleet: Prior) -> list[tuple[Prior, float, bool]]:
     """Return each distribution of the values, its probability, and whether it is of others."""
     common = np.diag(typical_spread() ** 2)
@@ -143,6 +186,7 @@ def _priors(fleet: Prior) -> list[tuple[Prior, float, bool]]:
 
 
 def _reason(fleet: FleetPrior, count: int) -> str:
+    """Return the number of poses, and the fleet."""
     name = f' of model {fleet.model}' if fleet.model else ''
     return (f'{counted(count, "pose")} with the typical values of '
             f'{counted(fleet.sensors, "sensor")}{name}')

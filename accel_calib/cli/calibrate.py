@@ -41,6 +41,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       help='do not look for effects beyond offset, gain and cross-axis')
     made.add_argument('--keep-bad', action='store_true',
                       help='store a calibration that is BAD, too')
+    options.add_prior(made)
     options.add_log(made)
     options.add_max_dwell(made)
     options.add_json(made)
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         with working('fitting'):
             outcome = calibrated(intake.poses, intake.units, flat=args.flat,
                                  nose_down=args.nose_down, frame=args.frame, sensor=args.sensor,
-                                 refined=not args.no_refine)
+                                 refined=not args.no_refine, fleet=options.prior(args))
     stored = _store(args, intake, outcome)
     options.write_json(args.json, {'file': args.log, **_result(intake, outcome)})
     _show(args, intake, outcome, stored)

@@ -25,7 +25,6 @@ from ..calibrate import (
     outlook,
 )
 from ..files import write_calibration
-from ..files.fleet_yaml import read_prior
 from ..intake import Intake
 from ..rating import rate, Rating
 from ..words import now
@@ -58,10 +57,7 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       'heading of the mounting (needs --flat)')
     made.add_argument('--frame', choices=FRAMES, default='ros',
                       help='levelled frame (default: ros, z up)')
-    made.add_argument('--prior', type=Path, metavar='FLEET', help='typical values of a fleet '
-                      '(fleet.yaml of accel-calib fleet), for few poses')
-    made.add_argument('--sensor-model', default='', metavar='NAME', help='model of the sensor in '
-                      'the file of --prior, if it has several')
+    options.add_prior(made)
     made.add_argument('--jobs', type=int, default=1, metavar='N',
                       help='number of tables to process in parallel')
     options.add_log(made)
@@ -111,11 +107,11 @@ def _fit(args: argparse.Namespace, path: Path) -> _Fitted:
     poses = intake.poses
     with working('fitting'):
         chosen = options.rows_between(poses, args.rows)
-        if args.prior is None:
+        fleet = options.prior(args)
+        if fleet is None:
             calibration = fit_poses(chosen, intake.units, model=args.model, method=args.method,
                                     sensor=args.sensor, date=now())
         else:
-            fleet = read_prior(args.prior, args.sensor_model)
             calibration = fit_with_fleet(chosen, intake.units, fleet, sensor=args.sensor,
                                          date=now())
         calibration = level_by_rows(calibration, poses, args.frame, args.flat, args.nose_down)

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from .terminal import Output, progress
-from ..calibrate import Calibration, EDITED
+from ..calibrate import Calibration, EDITED, FleetPrior
 from ..errors import AccelCalibError, InputError, system_error
 from ..files import LogOptions, read_calibration
 from ..files.atomic import write_atomically
 from ..files.calibration_yaml import OTHER_CORRECTION
+from ..files.fleet_yaml import read_prior
 from ..files.logs.formats import NAMES
 from ..intake import Intake, poses_of
 from ..rating import Rating
@@ -76,6 +77,20 @@ def add_max_dwell(made: argparse.ArgumentParser) -> None:
     """Add ``--max-dwell``."""
     made.add_argument('--max-dwell', type=positive, metavar='S', help='for a recording: split '
                       'longer rests into poses with the same orientation')
+
+
+def add_prior(made: argparse.ArgumentParser, group: Any = None) -> None:
+    """Add ``--prior``, to a group if there is one, and ``--sensor-model``."""
+    (group or made).add_argument(
+        '--prior', type=Path, metavar='FLEET', help='typical values of a fleet (fleet.yaml of '
+        'accel-calib fleet) for offset, gain and cross-axis, for few poses')
+    made.add_argument('--sensor-model', default='', metavar='NAME', help='model of the sensor in '
+                      'the file of --prior, if it has several')
+
+
+def prior(args: argparse.Namespace) -> FleetPrior | None:
+    """Return the typical values that `add_prior` asks for."""
+    return None if args.prior is None else read_prior(args.prior, args.sensor_model)
 
 
 def _columns(text: str) -> dict[str, str]:

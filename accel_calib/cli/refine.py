@@ -18,7 +18,7 @@ from ..errors import listed, RefusedFitError
 from ..files import write_calibration
 from ..files.plan_table import write_plan
 from ..rating import rate_refinement
-from ..refine import BASES, refine, Refinement
+from ..refine import BASES, refine, refine_with_fleet, Refinement
 from ..report import check_matplotlib, write_page
 from ..words import now, residual_words, verdict_words
 
@@ -53,6 +53,7 @@ def add_inputs(made: argparse.ArgumentParser) -> None:
     base.add_argument('--base', choices=BASES, default='auto',
                       help='model to start from (default: the model that fit --model auto '
                       'selects)')
+    options.add_prior(made, base)
     made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
     options.add_log(made)
     options.add_max_dwell(made)
@@ -112,9 +113,12 @@ def refine_file(args: argparse.Namespace, path: Path) -> Refinement:
         intake = options.intake(args, path)
     for line in intake.lines:
         Output(stderr=True).print(line)
+    poses = options.rows_between(intake.poses, args.rows)
     with working('refining'):
-        return refine(options.rows_between(intake.poses, args.rows), intake.units, base=base,
-                      sensor=args.sensor, date=now())
+        fleet = options.prior(args)
+        if fleet is not None:
+            return refine_with_fleet(poses, intake.units, fleet, sensor=args.sensor, date=now())
+        return refine(poses, intake.units, base=base, sensor=args.sensor, date=now())
 
 
 def _store(result: Refinement, source: Path, output: Path | None, report: Path | None,

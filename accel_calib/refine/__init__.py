@@ -11,12 +11,14 @@ a model, and the score of a set of effects and outliers. `sets` searches for the
 `wander` compares it with a random walk of the offset. `curves` finds an empirical curve where no
 effect fits, and `rivals` computes the probability of each effect. `output` contains the effects
 that are not columns of the equations. `findings` describes the result, and `plan` chooses the
-poses that separate effects from their rivals.
+poses that separate effects from their rivals. `with_fleet` includes the typical values of a fleet.
 
 """
 
 from .plan_words import PlannedPose, PosePlan
 from .records import Refinement, Stage, Step
 from .refinement import BASES, refine
+from .with_fleet import refine_with_fleet
 
-__all__ = ['BASES', 'PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine']
+__all__ = ['BASES', 'PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine',
+           'refine_with_fleet']
