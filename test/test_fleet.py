@@ -7,58 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+import functools
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import json
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+from threading import Thread
 import time
 from typing import Any
 
-from accel_calib.api import simulate
 from accel_calib.errors import InputError
-from accel_calib.files import read_calibration, write_table
-from accel_calib.fleet import cluster, Input, Options, recordings, run, Store
+from accel_calib.files import read_calibration
+from accel_calib.fleet import cluster, Input, run, Store
 from accel_calib.fleet.identity import as_folder, date_of, sensor_of
-from accel_calib.fleet.inputs import content_hash
+from accel_calib.fleet.inputs import content_hash, on_disk
+from fleet_case import found_in, OFFSET, QUICK, rows_of, write_fleet, write_poses
 import numpy as np
 import pytest
 
 pytest.importorskip('distributed')
-pq = pytest.importorskip('pyarrow.parquet')
-
-OFFSET = np.array([0.01, -0.02, 0.03])
-QUICK = Options(refined=False)
-
-
-def write_poses(path: Path, offset: Any = OFFSET, *, seed: int = 0, sensor: str = 'imu_link',
-                **options: Any) -> Path:
-    """Write the pose table of a simulated sensor, and return its path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    poses = simulate({'offset': offset, 'axis_gain': (0.004, -0.006, 0.002)}, poses=14, seed=seed,
-                     units='g', **options)
-    write_table(path, replace(poses, sensor=sensor))
-    return path
-
-
-def write_fleet(folder: Path, robots: int, dates: int) -> Path:
-    """Write recordings of robots whose offset differs by 1 mg in x from one to the next."""
-    for robot in range(robots):
-        for month in range(1, dates + 1):
-            write_poses(folder / f'robot_{robot}' / f'2026-{month:02d}-03.csv',
-                        OFFSET + np.eye(3)[0] * 0.001 * robot, seed=100 * robot + month)
-    return folder
-
-
-def rows_of(results: Path) -> list[dict[str, Any]]:
-    """Return the rows of the data set, as any reader of Parquet sees them."""
-    found: list[dict[str, Any]] = pq.read_table(results / 'recordings').to_pylist()
-    return found
-
-
-def found_in(*names: Path | str) -> list[Input]:
-    return list(recordings(map(str, names)))
+pytest.importorskip('pyarrow')
 
 
 @pytest.fixture(scope='module')
@@ -288,6 +259,21 @@ def test_lists_globs_and_folders_find_recordings(tmp_path: Path) -> None:
         found_in(tmp_path / 'robot_9')
     with pytest.raises(InputError, match='holds no recording'):
         found_in(tmp_path / 'nothing_*')
+
+
+def test_an_address_of_the_web_may_have_a_query(tmp_path: Path) -> None:
+    pytest.importorskip('aiohttp')
+    write_poses(tmp_path / 'robot_0' / 'a.csv')
+    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with ThreadingHTTPServer(('127.0.0.1', 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        address = f'http://127.0.0.1:{server.server_port}/robot_0/a.csv?token=1'
+        (found,) = found_in(address)
+        with on_disk(found.path) as path:
+            assert path.name == 'a.csv'
+            assert path.read_bytes() == (tmp_path / 'robot_0' / 'a.csv').read_bytes()
+        server.shutdown()
+    assert found.path == address
 
 
 def test_the_content_of_a_folder_is_that_of_its_files_and_names(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import re
 from . import options
 from .terminal import progress, working
 from ..errors import counted
-from ..fleet import cluster, Options, recordings, Store, Summary
+from ..fleet import cluster, Options, recordings, STATUS, Store, Summary
 from ..fleet import run as run_fleet
 
 _EXAMPLE = ('accel-calib fleet recordings/ -o results/\n'
@@ -66,8 +66,9 @@ def run(args: argparse.Namespace) -> int:
                           f'{client.dashboard_link}')
             with progress('recordings') as moved:
                 summary = run_fleet(client, found, asked, Store(args.output.absolute()), moved)
-    options.write_json(args.json, {'recordings': len(found), **summary.counts,
-                                   'sensors': summary.sensors})
+    options.write_json(args.json, {
+        'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
+        'sensors': summary.sensors})
     for line in _lines(summary, args.output):
         console.print(line)
     return 0

@@ -13,6 +13,6 @@ calibrations of each sensor over time. `run` submits the tasks.
 from .inputs import Input, recordings
 from .run import cluster, run, Summary
 from .store import Store
-from .task import Options
+from .task import Options, STATUS
 
-__all__ = ['Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings', 'run']
+__all__ = ['Input', 'Options', 'STATUS', 'Store', 'Summary', 'cluster', 'recordings', 'run']

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import tempfile
 from typing import Any
 
-from ..errors import InputError
+from ..errors import AccelCalibError, InputError
 
 _SUFFIXES = ('.csv', '.tsv', '.txt', '.log', '.mcap', '.db3', '.bag', '.ulg', '.bin')
 """Endings of recordings in a folder; a file that is named itself can have any ending."""
@@ -123,20 +123,44 @@ def _below(folder: Path, root: Path) -> Iterator[Input]:
 def _addresses(text: str) -> Iterator[Input]:
     """Yield the recordings of an address, in order."""
     system, path = _system(text)
-    protocol = text.partition('://')[0]
-    if any(letter in path for letter in _MAGIC):
-        parts = PurePosixPath(path).parts
-        first = next(k for k, part in enumerate(parts)
-                     if any(letter in part for letter in _MAGIC))
-        root, found = PurePosixPath(*parts[:first]), system.glob(path)
-    elif system.isfile(path):
-        root, found = PurePosixPath(path).parent, [path]
-    else:
-        root = PurePosixPath(path)
-        found = [each for each in system.find(path) if each.lower().endswith(_SUFFIXES)]
+    with _as_input_error(text):
+        root, found = _found_at(system, path)
     for each in sorted(found):
-        yield Input(f'{protocol}://{each.lstrip("/") if protocol != "file" else each}',
+        yield Input(system.unstrip_protocol(each),
                     PurePosixPath(each).relative_to(root).as_posix())
+
+
+def _found_at(system: Any, path: str) -> tuple[PurePosixPath, list[str]]:
+    """Return the folder above the recordings, and their paths in the file system."""
+    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
+    parts = PurePosixPath(path).parts
+    first = next((k for k, part in enumerate(parts) if set(part) & set(magic)), None)
+    if first is None and system.isfile(path):
+        return PurePosixPath(path).parent, [path]
+    if first is None:
+        return PurePosixPath(path), _files_below(system, path)
+    found = system.glob(path, detail=True).items()
+    files = [each for each, about in found if about['type'] == 'file']
+    below = [file for each, about in found if about['type'] == 'directory'
+             for file in _files_below(system, each)]
+    return PurePosixPath(*parts[:first]), files + below
+
+
+def _files_below(system: Any, path: str) -> list[str]:
+    return [each for each in system.find(path) if each.lower().endswith(_SUFFIXES)]
+
+
+@contextmanager
+def _as_input_error(address: str) -> Iterator[None]:
+    """Raise InputError for the errors of a store, which have many types; OSError stays."""
+    try:
+        yield
+    except (AccelCalibError, OSError):
+        raise
+    except Exception as err:
+        raise InputError(f'{address} cannot be read: {err or type(err).__name__}, expected a '
+                         'store that answers', 'check the address, the network and the '
+                         'credentials, and run again') from err
 
 
 def _system(text: str) -> tuple[Any, str]:
@@ -159,8 +183,9 @@ def on_disk(path: str) -> Iterator[Path]:
         return
     system, inside = _system(path)
     with tempfile.TemporaryDirectory(prefix='accel_calib-') as folder:
-        local = Path(folder) / PurePosixPath(inside).name
-        system.get_file(inside, str(local))
+        local = Path(folder) / PurePosixPath(inside.partition('?')[0]).name
+        with _as_input_error(path):
+            system.get_file(inside, str(local))
         yield local
 
 

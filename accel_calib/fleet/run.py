@@ -15,6 +15,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
+import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
@@ -36,7 +38,20 @@ _Item = TypeVar('_Item')
 _AHEAD = 4
 """Tasks in the queue per worker thread: enough that none waits for the program."""
 
+_TASK_S = 0.5
+"""Duration of a task [s]: recordings share it if they are quick, because a task costs the program
+some milliseconds."""
+
+_MOST_TOGETHER = 20
+"""Largest number of recordings per task: they are done again if their worker dies."""
+
+_NEWEST = 0.2
+"""Weight of the newest task in the mean duration of a recording."""
+
 _CONNECT_S = 30.0
+
+_CONFIG = {'distributed.worker.profile.enabled': False}
+"""Settings of a cluster on this machine. The profiles of a worker would take 1 GB in an hour."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +94,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
 
     """
     try:
+        import dask
         from distributed import Client, LocalCluster
         import pyarrow  # noqa: F401
     except ImportError as err:
@@ -93,8 +109,9 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         with client:
             yield client
         return
-    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=':0',
-                      silence_logs='ERROR') as local, \
+    with dask.config.set(_CONFIG), \
+            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=':0',
+                         silence_logs='ERROR') as local, \
             Client(local, set_as_default=False) as client:
         yield client
 
@@ -134,7 +151,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         _merge(client, store)  # what an interrupted run left
         counts: Counter[str] = Counter()
         unread: list[Row] = []
-        for item, result in _mapped(client, calibrate_recording, found, options, store):
+        for item, result in mapped(client, calibrate_recording, found, options, store):
             done = _of_dead(item, options, result) if isinstance(result, Exception) else result
             counts[done.status] += 1
             unread += [] if done.row is None else [done.row]
@@ -144,7 +161,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         priors = priors_of(store.all_rows(PRIOR_COLUMNS))
         if priors:
             write_priors(store.folder / PRIOR_FILE, priors)
-        write_fleet_page(store, sensors)
+        write_fleet_page(store, sensors, priors)
         return Summary(counts, sensors, priors)
 
 
@@ -153,7 +170,7 @@ def _merge(client: Client, store: Store) -> list[Row]:
     rows, names = [], store.waiting()
     if not names:
         return read_sensors(store)
-    for _, result in _mapped(client, merge_sensor, names, store):
+    for _, result in mapped(client, merge_sensor, names, store):
         if isinstance(result, Exception):
             raise result
         rows.append(result)
@@ -174,38 +191,70 @@ def _of_dead(item: Input, options: Options, error: Exception) -> Done:
         'give the workers more memory, and run again')))
 
 
-def _mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
-            ) -> Iterator[tuple[_Item, Any]]:
+def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
+           ) -> Iterator[tuple[_Item, Any]]:
     """Yield each item with the result of a function, or its exception, as they are done."""
+    from distributed import as_completed, KilledWorker
+
+    rest, alone, pace = iter(items), list[_Item](), _Pace()
+    waiting: dict[Any, list[_Item]] = {}
+    done = as_completed(loop=client.loop)
+    limit = _AHEAD * max(sum(client.nthreads().values()), 1)
+    while True:
+        while len(waiting) < limit and (batch := [alone.pop()] if alone else
+                                        list(islice(rest, pace.size))):
+            future = client.submit(_each, function, batch, *others, pure=False)
+            waiting[future] = batch
+            done.add(future)
+        if not waiting:
+            return
+        future = next(done)
+        batch = waiting.pop(future)
+        try:
+            results, seconds = _result_of(client, future)
+        except KilledWorker as err:
+            if len(batch) > 1:  # find out which one
+                alone += batch
+                continue
+            results, seconds = [err], 0.0
+        del future  # so that the scheduler forgets it
+        pace.add(len(batch), seconds)
+        yield from zip(batch, results, strict=True)
+
+
+def _result_of(client: Client, future: Any) -> tuple[list[Any], float]:
+    """Return the result of a task; raise InputError if the scheduler is gone."""
     from concurrent.futures import CancelledError
 
-    from distributed import as_completed
+    try:
+        found: tuple[list[Any], float] = future.result()
+        return found
+    except CancelledError as err:
+        raise InputError(f'the scheduler {client.scheduler.addr} is gone; expected it to stay '
+                         'until the end', 'start it again, and run the same command: done '
+                         'recordings are skipped') from err
 
-    rest, waiting = iter(items), {}
-    done = as_completed(loop=client.loop)
 
-    def submit() -> bool:
-        for item in rest:
-            future = client.submit(function, item, *others, pure=False)
-            waiting[future] = item
-            done.add(future)
-            return True
-        return False
-
-    limit = _AHEAD * max(sum(client.nthreads().values()), 1)
-    while len(waiting) < limit and submit():
-        pass
-    while waiting:
-        future = next(done)
-        item = waiting.pop(future)
+def _each(function: Callable[..., Any], batch: Sequence[Any], *others: Any
+          ) -> tuple[list[Any], float]:
+    """Return the result of a function per item, or its exception, and the seconds of them all."""
+    begin, results = time.perf_counter(), list[Any]()
+    for item in batch:
         try:
-            result = future.result()
-        except CancelledError as err:
-            raise InputError(f'the scheduler {client.scheduler.addr} is gone; expected it to stay '
-                             'until the end', 'start it again, and run the same command: done '
-                             'recordings are skipped') from err
-        except Exception as err:  # the caller decides
-            result = err
-        del future  # so that the scheduler forgets it
-        submit()
-        yield item, result
+            results.append(function(item, *others))
+        except Exception as err:  # the program decides
+            results.append(err)
+    return results, time.perf_counter() - begin
+
+
+class _Pace:
+    """The number of items per task: about `_TASK_S` of work, beginning with one item."""
+
+    def __init__(self) -> None:
+        self.size = 1
+        self._seconds = _TASK_S
+
+    def add(self, count: int, seconds: float) -> None:
+        """Add a task of this many items; the newest tasks count most."""
+        self._seconds += _NEWEST * (seconds / count - self._seconds)
+        self.size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(self._seconds, 1e-9))))

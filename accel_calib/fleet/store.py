@@ -135,11 +135,13 @@ class Store:
         return len(rows)
 
     def finish(self, name: str) -> None:
-        """Remove the pending rows of a sensor, which are in the data set."""
+        """Remove the pending rows of a sensor that are in the data set."""
         folder = self.pending / name
         for path in folder.iterdir():  # with temporary files of killed workers
-            path.unlink()
-        folder.rmdir()
+            if path.suffix != '.json' or self.has(path.stem):
+                path.unlink(missing_ok=True)
+        if not any(folder.iterdir()):  # a worker of a killed program may still write
+            folder.rmdir()
 
     def replace_unread(self, rows: list[Row]) -> None:
         """Replace the rows of the recordings that could not be read."""

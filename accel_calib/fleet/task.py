@@ -33,12 +33,15 @@ from ..crash import crash_words
 from ..errors import AccelCalibError, RefusedFitError, system_error
 from ..files import LogOptions, write_calibration
 from ..intake import Intake, poses_of
+from ..model import MODELS
 from ..pipeline import calibrated, Outcome
 from ..table import Poses
-from ..units import Units
 
 RESULTS = 1
 """Version of the rows. Another version makes all recordings be calibrated again."""
+
+STATUS = ('ok', 'error', 'unread', 'skipped')
+"""What can happen to a recording; unread: it could not be read, and is tried again."""
 
 _PRIOR_MODEL = '10'
 
@@ -77,8 +80,8 @@ class Done:
     ----------
     key : str
         Key of the result; empty if the recording could not be read.
-    status : {'ok', 'error', 'unread', 'skipped'}
-        What happened.
+    status : str
+        What happened, one of `STATUS`.
     row : dict or None
         The row, if it is not in the store: for a recording that could not be read.
 
@@ -213,7 +216,7 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
-        **_linear(calibration), **_for_prior(intake.poses, intake.units)}
+        **_linear(calibration), **_for_prior(intake, calibration)}
 
 
 def _linear(calibration: Calibration) -> Row:
@@ -224,13 +227,14 @@ def _linear(calibration: Calibration) -> Row:
         (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}
 
 
-def _for_prior(poses: Poses, units: Units) -> Row:
+def _for_prior(intake: Intake, found: Calibration) -> Row:
     """Return values and covariance of model 10, if the poses determine it."""
-    if units.name == 'native':
+    if intake.units.name == 'native':
         return {}
-    try:
-        found = fit_poses(poses, units, model=_PRIOR_MODEL)
-    except RefusedFitError:
-        return {}
+    if found.model.effects != MODELS[_PRIOR_MODEL]:
+        try:
+            found = fit_poses(intake.poses, intake.units, model=_PRIOR_MODEL)
+        except RefusedFitError:
+            return {}
     return {'prior_values': found.model.vector.tolist(),
             'prior_covariance': found.covariance.ravel().tolist()}
