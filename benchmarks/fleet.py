@@ -1,0 +1,424 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A fleet of simulated sensors, calibrated on a local cluster.
+
+The pose tables are made first. Every sensor has values of its own; some sensors drift or change
+for good, some are far from the others, and some files are damaged. A second call with the same
+folder continues the first one::
+
+    python benchmarks/fleet.py --folder /tmp/fleet --markdown docs/figures/fleet.md
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
+import functools
+from importlib import import_module
+import json
+import os
+from pathlib import Path
+import platform
+import shutil
+import sys
+from tempfile import TemporaryDirectory
+import time
+from typing import Any
+from unittest import mock
+
+# One thread per process, so that two workers are compared with one.
+os.environ |= dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+import accel_calib as ac  # noqa: E402
+from accel_calib import fleet, pipeline  # noqa: E402
+from accel_calib.files import write_table  # noqa: E402
+from accel_calib.fleet import Input, Options, Store, Summary  # noqa: E402
+from figures import Line, processor, publish, table  # noqa: E402
+import numpy as np  # noqa: E402
+
+RUN, SENSORS, TASK = (import_module(f'accel_calib.fleet.{name}')
+                      for name in ('run', 'sensors', 'task'))
+
+POSES = 14
+DAMAGED = 0.03
+"""Share of the files that cannot be calibrated."""
+
+KINDS = {'odd': 0.01, 'drifts': 0.02, 'changes': 0.03}
+"""Share of the sensors by what is special about them, cumulative from 0."""
+
+OFFSET_G, GAIN, CROSS = 0.020, 0.008, 0.002
+"""Standard deviations over the sensors."""
+
+ODD_G, DRIFT_G, CHANGE_G = 0.200, 0.0005, 0.015
+"""Offset of an odd sensor, drift per recording, and change for good."""
+
+TCO = 0.0006
+"""Change of the offset with temperature of model B [g/°C]."""
+
+FIRST = datetime(2026, 1, 1, tzinfo=timezone.utc)
+EVERY = timedelta(days=18)
+
+LEAST_RATIO = 1.8
+MOST_RISE = 0.1
+"""Largest relative rise of the memory between two parts of the run that counts as flat."""
+
+PARTS = (0.1, 0.5, 1.0)
+SAMPLED = 100
+"""Memory is sampled so often per run."""
+
+TIMED = 600
+"""Recordings for the speed with one and two workers."""
+
+STAGED = 200
+"""Recordings for the cost by stage, in one process."""
+
+MILLION = 1_000_000
+HOUR_S = 3600.0
+
+ABOUT = """# Speed and memory of a fleet
+
+Made by `python benchmarks/fleet.py {command} --markdown FILE`. {sensors:,} simulated sensors with
+{calibrations} pose tables of {poses} poses each, on a cluster of this machine; {damaged:.0f} % of
+the files are damaged. Every process has one thread. Speed is that of {timed} recordings, without
+the first and last tenth. Memory is the resident memory of the largest worker, and of the program
+with the scheduler.
+
+Machine: {machine}."""
+
+AFTER = """
+A stage is timed in one process on {staged} recordings, in milliseconds of the processor, without
+waiting for the disk. The stages that follow the recordings are timed for their sensors. The rest
+of a recording on a worker is the work of Dask. A million robots with {calibrations} recordings
+each need the core hours of the last line."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """
+    A simulated sensor.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    kind : str
+        One of `KINDS`, or empty.
+    values : dict of str to array
+        Values by effect of the first recording.
+    away : array of shape (3,)
+        Direction of a drift or change of the offset.
+    from_ : int
+        First recording after a change for good.
+
+    """
+
+    name: str
+    kind: str
+    values: dict[str, Any]
+    away: Any
+    from_: int
+
+    def at(self, k: int) -> dict[str, Any]:
+        """Return the values by effect at recording k."""
+        moved = {'drifts': DRIFT_G * k, 'changes': CHANGE_G * (k >= self.from_)}
+        offset = self.values['offset'] + moved.get(self.kind, 0.0) * self.away
+        return {**self.values, 'offset': offset}
+
+
+def sensor(number: int, calibrations: int, seed: int) -> Sensor:
+    """Return a sensor; the same number and seed give the same one."""
+    rng = np.random.default_rng([seed, number])
+    drawn, model = rng.uniform(), 'AB'[number % 2]
+    kind = next((name for name, share in KINDS.items() if drawn < share), '')
+    away = rng.normal(size=3)
+    away /= np.linalg.norm(away)
+    offset = np.array([0.01, -0.02, 0.03]) + rng.normal(0.0, OFFSET_G, 3)
+    values = {'offset': offset + (ODD_G * away if kind == 'odd' else 0.0),
+              'axis_gain': rng.normal(0.0, GAIN, 3), 'cross_axis': rng.normal(0.0, CROSS, 3)}
+    if model == 'B':
+        values['offset_temperature'] = rng.normal(TCO, TCO / 10.0, 3)
+    changed = int(rng.integers(2, max(calibrations - 1, 3)))
+    return Sensor(f'{model}-{number:07d}', kind, values, away, changed)
+
+
+def write_sensor(folder: Path, number: int, calibrations: int, seed: int) -> None:
+    """Write the pose tables of a sensor, unless they are there."""
+    made = sensor(number, calibrations, seed)
+    if (folder / made.name).exists():
+        return
+    rng = np.random.default_rng([seed, number, 1])
+    new = folder / f'.{made.name}'
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir()
+    for k in range(calibrations):
+        begin = FIRST + k * EVERY
+        poses = ac.simulate(
+            made.at(k), poses=POSES, seed=int(rng.integers(2 ** 32)),
+            time=begin.timestamp() + 10.0 * np.arange(POSES),
+            temperature=np.sort(rng.uniform(20.0, 35.0, POSES)) if 'B' in made.name else ())
+        path = new / f'{begin:%Y-%m-%d}.csv'
+        write_table(path, replace(poses, sensor=''))
+        if rng.uniform() < DAMAGED:
+            damage(path, int(rng.integers(3)))
+    new.rename(folder / made.name)
+
+
+def damage(path: Path, kind: int) -> None:
+    """Damage a pose table: no table, too few poses, or nothing."""
+    lines = path.read_text(encoding='utf-8').splitlines(keepends=True)
+    path.write_text(''.join((['the logger was off\n'], lines[:6], [])[kind]), encoding='utf-8')
+
+
+def write_inputs(folder: Path, given: argparse.Namespace) -> None:
+    """Write the pose tables of all sensors; those that are there stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(given.workers) as pool:
+        write = functools.partial(write_sensor, folder, calibrations=given.calibrations,
+                                  seed=given.seed)
+        for k, _ in enumerate(pool.map(write, range(given.sensors), chunksize=20), 1):
+            if k % 1000 == 0:
+                print(f'{k:,} sensors written', file=sys.stderr, flush=True)
+
+
+def memory_mb() -> float:
+    """Return the resident memory of this process [MB]."""
+    pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+class Watch:
+    """Moments and memory of a run, and the progress function that records them."""
+
+    def __init__(self, client: Any, log: Path | None = None) -> None:
+        self.client, self.log = client, log
+        self.moments: list[float] = []
+        self.every = 0
+
+    def __call__(self, done: int, count: int) -> None:
+        """Record a moment; sample the memory at parts of the run."""
+        self.moments.append(time.perf_counter())
+        if self.log and (done == count or done % max(count // SAMPLED, 1) == 0):
+            line = {'done': done, 'count': count, 'program': memory_mb(),
+                    'worker': max(self.client.run(memory_mb).values()),
+                    'seconds': self.moments[-1] - self.moments[0]}
+            with self.log.open('a', encoding='utf-8') as file:
+                print(json.dumps(line), file=file)
+
+    def per_s(self) -> float:
+        """Return recordings per second, without the first and last tenth."""
+        tenth = len(self.moments) // 10
+        first, last = self.moments[tenth], self.moments[-tenth - 1]
+        return (len(self.moments) - 2 * tenth - 1) / (last - first)
+
+
+def speed(found: Sequence[Input], options: Options, workers: int, folder: Path) -> float:
+    """Return recordings per second."""
+    with TemporaryDirectory(dir=folder) as out, fleet.cluster(workers=workers) as client:
+        client.wait_for_workers(workers)
+        watch = Watch(client)
+        fleet.run(client, found, options, Store(Path(out)), watch)
+    return watch.per_s()
+
+
+@contextmanager
+def timed(spent: dict[str, float], stages: dict[str, tuple[Any, str]],
+          clock: Callable[[], float] = time.perf_counter) -> Iterator[None]:
+    """Add up the time of functions, by stage; a function is an object and a name in it."""
+    def timer(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def timed_function(*given: Any, **options: Any) -> Any:
+            begin = clock()
+            try:
+                return function(*given, **options)
+            finally:
+                spent[stage] += clock() - begin
+        return timed_function
+
+    with ExitStack() as stack:
+        for stage, (owner, name) in stages.items():
+            stack.enter_context(
+                mock.patch.object(owner, name, timer(stage, getattr(owner, name))))
+        yield
+
+
+def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
+    """Return the cost by stage in one process [ms of processor per recording]."""
+    spent: dict[str, float] = Counter()
+    with TemporaryDirectory(dir=folder) as out:
+        store = Store(Path(out))
+        TASK.calibrate_recording(found[0], options, Store(store.folder / 'first'))  # imports
+        with timed(spent, {
+                'all': (TASK, 'calibrate_recording'), 'hash': (TASK, 'content_hash'),
+                'read and capture': (TASK, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
+                'refine': (pipeline, 'refine'), 'rate': (pipeline, 'rate'),
+                'fit for the prior': (TASK, 'fit_poses'),
+                'write the calibration': (TASK, 'write_calibration'),
+                'write the row': (Store, 'add')}, time.process_time):
+            for each in found:
+                TASK.calibrate_recording(each, options, store)
+        spent['other'] = 2.0 * spent['all'] - sum(spent.values())
+        with timed(spent, {'merge': (Store, 'merge'), 'compare': (SENSORS, '_compared'),
+                           'read the calibrations': (SENSORS, 'read_calibration'),
+                           'typical values': (RUN, 'priors_of'),
+                           'page': (RUN, 'write_fleet_page')}, time.process_time):
+            rows = [SENSORS.merge_sensor(name, store) for name in store.waiting()]
+            rows = SENSORS.write_sensors(store, rows)
+            RUN.priors_of(store.all_rows(RUN.PRIOR_COLUMNS))
+            RUN.write_fleet_page(store, rows)
+    return {stage: 1e3 * seconds / len(found) for stage, seconds in spent.items()}
+
+
+@dataclass(frozen=True)
+class Whole:
+    """
+    The run over all recordings.
+
+    Parameters
+    ----------
+    summary : Summary
+        What was done.
+    per_s : float
+        Recordings per second.
+    seconds, program_s : float
+        Duration, and processor time of the program with the scheduler.
+    after : dict of str to float
+        Seconds of the stages after the recordings.
+
+    """
+
+    summary: Summary
+    per_s: float
+    seconds: float
+    program_s: float
+    after: dict[str, float]
+
+
+def whole(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Whole:
+    """Calibrate all recordings, or those that are left."""
+    spent: dict[str, float] = Counter()
+    with fleet.cluster(workers=workers) as client:
+        client.wait_for_workers(workers)
+        begin, program_s = time.perf_counter(), time.process_time()
+        watch = Watch(client, folder / 'memory.jsonl')
+        with timed(spent, {'merge and compare': (RUN, '_merge'),
+                           'typical values': (RUN, 'priors_of'),
+                           'page': (RUN, 'write_fleet_page')}):
+            summary = fleet.run(client, found, options, Store(folder / 'results'), watch)
+        return Whole(summary, watch.per_s(), time.perf_counter() - begin,
+                     time.process_time() - program_s, spent)
+
+
+def memory_lines(log: Path, workers: int) -> Iterator[Line]:
+    """Yield the memory at parts of the run, which several calls may have made."""
+    samples = [json.loads(line) for line in log.read_text(encoding='utf-8').splitlines()]
+    for who, of in (('worker', f'largest of {workers} workers'), ('program', 'program')):
+        first = None
+        for part in PARTS:
+            sample = next((each for each in samples if each['done'] >= part * each['count']), None)
+            if sample is None:
+                continue
+            first = first or sample[who]
+            rise = sample[who] / first - 1.0
+            yield Line(f'{of} after {part:.0%} of the recordings, MB', f'{sample[who]:.0f}',
+                       f'<= {MOST_RISE:+.0%}' if part > PARTS[0] else '', 1,
+                       rise <= MOST_RISE if part > PARTS[0] else None)
+
+
+def found_lines(summary: Summary, given: argparse.Namespace) -> Iterator[Line]:
+    """Yield how many sensors of each kind are named as changed for good."""
+    named = {row['sensor'] for row in summary.sensors
+             if any(change['for_good'] for change in row['changes'])}
+    made = [sensor(k, given.calibrations, given.seed) for k in range(given.sensors)]
+    for kind in ('changes', 'drifts', 'odd', ''):
+        names = {each.name for each in made if each.kind == kind}
+        if names:
+            yield Line(f'named as changed for good: sensors of kind {kind or "constant"}',
+                       f'{len(names & named)} of {len(names)}', '', len(names), None)
+
+
+def run_lines(done: Whole, given: argparse.Namespace) -> Iterator[Line]:
+    """Yield the figures of the run over all recordings."""
+    counts = done.summary.counts
+    total = sum(counts.values())
+    words = ', '.join(f'{count:,} {name}' for name, count in sorted(counts.items()))
+    yield Line(f'all recordings, minutes ({words})', f'{done.seconds / 60.0:.1f}', '', total, None)
+    yield Line(f'all recordings, per second with {given.workers} workers', f'{done.per_s:.1f}',
+               '', total, None)
+    yield Line('program with the scheduler, ms of processor per recording',
+               f'{1e3 * done.program_s / total:.2f}', '', total, None)
+    for stage, seconds in done.after.items():
+        yield Line(f'after the recordings: {stage}, seconds', f'{seconds:.1f}', '', total, None)
+    yield from found_lines(done.summary, given)
+
+
+def cost_lines(spent: dict[str, float], done: Whole, given: argparse.Namespace
+               ) -> Iterator[Line]:
+    """Yield the cost by stage, and what a million robots need."""
+    for stage, cost in spent.items():
+        if stage != 'all':
+            yield Line(f'{stage}, ms of processor per recording', f'{cost:.2f}', '', STAGED, None)
+    each_s = given.workers / done.per_s
+    yield Line('a recording on a worker with Dask, ms', f'{1e3 * each_s:.1f}', '', 1, None)
+    count = sum(done.summary.counts.values())
+    end_s = done.after.get('merge and compare', 0.0) * given.workers / count
+    hours = MILLION * given.calibrations * (each_s + end_s) / HOUR_S
+    yield Line(f'a million robots with {given.calibrations} recordings each, core hours',
+               f'{hours:,.0f}', '', 1, None)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--sensors', type=int, default=10_000)
+    parser.add_argument('--calibrations', type=int, default=20)
+    parser.add_argument('--workers', type=int, default=2)
+    parser.add_argument('--no-refine', action='store_true')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--folder', type=Path, help='folder of the recordings and the results; a '
+                        'second call continues (default: a temporary one)')
+    parser.add_argument('--markdown', type=Path, help='write the table to this file')
+    given = parser.parse_args(arguments)
+    with TemporaryDirectory() as temporary:
+        publish(measured(given, (given.folder or Path(temporary)).absolute()), given.markdown)
+    return 0
+
+
+def measured(given: argparse.Namespace, folder: Path) -> str:
+    """Run the benchmark in a folder, and return the page."""
+    machine = f'{processor()} before; Python {platform.python_version()}, numpy {np.__version__}'
+    options = Options(model_from='^([AB])-', refined=not given.no_refine)
+    write_inputs(folder / 'in', given)
+    found = list(fleet.recordings([str(folder / 'in')]))
+    mixed = np.random.default_rng(given.seed).permutation(len(found)).tolist()
+    some = [found[k] for k in mixed[:TIMED]]
+    speeds = {workers: speed(some, options, workers, folder) for workers in (1, 2)}
+    spent = costs(some[:STAGED], options, folder)
+    done = whole(found, options, given.workers, folder)
+    ratio = speeds[2] / speeds[1]
+    lines = [*(Line(f'recordings per second with {counted}', f'{each:.1f}', '', len(some), None)
+               for counted, each in zip(('1 worker', '2 workers'), speeds.values(), strict=True)),
+             Line('2 workers against 1', f'{ratio:.2f}', f'>= {LEAST_RATIO}', len(some),
+                  ratio >= LEAST_RATIO),
+             *memory_lines(folder / 'memory.jsonl', given.workers), *run_lines(done, given),
+             *cost_lines(spent, done, given)]
+    command = f'--sensors {given.sensors} --calibrations {given.calibrations}'
+    about = ABOUT.format(command=command + ' --no-refine' * given.no_refine, machine=machine,
+                         sensors=given.sensors, calibrations=given.calibrations, poses=POSES,
+                         damaged=100.0 * DAMAGED, timed=len(some))
+    after = AFTER.format(staged=min(STAGED, len(some)), calibrations=given.calibrations)
+    return f'{about}\n\n{table(lines)}\n{after}'
+
+
+if __name__ == '__main__':
+    sys.exit(main())
