@@ -82,8 +82,17 @@ def calibration(seed):
     return lambda path: ac.fit(poses(seed), flat=1).save(path)
 
 
+def fleet(folder):
+    for robot in range(6):
+        (folder / f'robot_{robot}').mkdir(parents=True)
+        own = {**SENSOR, 'offset': np.array(SENSOR['offset']) + 0.002 * robot}
+        write_table(folder / f'robot_{robot}' / 'poses.csv',
+                    ac.simulate(own, poses=14, seed=40 + robot))
+
+
 FILES = {
     'recording': bag,
+    'recordings/': fleet,
     'recording.csv': lambda path: write_table(path, recording(poses=14, seed=9)),
     'poses.csv': lambda path: write_table(path, poses(8)),
     'other_poses.csv': lambda path: write_table(path, poses(18)),
@@ -106,6 +115,8 @@ def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
         if Path(sample).suffix in LIBRARIES:
             pytest.importorskip(LIBRARIES[Path(sample).suffix])
         shutil.copy(LOGS / sample, name)
+    if any(words[0] == 'fleet' for block in blocks for words in block.commands):
+        pytest.importorskip('distributed')
     for block in blocks:
         statuses = [run(words) for words in block.commands if words[0] not in OF_ROS]
         expected = [0] * (len(statuses) - 1) + [block.status] * bool(statuses)

@@ -285,3 +285,17 @@ def test_the_content_of_a_folder_is_that_of_its_files_and_names(tmp_path: Path) 
     a, b, c, d = (content_hash(tmp_path / name) for name in 'abcd')
     assert a == b
     assert len({a, c, d}) == 3
+
+
+def test_pandas_reads_the_results_as_the_page_says(client: Any, tmp_path: Path,
+                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    write_poses(tmp_path / 'in' / 'good.csv')
+    (tmp_path / 'in' / 'bad.csv').write_text('nothing to see\n')
+    run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'results'))
+    monkeypatch.chdir(tmp_path)
+    page = Path(__file__).resolve().parents[1] / 'docs' / 'fleet.md'
+    found = page.read_text(encoding='utf-8').partition('```python\n')[2].partition('```')[0]
+    names: dict[str, Any] = {}
+    exec(compile(found, 'fleet.md', 'exec'), names)
+    assert names['errors'].recording.tolist() == [str(tmp_path / 'in' / 'bad.csv')]
+    assert len(names['rows']) == 2
