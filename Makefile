@@ -73,8 +73,9 @@ $(VENV)/made:
 	@$(PIP) install 'setuptools>=70.1'
 	@touch $@
 
+$(VENV)/extra-test: ALSO := ,test-fleet
 $(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev $(VENV)/extra-docs: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
-	@$(PIP) install --no-build-isolation '.[ros,$*]'
+	@$(PIP) install --no-build-isolation '.[ros,$*$(ALSO)]'
 	@touch $@
 
 # Only for tests.

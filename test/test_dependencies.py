@@ -25,7 +25,7 @@ package_xml, setup_py = test_packaging.package_xml, test_packaging.setup_py
 ROOT = Path(__file__).parent.parent
 PINNED = '.ci/ubuntu-24.04.txt', 'requirements-dev.txt'
 
-FOR_DEVELOPERS = {'dev', 'docs', 'test'}
+FOR_DEVELOPERS = {'dev', 'docs', 'test', 'test-fleet'}
 """Extras that users do not install. The extra `ros` has exact versions."""
 
 WITHOUT_DISTRIBUTION = {'_typeshed', 'compression'}
