@@ -107,6 +107,7 @@ class Host:
         self._waiting: list[Floats] = []
         self._passed = self._ticked = self._shown = -math.inf
         self.session = Session(settings, source.name)
+        self.session.publishers = None
         self._worker = Worker(self._tasks.put, self._handle_events,
                               lambda words: self._log(Log('error', words)))
         self.exchange = Exchange(self.session, self._worker, self._tasks.put, self._log,

@@ -53,8 +53,8 @@ class Health:
         Name of the sensor; current state; reason why messages are not corrected, or empty.
     topic : str
         Topic of the raw messages, with namespace and remapping.
-    publishers : tuple of str
-        Names of the nodes that publish on this topic.
+    publishers : tuple of str or None
+        Names of the nodes that publish on this topic; None: the samples come from a board.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, and what to do.
     calibration : str
@@ -98,7 +98,7 @@ class Health:
     state: str
     problem: str
     topic: str
-    publishers: tuple[str, ...]
+    publishers: tuple[str, ...] | None
     mismatches: tuple[str, ...]
     calibration: str
     outside: str
@@ -152,7 +152,7 @@ def _stream(health: Health) -> Finding:
 
 
 def stream_fault(statistics: StreamStatistics, length: float, topic: str,
-                 publishers: Sequence[str], mismatches: Sequence[str] = ()) -> str:
+                 publishers: Sequence[str] | None, mismatches: Sequence[str] = ()) -> str:
     """Return what is wrong with the messages, and what to do; arguments as in `Health`."""
     silence = '' if mismatches else _silence(statistics, topic, publishers)
     faults = (_publishers(topic, publishers), *mismatches, silence, statistics.stamp_fault,
@@ -160,17 +160,19 @@ def stream_fault(statistics: StreamStatistics, length: float, topic: str,
     return '; '.join(filter(None, faults))
 
 
-def _publishers(topic: str, names: Sequence[str]) -> str:
-    if len(names) < 2:
+def _publishers(topic: str, names: Sequence[str] | None) -> str:
+    if names is None or len(names) < 2:
         return ''
     count = 'two' if len(names) == 2 else str(len(names))
     return (f'{count} publishers on the topic {topic}: {", ".join(names)}; expected one sensor: '
             'stop the others, or give each sensor its own topic')
 
 
-def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]) -> str:
+def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str] | None) -> str:
     if min(statistics.age, statistics.dropped_ago) <= SILENT:
         return ''
+    if publishers is None:
+        return f'{topic} sends no samples: check the board, its cable and its program'
     if publishers:
         return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
                 'the driver')

@@ -87,8 +87,8 @@ class Session:
         What the user can ask for.
     preview : Calibration or None
         A calibration that waits for ~/save or ~/undo.
-    publishers : tuple of str
-        Names of the nodes that publish the messages.
+    publishers : tuple of str or None
+        Names of the nodes that publish the messages; None: the samples come from a board.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     changes : int
@@ -117,7 +117,7 @@ class Session:
         self.commands = Commands(self)
         self.frame_id: str | None = None
         self.problem = ''
-        self.publishers: tuple[str, ...] = ()
+        self.publishers: tuple[str, ...] | None = ()
         self.mismatches: tuple[str, ...] = ()
         self.preview: Calibration | None = None
         self.fitted_poses = self.changes = self.computing = 0
