@@ -21,6 +21,7 @@ from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.files import read_calibration
+from accel_calib.files.exports import export
 from accel_calib.fleet import cluster, Input, run, Store
 from accel_calib.fleet.identity import as_folder, date_of, sensor_of
 from accel_calib.fleet.inputs import content_hash, on_disk
@@ -299,3 +300,18 @@ def test_pandas_reads_the_results_as_the_page_says(client: Any, tmp_path: Path,
     exec(compile(found, 'fleet.md', 'exec'), names)
     assert names['errors'].recording.tolist() == [str(tmp_path / 'in' / 'bad.csv')]
     assert len(names['rows']) == 2
+
+
+def test_each_calibration_is_exported_as_asked(client: Any, tmp_path: Path) -> None:
+    write_poses(tmp_path / 'in' / 'a.csv')
+    options = replace(QUICK, exports=('c', 'arduino', 'px4', 'betaflight'))
+    run(client, found_in(tmp_path / 'in'), options, Store(tmp_path / 'out'))
+    row, = rows_of(tmp_path / 'out')
+    stored = tmp_path / 'out' / row['calibration']
+    assert sorted(path.name for path in stored.parent.iterdir()) == sorted(
+        [stored.name, *(f'{stored.stem}_{end}' for end in (
+            'arduino.h', 'betaflight.txt', 'c.h', 'px4.params'))])
+    calibration = read_calibration(stored)
+    assert stored.with_name(f'{stored.stem}_px4.params').read_bytes().decode() == (
+        export(calibration, 'px4').text_or_bytes)
+    assert any(line.startswith('betaflight: ') for line in row['warnings'])

@@ -188,7 +188,7 @@ def test_exports_need_the_token_and_an_accepted_calibration(turned: Bench) -> No
         200, 'attachment; filename="calibration.json"')
     found = json.loads(content)
     assert viewer.state['result']['model'] in str(found)
-    for name in messages.EXPORTS:
+    for name in messages.CALIBRATION_ALONE:
         assert fetch(f'{turned.base}/export/{name}', Authorization=key)[0] == 200, name
     words = fetch(f'{turned.base}/export/kalibr', Authorization=key)
     assert words[0] == 409

@@ -12,6 +12,7 @@ import re
 from . import options
 from .terminal import progress, working
 from ..errors import counted
+from ..files.exports import CALIBRATION_ALONE
 from ..fleet import cluster, Options, recordings, STATUS, Store, Summary
 from ..fleet import run as run_fleet
 
@@ -38,6 +39,9 @@ def add_to(made: argparse.ArgumentParser) -> None:
                       'model of the sensor from its name')
     made.add_argument('--no-refine', action='store_true',
                       help='do not look for effects beyond offset, gain and cross-axis')
+    made.add_argument('--export', action='append', default=[], choices=CALIBRATION_ALONE,
+                      metavar='FORMAT', help='write each calibration in this format, too; can be '
+                      f'repeated: {", ".join(CALIBRATION_ALONE)}')
     options.add_log(made)
     options.add_max_dwell(made)
     options.add_json(made)
@@ -60,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
         with working('looking for recordings'):
             found = list({each.path: each for each in recordings(args.recordings)}.values())
         asked = Options(args.sensor_from, args.model_from, options.log_options(args),
-                        options.settings(args), not args.no_refine)
+                        options.settings(args), not args.no_refine,
+                        tuple(dict.fromkeys(args.export)))
         with cluster(args.scheduler, args.workers) as client:
             console.print(f'{counted(len(found), "recording")}; dashboard: '
                           f'{client.dashboard_link}')

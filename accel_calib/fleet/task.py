@@ -12,7 +12,7 @@ such as a full disk, are raised: they concern all recordings.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import json
@@ -32,6 +32,8 @@ from ..compare.parameters import NAMES, rotation_free
 from ..crash import crash_words
 from ..errors import AccelCalibError, RefusedFitError, system_error
 from ..files import LogOptions, write_calibration
+from ..files.atomic import write_bytes_atomically
+from ..files.exports import export
 from ..intake import Intake, poses_of
 from ..model import MODELS
 from ..pipeline import calibrated, Outcome
@@ -61,6 +63,8 @@ class Options:
         Fields of `accel_calib.capture.CaptureSettings`.
     refined : bool
         Look for effects beyond offset, gain and cross-axis.
+    exports : tuple of str
+        Formats of `accel_calib.files.exports.FORMATS` to write beside each calibration.
 
     """
 
@@ -69,6 +73,7 @@ class Options:
     log: LogOptions = LogOptions()
     settings: dict[str, Any] = field(default_factory=dict)
     refined: bool = True
+    exports: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -135,8 +140,26 @@ def calibrate_recording(found: Input, options: Options, store: Store) -> Done:
         (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_calibration(store.folder / name, calibration, keep_before=False)
         row['calibration'] = name
+        row['warnings'] += _exported(calibration, store.folder / name, options.exports)
     store.add(row)
     return Done(key, row['status'])
+
+
+def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:
+    """Write exports beside a calibration; return what they do not hold, or why there is none."""
+    found = []
+    for name in formats:
+        try:
+            made = export(calibration, name)
+        except AccelCalibError as err:
+            found.append(f'no export to {name}: {err}')
+            continue
+        content = made.text_or_bytes
+        write_bytes_atomically(
+            path.with_name(f'{path.stem}_{name}{Path(made.suffix).suffix or made.suffix}'),
+            content.encode() if isinstance(content, str) else content)
+        found += [f'{name}: {line}' for line in made.losses]
+    return found
 
 
 def key_of(content: str, found: Input, options: Options) -> str:

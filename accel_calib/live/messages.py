@@ -24,7 +24,7 @@ from .. import __version__
 from ..calibrate import Calibration
 from ..calibrate.pose_planning import words_of
 from ..errors import InputError
-from ..files.exports import FORMATS
+from ..files.exports import CALIBRATION_ALONE
 from ..rating import Rating
 from ..session.events import Severity
 from ..session.guidance import Progress
@@ -40,9 +40,6 @@ OFFERED = ('fit', 'refine', 'set_level', 'set_heading', 'calibrate_at_rest')
 COMMANDS = ('capture_pose', 'undo_pose', *OFFERED, 'save', 'undo', 'load', 'reset', 'enable',
             'disable')
 """Commands of the page."""
-
-EXPORTS = tuple(name for name, each in FORMATS.items() if not each.needs_noise)
-"""Formats of exports that need nothing but the calibration."""
 
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
@@ -119,7 +116,7 @@ def welcome(why: str, history: Iterable[Message]) -> Message:
     """
     kept = list(history)
     return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-            'seconds': HISTORY_S, 'commands': COMMANDS, 'exports': EXPORTS,
+            'seconds': HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
             'history': {key: [each[key] for each in kept] for key in _HISTORY}}
 
 

@@ -41,8 +41,8 @@ from .tools import (
 )
 from ...calibrate import Calibration
 
-__all__ = ['FORMATS', 'Export', 'Exported', 'Loss', 'Noise', 'Options', 'export', 'identifier',
-           'read_noise']
+__all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Export', 'Exported', 'Loss', 'Noise', 'Options',
+           'export', 'identifier', 'read_noise']
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,9 @@ FORMATS: Mapping[str, Export] = MappingProxyType({
     'npz': Export('NumPy', '.npz', 'all values as arrays', '', make_npz),
 })
 """The formats by name."""
+
+CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if not each.needs_noise)
+"""Formats that need nothing but the calibration."""
 
 
 def export(calibration: Calibration, to: str, noise: Noise | None = None,
