@@ -68,7 +68,7 @@ setup(
                  'pandas>=2.1.4,<4', 'playwright>=1.49,<2', 'pymavlink>=2.4.41,<2.5',
                  'pyserial>=3.5,<4', 'pytest>=7.4,<10', 'pytest-xdist>=3.4,<4', 'pyulog>=1.1,<2',
                  'segno>=1.6,<2', 'setuptools>=68.1.2,<85'],
-        # Also a store of s3 on this machine; apart, because pip takes minutes to find old versions.
+        # With a store of s3. Apart, because pip takes minutes to find old versions of it.
         'test-fleet': [*FLEET, 'flask>=2.2.5,<4', 'flask-cors>=4,<7', 'moto[s3]>=5,<6',
                        's3fs>=2024.2,<2027'],
         'dev': [
