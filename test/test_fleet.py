@@ -315,3 +315,12 @@ def test_each_calibration_is_exported_as_asked(client: Any, tmp_path: Path) -> N
     assert stored.with_name(f'{stored.stem}_px4.params').read_bytes().decode() == (
         export(calibration, 'px4').text_or_bytes)
     assert any(line.startswith('betaflight: ') for line in row['warnings'])
+
+
+def test_typical_values_that_no_longer_hold_are_removed(client: Any, tmp_path: Path) -> None:
+    write_fleet(tmp_path / 'in', 5, 1)
+    found, store = found_in(tmp_path / 'in'), Store(tmp_path / 'out')
+    assert run(client, found, QUICK, store).priors
+    assert (tmp_path / 'out' / 'fleet.yaml').exists()
+    assert not run(client, found, replace(QUICK, model_from=r'robot_\d'), store).priors
+    assert not (tmp_path / 'out' / 'fleet.yaml').exists()

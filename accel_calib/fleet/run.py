@@ -161,6 +161,8 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         priors = priors_of(store.all_rows(PRIOR_COLUMNS))
         if priors:
             write_priors(store.folder / PRIOR_FILE, priors)
+        else:
+            (store.folder / PRIOR_FILE).unlink(missing_ok=True)
         write_fleet_page(store, sensors, priors)
         return Summary(counts, sensors, priors)
 
@@ -226,10 +228,12 @@ def _result_of(client: Client, future: Any) -> tuple[list[Any], float]:
     """Return the result of a task; raise InputError if the scheduler is gone."""
     from concurrent.futures import CancelledError
 
+    from distributed.comm import CommClosedError
+
     try:
         found: tuple[list[Any], float] = future.result()
         return found
-    except CancelledError as err:
+    except (CancelledError, CommClosedError) as err:
         raise InputError(f'the scheduler {client.scheduler.addr} is gone; expected it to stay '
                          'until the end', 'start it again, and run the same command: done '
                          'recordings are skipped') from err
