@@ -441,6 +441,31 @@ def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) 
         bench.close()
 
 
+def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Path) -> None:
+    class Silent(Recording):
+        @property
+        def blocks(self) -> Iterator[Floats]:
+            yield self.rows[:40]
+            while not self.played.wait(PAUSE):
+                yield self.rows[:0]
+            later = self.rows.copy()
+            later[:, 0] += 100.0
+            for row in later:
+                time.sleep(PAUSE)
+                yield row[np.newaxis]
+
+    bench = Bench(Silent(rows_of(spread_directions(1))), tmp_path / 'c.yaml')
+    try:
+        viewer = bench.viewer()
+        wait(lambda: 'bench.csv sends no samples' in viewer.state['problem'])
+        assert 'publisher' not in viewer.state['problem']
+        bench.source.played.set()
+        wait(lambda: 'sends no samples' not in viewer.state['problem'])
+    finally:
+        bench.source.played.set()
+        bench.close()
+
+
 def test_numbers_that_are_not_known_are_null() -> None:
     from accel_calib.session.guidance import Progress
     now = Progress(False, float('nan'), 0.0, 1.0, 0, 0, 0.0, float('inf'), '', ())

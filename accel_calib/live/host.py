@@ -28,7 +28,6 @@ from .server import PageServer
 from ..errors import AccelCalibError, system_error
 from ..session import BATCH, CalibratorSettings, Job, Log, LogFilter, Session, ShowPoses
 from ..session.events import Severity
-from ..session.stream_statistics import SILENT
 from ..session.worker import Worker
 from ..table import Floats
 
@@ -169,10 +168,6 @@ class Host:
     def _report_source(self) -> None:
         """Show and log that the source is interrupted, or is back."""
         problem = self._source.problem()
-        if not problem and self.session.statistics.messages and (
-                self.session.statistics.age > SILENT):
-            problem = (f'{self._source.name} sends no samples: check the board, its cable and its '
-                       'program; the page continues when they arrive, and the poses are kept')
         if bool(problem) != bool(self.exchange.problem):
             self._show_problem(problem, Log('warning', problem) if problem else Log(
                 'info', f'{self._source.name} is back; continue with the next pose'))

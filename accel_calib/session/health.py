@@ -172,7 +172,8 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
     if min(statistics.age, statistics.dropped_ago) <= SILENT:
         return ''
     if publishers is None:
-        return f'{topic} sends no samples: check the board, its cable and its program'
+        return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
+                'are kept')
     if publishers:
         return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
                 'the driver')
