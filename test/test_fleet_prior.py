@@ -231,6 +231,7 @@ def test_the_command_line_refines_with_the_file_of_the_fleet(
         assert "expected the model ''" in json.loads((tmp_path / 'r.json').read_text())['error']
         assert main([*arguments, '--sensor-model', 'B', '-o', str(out), '--report',
                      str(tmp_path / 'r.html'), '--json', str(tmp_path / 'r.json')]) == 0
+        assert main(['fit', *arguments[1:], '--sensor-model', 'B', '--model', '4']) == 2
         found = json.loads((tmp_path / 'r.json').read_text())
         assert [step['effect'] for step in found['steps']] == effects
         stored = read_calibration(out)

@@ -24,6 +24,7 @@ from ..calibrate import (
     MODEL_NAMES,
     outlook,
 )
+from ..errors import InputError
 from ..files import write_calibration
 from ..intake import Intake
 from ..rating import rate, Rating
@@ -108,6 +109,9 @@ def _fit(args: argparse.Namespace, path: Path) -> _Fitted:
     with working('fitting'):
         chosen = options.rows_between(poses, args.rows)
         fleet = options.prior(args)
+        if fleet is not None and (args.model not in ('auto', '10') or args.method != 'ml'):
+            raise InputError(f'--prior with --model {args.model} --method {args.method}, expected '
+                             'model 10 by maximum likelihood', 'leave out these options')
         if fleet is None:
             calibration = fit_poses(chosen, intake.units, model=args.model, method=args.method,
                                     sensor=args.sensor, date=now())
