@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     noise = None if args.noise is None else read_noise(args.noise)
     made = export(calibration, args.to, noise, chosen)
     target = _target(args, made)
-    _write(target, made.text_or_bytes)
+    _write(target, made)
     options.write_json(args.json, _result(args, target, made))
     _show(made, target)
     return 0
@@ -92,15 +92,14 @@ def _target(args: argparse.Namespace, made: Exported) -> Path | None:
     return target
 
 
-def _write(target: Path | None, content: str | bytes) -> None:
+def _write(target: Path | None, made: Exported) -> None:
     """Write the content to a file, or to standard output."""
-    data = content.encode() if isinstance(content, str) else content
     if target is None:
         sys.stdout.flush()
-        sys.stdout.buffer.write(data)
+        made.write(sys.stdout)
         sys.stdout.flush()
     else:
-        write_atomically(target, lambda file: file.buffer.write(data))
+        write_atomically(target, made.write)
 
 
 def _result(args: argparse.Namespace, target: Path | None, made: Exported) -> dict[str, Any]:

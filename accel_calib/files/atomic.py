@@ -73,17 +73,6 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     remove_leftovers(target, older_than=_STALE_S)
 
 
-def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Write a binary file as `write_atomically` does; errors as there."""
-    target = Path(os.path.realpath(path))
-    with _replacing(target) as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    _flush_folder(target.parent)
-    remove_leftovers(target, older_than=_STALE_S)
-
-
 def copy_atomically(path: Path, target: Path) -> None:
     """Copy a file within its folder, completely or not at all; raise OSError if it fails."""
     with path.open('rb') as source, _replacing(target) as file:

@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import errno
 import fcntl
-import io
 import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -26,7 +25,7 @@ from typing import Any, TYPE_CHECKING
 from .identity import as_folder
 from ..compare.parameters import NAMES
 from ..errors import InputError
-from ..files.atomic import write_atomically, write_bytes_atomically
+from ..files.atomic import write_atomically
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -207,9 +206,7 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
     import pyarrow.parquet as pq
 
     table = pa.Table.from_pylist(rows, columns)
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    write_bytes_atomically(path, buffer.getvalue())
+    write_atomically(path, lambda file: pq.write_table(table, file.buffer))
 
 
 def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:

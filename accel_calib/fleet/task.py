@@ -32,7 +32,7 @@ from ..compare.parameters import NAMES, rotation_free
 from ..crash import crash_words
 from ..errors import AccelCalibError, RefusedFitError, system_error
 from ..files import LogOptions, write_calibration
-from ..files.atomic import write_bytes_atomically
+from ..files.atomic import write_atomically
 from ..files.exports import export
 from ..intake import Intake, poses_of
 from ..model import MODELS
@@ -154,10 +154,8 @@ def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> l
         except AccelCalibError as err:
             found.append(f'no export to {name}: {err}')
             continue
-        content = made.text_or_bytes
-        write_bytes_atomically(
-            path.with_name(f'{path.stem}_{name}{Path(made.suffix).suffix or made.suffix}'),
-            content.encode() if isinstance(content, str) else content)
+        end = Path(made.suffix).suffix or made.suffix  # two formats have the same suffix
+        write_atomically(path.with_name(f'{path.stem}_{name}{end}'), made.write)
         found += [f'{name}: {line}' for line in made.losses]
     return found
 

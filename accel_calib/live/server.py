@@ -332,10 +332,8 @@ class PageServer:
         found, = await self._asked(lambda answer: self._desk.export(name, answer))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
-        content = found.text_or_bytes
         return web.Response(
-            body=content.encode() if isinstance(content, str) else content,
-            content_type='application/octet-stream',
+            body=found.data, content_type='application/octet-stream',
             headers={'Content-Disposition': f'attachment; filename="calibration{found.suffix}"'})
 
     async def _asked(self, ask: Callable[[Any], object]) -> Any:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import TextIO
 
 from .c import identifier, make_arduino, make_c
 from .flight import (
@@ -103,6 +104,16 @@ class Exported:
     leaves_mg: float
     details: tuple[Loss, ...] = field(default=(), repr=False)
     notes: tuple[str, ...] = ()
+
+    @property
+    def data(self) -> bytes:
+        """Return the content as bytes."""
+        content = self.text_or_bytes
+        return content.encode() if isinstance(content, str) else content
+
+    def write(self, file: TextIO) -> None:
+        """Write the content to an open file."""
+        file.buffer.write(self.data)
 
 
 FORMATS: Mapping[str, Export] = MappingProxyType({
