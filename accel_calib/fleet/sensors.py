@@ -18,7 +18,7 @@ change is fitted to each value, and the row has the most significant slope.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
@@ -109,7 +109,9 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     found: dict[str, Any] = {'agree': history.whole.agree, 'p_value': history.whole.p_value}
     if history.whole.agree:
         return {**found, 'drift': drift_of(history)}
-    limit, changes, back = LEVEL / len(history.changes), [], False
+    limit, back = LEVEL / len(history.changes), False
+    changes: list[Row] = []
+    lasting: dict[int, bool | None] = {}
     steady = _Steady.of(history)
     for k, change in enumerate(history.changes):
         name = steady.changed(k, k + 1, limit)
@@ -119,16 +121,13 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
         if back:  # from the odd one back to the others
             back = False
             continue
-        for_good = _stays(ordered, steady, k, limit)
+        lasting[k + 1] = for_good = _stays(ordered, steady, k, limit)
         back = for_good is False
         row = rows[order[k + 1]]
         changes.append({'key': row['key'], 'date': row['date'], 'parameter': name,
                         'p_value': change.comparison.p_value, **steady.change(name, k),
-                        'for_good': for_good, 'recording': row['recording'], 'index': k + 1})
-    drift = drift_of(history, changes)
-    for each in changes:
-        del each['index']
-    return {**found, 'changes': changes, 'drift': drift}
+                        'for_good': for_good, 'recording': row['recording']})
+    return {**found, 'changes': changes, 'drift': drift_of(history, lasting)}
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,7 @@ def years_of(history: History) -> Floats | None:
     return np.array(dates) / _YEAR_S if len(dates) == len(history.moments) else None
 
 
-def drift_of(history: History, changes: Sequence[Row] = ()) -> Row | None:
+def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row | None:
     """
     Return the most significant drift of a value over the dates.
 
@@ -213,9 +212,9 @@ def drift_of(history: History, changes: Sequence[Row] = ()) -> Row | None:
     ----------
     history : History
         The calibrations.
-    changes : sequence of dict
-        Changes with the ``index`` of the first calibration after it. If a change is not for good,
-        this calibration is left out.
+    changes : mapping of int to bool or None
+        Whether a change is for good, by the index of the first calibration after it. If it is not
+        for good, this calibration is left out.
 
     Returns
     -------
@@ -230,8 +229,8 @@ def drift_of(history: History, changes: Sequence[Row] = ()) -> Row | None:
     if years is None:
         return None
     kept = np.ones(len(years), bool)
-    kept[[each['index'] for each in changes if each['for_good'] is not True]] = False
-    steps = [np.arange(len(years)) >= each['index'] for each in changes if each['for_good']]
+    kept[[index for index, for_good in changes.items() if not for_good]] = False
+    steps = [np.arange(len(years)) >= index for index, for_good in changes.items() if for_good]
     columns = np.column_stack([years - np.mean(years), np.ones(len(years)), *steps])[kept]
     dof = len(columns) - columns.shape[1]
     if dof < 1 or np.linalg.matrix_rank(columns) < columns.shape[1]:
