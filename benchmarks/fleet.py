@@ -274,8 +274,8 @@ def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, f
                            'page': (RUN, 'write_fleet_page')}, time.process_time):
             rows = [SENSORS.merge_sensor(name, store) for name in store.waiting()]
             rows = SENSORS.write_sensors(store, rows)
-            RUN.priors_of(store.all_rows(RUN.PRIOR_COLUMNS))
-            RUN.write_fleet_page(store, rows)
+            priors = RUN.priors_of(store.all_rows(RUN.PRIOR_COLUMNS))
+            RUN.write_fleet_page(store, rows, priors)
     return {stage: 1e3 * seconds / len(found) for stage, seconds in spent.items()}
 
 

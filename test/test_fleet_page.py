@@ -79,7 +79,7 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
 
     known = overview([row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
                       row('error', None, 9.0)])
-    np.testing.assert_allclose(known.values['']['s'], 0.02)
+    np.testing.assert_allclose(known.models[''].values['s'], 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 1, 'BAD': 1, 'error': 1}
     assert len(known.errors) == 1
 
@@ -190,8 +190,9 @@ def _write_rows(store: Store, sensor: str, rows: list[dict[str, Any]]) -> None:
     write_parquet(folder / 'data.parquet', rows, schema())
 
 
-def page_of(store: Store, sensors: list[dict[str, Any]], **options: Any) -> str:
-    write_fleet_page(store, sensors, **options)
+def page_of(store: Store, sensors: list[dict[str, Any]],
+            priors: dict[str, FleetPrior] | None = None) -> str:
+    write_fleet_page(store, sensors, priors or {})
     return (store.folder / 'fleet.html').read_text(encoding='utf-8')
 
 

@@ -88,8 +88,7 @@ def of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawi
 def _draw_values(title: str, names: Sequence[str], known: OfModel, odd: Sequence[Odd]) -> Chart:
     hover, table = {}, np.array(list(known.values.values()))
     with styled():
-        figure = new_figure(3.6)
-        figure.suptitle(f'{title} [{scale_of(names[0])[2]}]', x=0.02, ha='left', fontsize=10.5)
+        figure = _titled(3.6, f'{title} [{scale_of(names[0])[2]}]')
         panels = figure.subplots(3, 1)
         for panel, name in zip(panels, names, strict=True):
             own = [each for each in odd if each[1] == name]
@@ -98,6 +97,13 @@ def _draw_values(title: str, names: Sequence[str], known: OfModel, odd: Sequence
                 hover[name] = tuple(Mark(0, odd_words(known, each)) for each in own)
         panels[1].set_ylabel('sensors')
     return Chart(figure, hover)
+
+
+def _titled(height: float, title: str) -> Any:
+    """Return a figure of this height [inch] with a title, in which $ is no mathematics."""
+    figure = new_figure(height)
+    figure.suptitle(title, x=0.02, ha='left', fontsize=10.5, parse_math=False)
+    return figure
 
 
 def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -> None:
@@ -166,9 +172,7 @@ def of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
 
 def _draw_months(title: str, names: Sequence[str], days: Floats, found: Floats) -> Chart:
     with styled():
-        figure = new_figure(3.9)
-        figure.suptitle(f'{title} minus its median [{scale_of(names[0])[2]}]', x=0.02, ha='left',
-                        fontsize=10.5)
+        figure = _titled(3.9, f'{title} minus its median [{scale_of(names[0])[2]}]')
         panels = figure.subplots(3, 1, sharex=True)
         for panel, name in zip(panels, names, strict=True):
             column = found[:, :, NAMES.index(name)] * scale_of(name)[1]
@@ -214,9 +218,7 @@ def _draw_sensor(sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str
         deviations[:, [NAMES.index(name) for name in CROSS]])]
     at, dated = _places(rows)
     with styled():
-        figure = new_figure(0.9 + 1.15 * len(groups))
-        figure.suptitle(_short_name(sensor), x=0.02, ha='left', fontsize=10.5,
-                        parse_math=False)
+        figure = _titled(0.9 + 1.15 * len(groups), _short_name(sensor))
         panels = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
         for panel, (_, _, names) in zip(panels, groups, strict=True):
             columns = [NAMES.index(name) for name in names]

@@ -128,11 +128,6 @@ class Overview:
     errors: list[Row] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
 
-    @property
-    def values(self) -> Mapping[str, Mapping[str, Floats]]:
-        """Return the mean of `NAMES` by model and sensor."""
-        return {name: each.values for name, each in self.models.items()}
-
 
 def overview(rows: Iterable[Row]) -> Overview:
     """Return the statistics of the rows of recordings, in order of sensor and date."""

@@ -70,7 +70,7 @@ _COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advi
 
 
 def write_fleet_page(store: Store, sensors: Sequence[Row],
-                     priors: Mapping[str, FleetPrior] | None = None) -> None:
+                     priors: Mapping[str, FleetPrior]) -> None:
     """
     Write the page.
 
@@ -80,7 +80,7 @@ def write_fleet_page(store: Store, sensors: Sequence[Row],
         The results.
     sensors : sequence of dict
         The rows of all sensors.
-    priors : mapping of str to FleetPrior, optional
+    priors : mapping of str to FleetPrior
         Typical values by model of sensor.
 
     Raises
@@ -90,7 +90,7 @@ def write_fleet_page(store: Store, sensors: Sequence[Row],
 
     """
     known = overview(store.all_rows(_COLUMNS))
-    text = sheet('Fleet', _body(store, known, sensors, priors or {}), script=False)
+    text = sheet('Fleet', _body(store, known, sensors, priors), script=False)
     write_atomically(store.folder / PAGE, lambda file: file.write(text))
 
 
