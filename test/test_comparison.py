@@ -8,8 +8,8 @@ import json
 
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.cli.main import main
-from accel_calib.compare import compare
-from accel_calib.compare.parameters import NAMES, rotation_free
+from accel_calib.compare import compare, history_of
+from accel_calib.compare.parameters import NAMES, rotation_free, Runs
 from accel_calib.errors import InputError
 from accel_calib.estimate.fit import estimate
 from accel_calib.files import write_calibration
@@ -182,6 +182,46 @@ def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one(
     assert found.dof == 9
     assert any('the model of run 1 omits gain.xy, gain.xz, gain.yz' in note
                for note in found.notes)
+
+
+@pytest.mark.parametrize('exact', [(), ((0, 1), (0, 2)), ((0, 1), (1, 1), (2, 1), (3, 1))])
+def test_squared_differences_are_those_of_all_contrasts(exact):
+    rng = np.random.default_rng(len(exact))
+    count, size = 4, 3
+    factors = rng.normal(size=(count, size, size)) * 1e-3
+    for run, row in exact:
+        factors[run, row] = 0.0
+    covariances = factors @ np.swapaxes(factors, 1, 2)
+    values = 1.0 + np.einsum('nij,nj->ni', factors, rng.normal(size=(count, size)))
+    contrasts = np.kron(np.eye(count)[1:] - np.eye(count)[:1], np.eye(size))
+    spread = np.zeros((count * size, count * size))
+    for k, one in enumerate(covariances):
+        spread[k * size:(k + 1) * size, k * size:(k + 1) * size] = one
+    away, matrix = contrasts @ values.ravel(), contrasts @ spread @ contrasts.T
+    chi2, rank = Runs(values, covariances, np.inf).squared
+    assert rank == np.linalg.matrix_rank(matrix, hermitian=True)
+    np.testing.assert_allclose(chi2, away @ np.linalg.pinv(matrix, hermitian=True) @ away,
+                               rtol=1e-4)
+
+
+def test_exact_values_agree_only_if_they_are_equal():
+    exact = np.zeros((3, 2, 2))
+    values = np.array([[0.01, 0.02]] * 3)
+    assert Runs(values, exact, np.inf).p_value == 1.0
+    values[2, 0] += 1e-6
+    assert Runs(values, exact, np.inf).p_value == 0.0
+
+
+def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model():
+    rng = np.random.default_rng(5)
+    small, large = model_with({'offset': [0.01, 0.0, 0.0], 'gain': 0.002}), sensor(rng)
+    calibrations = [*runs_of(small, rng, 2, name='4'), *runs_of(large, rng, 1)]
+    history = history_of(calibrations)
+    pair = history.between(0, 1)
+    assert pair.p_value == history.changes[0].comparison.p_value
+    assert [each.stated_sd[0] > 0.0 for each in pair.parameters] == [True] * 9
+    assert all('model 10' in note for note in pair.notes if 'omits' in note)
+    assert compare(calibrations[:2]).parameters[6].stated_sd[0] == 0.0
 
 
 def test_metres_and_g_are_converted():

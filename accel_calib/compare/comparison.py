@@ -29,6 +29,8 @@ from .parameters import (
     RotationFree,
     Runs,
     SAME_G,
+    Scatter,
+    scatter_of,
 )
 from ..calibrate import Calibration
 from ..calibrate.unknown_orientation import fit_unknown
@@ -49,7 +51,7 @@ _WARMER = 5.0
 """Difference of temperature between runs that causes a note [°C]."""
 
 
-def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
+def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
     """
     Check that calibrations can be compared.
 
@@ -82,7 +84,7 @@ def refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
                              'fit it again with more poses')
 
 
-def with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
+def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """
     Return fits whose uncertainties are valid for runs with smaller models, too.
 
@@ -116,7 +118,7 @@ def _fitted_with(name: str, run: Calibration) -> Calibration:
         return run
 
 
-def contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
+def _contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
     """Return the context for the comparison of each run, one row each."""
     common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
                                       if key in run.poses])])
@@ -134,16 +136,15 @@ def _own_context(run: Calibration) -> Context:
     return context
 
 
-def notes_of(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
-             names: tuple[str, ...], deviation: Floats, noisier: Sequence[int]
-             ) -> tuple[str, ...]:
+def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,
+              noisier: Sequence[int]) -> tuple[str, ...]:
     """
     Return notes that limit the meaning of a comparison.
 
     Parameters
     ----------
-    calibrations, sure : sequence of Calibration
-        The runs, and the result of `with_largest_model` for them.
+    given : sequence of Comparable
+        The runs.
     names : tuple of str
         Names of the t common parameters.
     deviation : (n, t) array
@@ -152,10 +153,11 @@ def notes_of(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
         Indices of runs whose poses repeat worse than those of the others.
 
     """
-    smaller = [f'run {k} (model {run.name}) omits parameters of model {larger.name}: they are '
-               'taken as zero, with the uncertainty that its poses allow'
-               for k, (run, larger) in enumerate(zip(calibrations, sure, strict=True), 1)
-               if run is not larger]
+    calibrations = [run.calibration for run in given]
+    smaller = [f'run {k} (model {run.calibration.name}) omits parameters of model '
+               f'{run.sure.name}: they are taken as zero, with the uncertainty that its poses '
+               'allow'
+               for k, run in enumerate(given, 1) if run.calibration is not run.sure]
     return (*_shared(calibrations), *smaller, *_left_out(names, deviation),
             *_temperatures(calibrations),
             *(f'the poses of run {k + 1} repeat significantly worse than those of the others: the '
@@ -317,6 +319,52 @@ class _Run:
         return carried
 
 
+@dataclass(frozen=True)
+class Comparable:
+    """
+    A calibration prepared for comparisons with others of its sensor.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    sure : Calibration
+        Fit of the largest model of the sensor to the same poses, or the calibration itself.
+    scatter : Scatter
+        How well the poses of `sure` repeat.
+
+    """
+
+    calibration: Calibration
+    sure: Calibration
+    scatter: Scatter
+
+
+def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
+    """
+    Prepare calibrations of one sensor for any number of comparisons among them.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        Two or more calibrations with any models.
+
+    Returns
+    -------
+    tuple of Comparable
+        One for each calibration.
+
+    Raises
+    ------
+    InputError
+        As `compare`.
+
+    """
+    _refuse_if_unlike(calibrations)
+    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in
+                 zip(calibrations, _with_largest_model(calibrations), strict=True))
+
+
 def compare(calibrations: Sequence[Calibration]) -> Comparison:
     """
     Test whether calibrations of one sensor agree within their uncertainties.
@@ -338,10 +386,26 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
         not, or one has no uncertainty.
 
     """
-    refuse_if_unlike(calibrations)
-    sure = with_largest_model(calibrations)
-    scaled = on_one_scale(sure)
-    prepared = _prepared(calibrations, sure, scaled.covariances)
+    return compared(comparable(calibrations))
+
+
+def compared(given: Sequence[Comparable]) -> Comparison:
+    """
+    Test whether prepared calibrations agree within their uncertainties.
+
+    Parameters
+    ----------
+    given : sequence of Comparable
+        Two or more of those that `comparable` returned.
+
+    Returns
+    -------
+    Comparison
+        The result of the test, with the differences.
+
+    """
+    scaled = on_one_scale([run.scatter for run in given])
+    prepared = _prepared(given, scaled.covariances)
     names = tuple(dict.fromkeys(name for run in prepared for name in run.free.names))
     values = np.array([_into(names, run.free, run.free.values) for run in prepared])
     runs = Runs(values, np.array([run.spread(names, run.covariance) for run in prepared]),
@@ -353,17 +417,21 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
         p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
         _each(prepared, p_values(runs)),
         tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
-        _tilt_deg(prepared), notes_of(calibrations, sure, names, stated, scaled.noisier))
+        _tilt_deg(prepared), _notes_of(given, names, stated, scaled.noisier))
 
 
-def _prepared(calibrations: Sequence[Calibration], sure: Sequence[Calibration],
-              covariances: Sequence[Floats]) -> list[_Run]:
+def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Run]:
     """Return each calibration with its context and parameters in the common unit."""
+    calibrations = [run.calibration for run in given]
     per_g = float(np.mean([run.units.per_g for run in calibrations]))
-    return [_Run(run, one, context, rotation_free(run, context, per_g),
-                 rotation_free(one, context, per_g).slope, covariance)
-            for run, one, context, covariance in
-            zip(calibrations, sure, contexts_of(calibrations), covariances, strict=True)]
+    found = []
+    for run, context, covariance in zip(given, _contexts_of(calibrations), covariances,
+                                        strict=True):
+        free = rotation_free(run.calibration, context, per_g)
+        slope = free.slope if run.sure is run.calibration else rotation_free(
+            run.sure, context, per_g).slope
+        found.append(_Run(run.calibration, run.sure, context, free, slope, covariance))
+    return found
 
 
 def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:

@@ -13,13 +13,13 @@ change of the sensor, if the calibrations contain the effect of the temperature.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import pairwise
 
 import numpy as np
 
-from .comparison import compare, Comparison, Parameter, refuse_if_unlike
+from .comparison import Comparable, comparable, compared, Comparison, Parameter
 from ..calibrate import Calibration
 from ..errors import InputError
 
@@ -92,6 +92,8 @@ class History:
         Comparison of all calibrations.
     notes : tuple of str
         Notes that limit the meaning of the history.
+    runs : tuple of Comparable
+        The calibrations in the same order, prepared for comparisons.
 
     """
 
@@ -100,6 +102,11 @@ class History:
     changes: tuple[Change, ...]
     whole: Comparison
     notes: tuple[str, ...]
+    runs: tuple[Comparable, ...] = field(repr=False)
+
+    def between(self, first: int, second: int) -> Comparison:
+        """Return the comparison of two of the calibrations, by their number in the order."""
+        return compared([self.runs[first], self.runs[second]])
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -131,18 +138,18 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
         If there are fewer than two, they cannot be compared, or a date is not valid.
 
     """
-    refuse_if_unlike(calibrations)
+    runs = comparable(calibrations)
     moments = [_moment(k, each) for k, each in enumerate(calibrations)]
     undated = [moment.index + 1 for moment in moments if moment.when is None]
     if not undated:
         moments.sort(key=lambda moment: (moment.when or _FIRST, moment.index))
-    ordered = [calibrations[moment.index] for moment in moments]
-    whole = compare(ordered)
+    ordered = tuple(runs[moment.index] for moment in moments)
+    whole = compared(ordered)
     notes = [f'calibration {number} has no date: the order is that of the input'
              for number in undated]
     return History(tuple(moments), whole.parameters,
-                   tuple(_change(first, second) for first, second in pairwise(ordered)),
-                   whole, (*notes, *whole.notes))
+                   tuple(_change(compared(pair)) for pair in pairwise(ordered)),
+                   whole, (*notes, *whole.notes), ordered)
 
 
 def _moment(index: int, calibration: Calibration) -> Moment:
@@ -164,8 +171,8 @@ def _when(index: int, date: str) -> datetime | None:
     return when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
 
 
-def _change(first: Calibration, second: Calibration) -> Change:
-    comparison = compare([first, second])
+def _change(comparison: Comparison) -> Change:
+    """Return the change from the first to the second of two calibrations."""
     changes = np.array([each.values[1] - each.values[0] for each in comparison.parameters])
     deviations = np.array([np.hypot(*each.stated_sd) for each in comparison.parameters])
     known = deviations > 0.0

@@ -28,16 +28,20 @@ repeat significantly worse than those of the others keeps its own scale.
 
 **Agreement.** Test whether the parameters of several runs agree within their covariances.
 
-Runs of one sensor have parameters x_i with covariances C_i. Contrasts of the x_i, such as their
-differences, are then normally distributed about zero with the covariance K diag(C_i) Kᵀ, and
+Runs of one sensor have parameters x_i with covariances C_i. The squared differences from their
+mean m, weighted by C_i⁻¹,
 
-    T² = dᵀ (K diag(C_i) Kᵀ)⁺ d,   d = K x
+    T² = Σ (x_i - m)ᵀ C_i⁻¹ (x_i - m)
 
-divided by its rank has an F distribution with the degrees of freedom of the noise. T² tests all
-directions at once. In addition, each parameter of each run is compared with the mean of the other
-runs (Student's t), to detect a change of a single parameter. The smaller of the two probabilities
-is used, corrected for two tests and for the number of parameters (Bonferroni). The differing run
-is the run whose removal reduces T² most.
+divided by the rank of T² have an F distribution with the degrees of freedom of the noise. T² tests
+all directions at once. `SAME_G` is added to the standard deviations, so that C_i has an inverse
+also if a model omits a parameter. A difference between values that no model fits is exactly zero
+and adds nothing to the rank.
+
+In addition, each parameter of each run is compared with the mean of the other runs (Student's t),
+to detect a change of a single parameter. The smaller of the two probabilities is used, corrected
+for two tests and for the number of parameters (Bonferroni). The differing run is the run whose
+removal reduces T² most.
 
 """
 
@@ -61,7 +65,6 @@ NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain
 """V, and the diagonal and the upper triangle of S."""
 
 _ENTRIES = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
-_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -122,14 +125,13 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
 
     """
     model = calibration.model
-    origin, axes = np.zeros((1, 3)), np.eye(3)
+    origin = np.zeros((1, 3))
     vec_v = reading_of(model, origin, context)[0]
     mat_w = force_slope(model, origin, context)[0]
     slope_v = parameter_basis(model, origin, context)[0]
-    either = [np.array([parameter_basis(model, sign * _STEP * axis[np.newaxis], context)[0]
-                        for axis in axes]) for sign in (1.0, -1.0)]
-    slope_w = np.swapaxes(either[0] - either[1], 0, 1) / (2.0 * _STEP)  # (row, column, p)
-    mat_s, slope_s = _polar(mat_w, slope_w)
+    here = {key: np.repeat(column, 3, 0) for key, column in context.items()}
+    slope_w = model.basis(np.zeros((3, 3)), here, np.eye(3)).full  # (column, row, p)
+    mat_s, slope_s = _polar(mat_w, np.swapaxes(slope_w, 0, 1))
     reading_scale, force_scale = _scales(calibration, per_g)
     gain_scale = reading_scale / force_scale
     own = [k for k, name in enumerate(calibration.parameters)
@@ -197,18 +199,34 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class _Run:
-    """The chi² of a run, its degrees of freedom, its stated variance, and the dof of its noise."""
+class Scatter:
+    """
+    How well the poses of a calibration repeat.
 
+    Parameters
+    ----------
+    covariance : (p, p) array
+        Stated covariance of ``model.vector`` [g²].
+    chi2 : float
+        Squared residuals over their variances.
+    dof : int
+        Degrees of freedom of the residuals.
+    stated : float
+        Factor of the stated covariance.
+    belief : float
+        Degrees of freedom for which the measured noise counts; 0 if it is not known.
+
+    """
+
+    covariance: Floats
     chi2: float
     dof: int
     stated: float
     belief: float
 
 
-def on_one_scale(calibrations: Sequence[Calibration]) -> Spread:
+def on_one_scale(runs: Sequence[Scatter]) -> Spread:
     """Return the covariances of calibrations of one sensor on a common scale."""
-    runs = [_run_of(calibration) for calibration in calibrations]
     factors, noisier, dofs = np.ones(len(runs)), [], []
     for measured in (True, False):  # without measured noise, chi² has no unit
         group = [k for k, run in enumerate(runs) if (run.belief > 0.0) is measured]
@@ -219,11 +237,11 @@ def on_one_scale(calibrations: Sequence[Calibration]) -> Spread:
         noisier += [group[j] for j in worse]
         dofs += [dof] if group and dof > 0.0 else []
     return Spread(tuple(run.covariance * factor
-                        for run, factor in zip(calibrations, factors, strict=True)),
+                        for run, factor in zip(runs, factors, strict=True)),
                   min(dofs, default=np.inf), tuple(sorted(noisier)))
 
 
-def _pooled(runs: Sequence[_Run]) -> tuple[float, float, list[int]]:
+def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
     """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
     from scipy.special import fdtrc
 
@@ -239,7 +257,7 @@ def _pooled(runs: Sequence[_Run]) -> tuple[float, float, list[int]]:
     return (*_scale(pool), worse)
 
 
-def _scale(pool: Sequence[_Run]) -> tuple[float, float]:
+def _scale(pool: Sequence[Scatter]) -> tuple[float, float]:
     """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
     from scipy.special import chdtrc
 
@@ -250,14 +268,15 @@ def _scale(pool: Sequence[_Run]) -> tuple[float, float]:
     return ((belief + chi2) / (belief + dof) if belief + dof > 0 else 1.0), belief + dof
 
 
-def _run_of(calibration: Calibration) -> _Run:
-    """Return the figures about the noise of a calibration."""
+def scatter_of(calibration: Calibration) -> Scatter:
+    """Return how well the poses of a calibration repeat."""
     fit = _fit_of(calibration)
     free = int(np.linalg.matrix_rank(fit.columns))
     # Over its own poses, the variances of a fit sum to the number of free parameters.
     total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
     belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
-    return _Run(fit.chi2, fit.equations.count - free, total / free if free else 0.0, belief)
+    return Scatter(calibration.covariance, fit.chi2, fit.equations.count - free,
+                   total / free if free else 0.0, belief)
 
 
 def _fit_of(calibration: Calibration) -> Fit:
@@ -296,16 +315,18 @@ class Runs:
     @property
     def squared(self) -> tuple[float, int]:
         """T² and its rank: squared differences in all directions over their variances."""
-        count = len(self.values)
-        contrasts = np.linalg.svd(np.ones((1, count)))[2][1:]
-        away = (contrasts @ self.values).ravel()
-        covariance = np.einsum('ai,irs,bi->arbs', contrasts, self.covariances, contrasts)
-        variances, vectors = np.linalg.eigh(covariance.reshape(away.size, away.size))
-        along = vectors.T @ away
-        vary = variances > _NO_SPREAD * max(float(np.max(variances, initial=0.0)), 1e-300)
-        if np.linalg.norm(along[~vary]) > SAME_G:
-            return np.inf, int(np.sum(vary))
-        return float(np.sum(along[vary] ** 2 / variances[vary])), int(np.sum(vary))
+        variances, vectors = np.linalg.eigh(self.covariances)
+        exact = variances <= _NO_SPREAD * np.max(variances, initial=1e-300)
+        weights = (vectors / (np.maximum(variances, 0.0) + SAME_G ** 2)[:, np.newaxis]
+                   ) @ np.swapaxes(vectors, 1, 2)
+        mean = np.linalg.solve(np.sum(weights, axis=0),
+                               np.einsum('nts,ns->t', weights, self.values))
+        away = self.values - mean
+        # Exact values of several runs in one direction: their differences have no variance.
+        known = np.einsum('ntk,nk,nsk->ts', vectors, exact, vectors)
+        rank = (len(away) - 1) * len(mean) - np.sum(exact) + np.linalg.matrix_rank(
+            known, _NO_SPREAD, hermitian=True)
+        return float(np.einsum('nt,nts,ns->', away, weights, away)), int(rank)
 
     @property
     def least(self) -> Floats:
@@ -333,8 +354,8 @@ def _beyond(chi2: float, rank: int, dof: float) -> float:
     """Return the probability of a T² of this rank that is at least this large."""
     from scipy.special import chdtrc, fdtrc
 
-    if rank == 0 or not np.isfinite(chi2):
-        return 1.0 if np.isfinite(chi2) else 0.0
+    if rank == 0:  # T² is in units of SAME_G²
+        return float(chi2 <= 1.0)
     return float(chdtrc(rank, chi2) if np.isinf(dof) else fdtrc(rank, dof, chi2 / rank))
 
 
@@ -350,7 +371,8 @@ def p_values(runs: Runs) -> Floats:
     found = []
     for k, least in enumerate(runs.least):
         others, others_rank = runs.without(k).squared
-        found.append(_either(_beyond(chi2 - others, rank - others_rank, runs.dof), float(least)))
+        added = max(chi2 - others, 0.0)
+        found.append(_either(_beyond(added, rank - others_rank, runs.dof), float(least)))
     return np.array(found)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from .store import Row, Store, write_parquet
 from ..calibrate import Calibration
-from ..compare import compare, History, history_of, LEVEL
+from ..compare import History, history_of, LEVEL
 from ..errors import AccelCalibError
 from ..files import read_calibration
 from ..table import Floats
@@ -105,7 +105,6 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     """Return whether the calibrations agree, and their changes."""
     history = history_of(calibrations)
     order = [moment.index for moment in history.moments]
-    ordered = [calibrations[k] for k in order]
     found: dict[str, Any] = {'agree': history.whole.agree, 'p_value': history.whole.p_value}
     if history.whole.agree:
         return {**found, 'drift': drift_of(history)}
@@ -121,7 +120,7 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
         if back:  # from the odd one back to the others
             back = False
             continue
-        lasting[k + 1] = for_good = _stays(ordered, steady, k, limit)
+        lasting[k + 1] = for_good = _stays(history, steady, k, limit)
         back = for_good is False
         row = rows[order[k + 1]]
         changes.append({'key': row['key'], 'date': row['date'], 'parameter': name,
@@ -185,14 +184,13 @@ class _Steady:
                 'sd': float(np.hypot(*self.deviations[row, step:step + 2]))}
 
 
-def _stays(ordered: Sequence[Calibration], steady: _Steady, before: int, limit: float
-           ) -> bool | None:
+def _stays(history: History, steady: _Steady, before: int, limit: float) -> bool | None:
     """Return whether the calibration after the next differs, too; None if there is none."""
-    if before + 2 >= len(ordered):
+    if before + 2 >= len(history.runs):
         return None
     if steady.changed(before, before + 2, limit) is None:
         return False
-    return compare([ordered[before], ordered[before + 2]]).p_value < limit
+    return history.between(before, before + 2).p_value < limit
 
 
 def years_of(history: History) -> Floats | None:
