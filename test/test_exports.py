@@ -12,6 +12,7 @@ import shutil
 import subprocess
 
 from accel_calib.calibrate import Calibration, GyroBias, Quality
+from accel_calib.effects.terms import terms_of
 from accel_calib.errors import DamagedCalibrationError, InputError
 from accel_calib.files.calibration_yaml import (
     format_calibration,
@@ -19,7 +20,7 @@ from accel_calib.files.calibration_yaml import (
     parse_calibration,
 )
 from accel_calib.files.exports import export, FORMATS, identifier, Options
-from accel_calib.model import Model, terms_of
+from accel_calib.model import Model
 from accel_calib.rotations import rotation_from_rpy
 from accel_calib.simulate import model_with, simulate_poses
 from accel_calib.sphere import spread_directions

@@ -37,7 +37,8 @@ from .quality import in_g, quality_of
 from .rest_noise import with_rest_noise
 from .unknown_orientation import copy_warning, FLEET, only_norm, rejected_by
 from ..errors import counted, RefusedFitError
-from ..estimate.fit import NotConvergedError, Prior
+from ..estimate.fit import Prior
+from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
 from ..sphere import unit
 from ..table import Floats, Poses

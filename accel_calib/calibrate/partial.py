@@ -61,7 +61,8 @@ from .unknown_orientation import copy_warning, only_norm, PRIOR, rejected_by
 from ..effects import EFFECTS
 from ..errors import counted, InputError, RefusedFitError
 from ..estimate.equations import variance_factor
-from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Prior
+from ..estimate.fit import estimate, Fit, judge, Prior
+from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
 from ..model import Model, MODELS, sensor_force, with_vector
 from ..sphere import unit

@@ -28,7 +28,7 @@ from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_warnings, in_g, quality_of, rival_warnings
 from ..errors import listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
-from ..estimate.fit import estimate, Fit, judge, NotConvergedError, Point, solve
+from ..estimate.fit import estimate, Fit, judge
 from ..estimate.geometry import (
     dilution,
     free_parameters,
@@ -38,6 +38,7 @@ from ..estimate.geometry import (
     poses_needed,
     WEAK_DILUTION,
 )
+from ..estimate.least_squares import NotConvergedError, Point, solve
 from ..estimate.mistakes import covariance_with, Rival, rivals
 from ..estimate.outliers import fit_norm, originals, start_of
 from ..model import Model, MODELS, sensor_force, with_linear_part, with_vector

@@ -19,7 +19,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from .comparison import Comparable, comparable, compared, Comparison, Parameter
+from .comparable import Comparable, comparable
+from .comparison import compared, Comparison, Parameter
 from ..calibrate import Calibration
 from ..errors import InputError
 

@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .equations import belief_in
-from .fit import Fit, judge, NotConvergedError
+from .fit import Fit, judge
+from .least_squares import NotConvergedError
 from .outliers import belief_beside, LEVEL
 from ..table import Floats, Poses
 

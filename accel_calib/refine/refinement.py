@@ -47,8 +47,9 @@ from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, WANDER
 from ..errors import counted, listed, RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import fit_4
 from ..estimate.equations import variance_factor
-from ..estimate.fit import judge, NotConvergedError
+from ..estimate.fit import judge
 from ..estimate.geometry import LARGEST_DILUTION
+from ..estimate.least_squares import NotConvergedError
 from ..model import Model
 from ..sphere import unit
 from ..table import Floats, Poses

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from .linear import held_out, Linear, linearised, Set
 from ..calibrate.quality import with_history
 from ..effects import CHANGES
-from ..estimate.fit import estimate, Fit, NotConvergedError
+from ..estimate.fit import estimate, Fit
+from ..estimate.least_squares import NotConvergedError
 from ..model import Model
 from ..table import Floats, Poses
 from ..units import MG
