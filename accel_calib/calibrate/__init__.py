@@ -18,12 +18,11 @@ from .calibration import (
     check_sensor,
     converted,
     EDITED,
-    of_samples,
     Quality,
     Rejected,
-    thermal_stream,
 )
 from .checks import check_units, FLAT
+from .context import of_samples, thermal_stream
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .fleet_prior import fit_with_fleet, FleetPrior
 from .gate import gated

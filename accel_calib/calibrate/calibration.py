@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .context import HELD, limited, of_samples, with_acting
 from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import AXES, Context
@@ -22,17 +23,10 @@ from ..html_table import table
 from ..model import correct, force_slope, Model, parameter_names, predict
 from ..significant import with_sd
 from ..table import Floats, Poses, Table
-from ..thermal import acting_temperature, rate_at, ThermalStream
 from ..units import STANDARD_GRAVITY, UnitName, Units
 
 EDITED = 'the file was edited by hand since it was stored'
 """Warning of a calibration whose file does not match its checksum."""
-
-THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
-"""Context that is computed from time and temperature."""
-
-HELD = ('time', 'temperature', *THERMAL, 'supply_voltage')
-"""Context that is limited to the range of the poses; effects are not extrapolated."""
 
 _IN_READING_UNITS = ('reading', 'std', 'reference')
 
@@ -295,7 +289,7 @@ class Calibration:
         acts.
 
         """
-        known = self._with_acting(self.poses.columns)
+        known = with_acting(self.model, self.poses.columns)
         used = ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
@@ -306,15 +300,6 @@ class Calibration:
         none = np.zeros((count, 3))
         middle = {key: np.full(count, sum(limits) / 2.0) for key, limits in self.ranges.items()}
         return {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(count), **middle}
-
-    def _with_acting(self, known: Context) -> Context:
-        """Return a context with rate and lag of the temperature, from its rows as history."""
-        wanted = [key for key in self.model.over if key in THERMAL and key not in known]
-        if not wanted or 'time' not in known or 'temperature' not in known:
-            return known
-        known = {**known, 'temperature_rate': rate_at(known)}
-        return {**known, **{key: acting_temperature(known, key, *lag)
-                            for key, lag in self.model.lags.items()}}
 
     def held(self, known: _Known) -> _Known:
         """Return a table with its context limited to `ranges`."""
@@ -407,8 +392,8 @@ class Calibration:
     def held_context(self, context: Context | None) -> Context:
         if not context or not self.ranges:
             return context or {}
-        known = self._with_acting(context)
-        return {**known, **_held(known, self.ranges)}
+        known = with_acting(self.model, context)
+        return {**known, **limited(known, self.ranges)}
 
 
 def conversion(before: UnitName, after: UnitName) -> float:
@@ -451,48 +436,6 @@ def check_sensor(calibration: Calibration, sensor: str) -> None:
         raise StoredCalibrationError(f'the calibration belongs to sensor {calibration.sensor!r}, '
                                      f'but the readings come from {sensor!r}',
                                      'use the calibration of this sensor, or fit one')
-
-
-def of_samples(known: Context, count: int, model: Model,
-               stream: ThermalStream | None = None) -> Context:
-    """
-    Return the context of single samples.
-
-    A single sample does not show the vibration or the previous pose. Both are set to zero, and so
-    is a rate that is NaN. Lag and rate of the temperature come from earlier samples, unless they
-    are known already.
-
-    Parameters
-    ----------
-    known : mapping of str to array
-        Known context of the samples.
-    count : int
-        Number of samples.
-    model : Model
-        Model that the context is for.
-    stream : ThermalStream, optional
-        Temperature before these samples; these samples are added.
-
-    """
-    none = np.zeros((count, 3))
-    found = {**known, 'std': none, 'previous': none,
-             'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
-    lacking = not all(key in known for key in model.over if key in THERMAL)
-    stream = thermal_stream(model) if stream is None and lacking else stream
-    if stream is not None and 'time' in known and 'temperature' in known:
-        found.update(stream.add_all(known['time'], known['temperature']))
-    return found
-
-
-def thermal_stream(model: Model) -> ThermalStream | None:
-    """Return the lag and rate of the temperature that a model needs; None if it needs none."""
-    rate = 'temperature_rate' in model.over
-    return ThermalStream(model.lags, rate=rate) if model.lags or rate else None
-
-
-def _held(context: Context, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Floats]:
-    return {key: np.clip(context[key], *limits) for key, limits in ranges.items()
-            if key in context}
 
 
 def _linear_rows(model: Model, u: Floats) -> Floats:

@@ -64,7 +64,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     Raises
     ------
     InputError
-        As `compare`.
+        If there are fewer than two, or they cannot be compared.
 
     """
     _refuse_if_unlike(calibrations)
