@@ -44,6 +44,8 @@ import accel_calib as ac  # noqa: E402
 from accel_calib import fleet, pipeline  # noqa: E402
 from accel_calib.files import write_table  # noqa: E402
 from accel_calib.fleet import Input, Options, Store, Summary  # noqa: E402
+from accel_calib.fleet.overview import not_agreeing  # noqa: E402
+from accel_calib.fleet.store import Row  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -68,6 +70,10 @@ TCO = 0.0006
 
 FIRST = datetime(2026, 1, 1, tzinfo=timezone.utc)
 EVERY = timedelta(days=18)
+YEAR = timedelta(days=365.25)
+
+LIMIT_SD = 3.0
+"""Largest error of a stated drift, relative to its standard deviation."""
 
 LEAST_RATIO = 1.8
 MOST_RISE = 0.1
@@ -356,16 +362,43 @@ def memory_lines(log: Path, workers: int) -> Iterator[Line]:
                        rise <= MOST_RISE if part > PARTS[0] else None)
 
 
-def found_lines(summary: Summary, given: argparse.Namespace) -> Iterator[Line]:
-    """Yield how many sensors of each kind are named as changed for good."""
-    named = {row['sensor'] for row in summary.sensors
-             if any(change['for_good'] for change in row['changes'])}
+def found_lines(sensors: Sequence[Row], given: argparse.Namespace) -> Iterator[Line]:
+    """Yield how many sensors of each kind the page lists as changed, and whether rightly so."""
+    listed = {row['sensor']: row for row in not_agreeing(sensors)}
     made = [sensor(k, given.calibrations, given.seed) for k in range(given.sensors)]
     for kind in ('changes', 'drifts', 'odd', ''):
-        names = {each.name for each in made if each.kind == kind}
-        if names:
-            yield Line(f'named as changed for good: sensors of kind {kind or "constant"}',
-                       f'{len(names & named)} of {len(names)}', '', len(names), None)
+        own = [each for each in made if each.kind == kind]
+        rows = [(each, listed[each.name]) for each in own if each.name in listed]
+        if own:
+            yield Line(f'sensors of kind {kind or "constant"} that are listed as changed',
+                       f'{len(rows)} of {len(own)}', '', len(own), None)
+        if kind == 'changes' and rows:
+            right = sum(is_change_right(*each) for each in rows)
+            yield Line('of them, with this change alone, for good', f'{right} of {len(rows)}', '',
+                       len(rows), None)
+        if kind == 'drifts' and rows:
+            right = sum(is_drift_right(*each) for each in rows)
+            yield Line(f'of them, with a drift within {LIMIT_SD:g} standard deviations',
+                       f'{right} of {len(rows)}', '', len(rows), None)
+            steps = sum(any(change['for_good'] for change in row['changes']) for _, row in rows)
+            yield Line('of them, with a change for good', f'{steps} of {len(rows)}', '',
+                       len(rows), None)
+
+
+def is_change_right(made: Sensor, row: Row) -> bool:
+    """Return whether the only lasting change is the right one; its recording may be damaged."""
+    numbers = [round((datetime.fromisoformat(change['date']) - FIRST) / EVERY)
+               for change in row['changes'] if change['for_good']]
+    return len(numbers) == 1 and numbers[0] in (made.from_, made.from_ + 1)
+
+
+def is_drift_right(made: Sensor, row: Row) -> bool:
+    """Return whether the stated drift is that of the sensor."""
+    drift = row['drift']
+    if not drift or not drift['parameter'].startswith('offset.'):
+        return False
+    per_year = DRIFT_G * made.away['xyz'.index(drift['parameter'][-1])] * (YEAR / EVERY)
+    return bool(abs(drift['per_year'] - per_year) < LIMIT_SD * drift['sd'])
 
 
 def run_lines(done: Whole, given: argparse.Namespace) -> Iterator[Line]:
@@ -380,7 +413,7 @@ def run_lines(done: Whole, given: argparse.Namespace) -> Iterator[Line]:
                f'{1e3 * done.program_s / total:.2f}', '', total, None)
     for stage, seconds in done.after.items():
         yield Line(f'after the recordings: {stage}, seconds', f'{seconds:.1f}', '', total, None)
-    yield from found_lines(done.summary, given)
+    yield from found_lines(done.summary.sensors, given)
 
 
 def cost_lines(spent: dict[str, float], done: Whole, given: argparse.Namespace

@@ -75,12 +75,14 @@ def test_few_of_many_unchanged_sensors_are_named_as_changed() -> None:
 def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     def row(status: str, rating: str | None, offset: float) -> dict[str, object]:
         return {'sensor': 's', 'sensor_model': None, 'status': status, 'rating': rating,
-                'parameters': [], **dict.fromkeys(NAMES, offset)}
+                'calibration': 'a.yaml' if rating in ('GOOD', 'USABLE') else None,
+                'determined': offset < 1.0, 'parameters': [], **dict.fromkeys(NAMES, offset)}
 
     known = overview([row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
-                      row('error', None, 9.0)])
+                      row('ok', 'USABLE', 7.0), row('error', None, 9.0)])
     np.testing.assert_allclose(known.models[''].values['s'], 0.02)
-    assert known.counts == {'GOOD': 1, 'USABLE': 1, 'BAD': 1, 'error': 1}
+    assert known.counts == {'GOOD': 1, 'USABLE': 2, 'BAD': 1, 'error': 1}
+    assert known.undetermined == 1
     assert len(known.errors) == 1
 
 
@@ -144,7 +146,7 @@ def test_a_step_is_told_from_a_steady_drift(
         write_calibration(tmp_path / f'{k}.yaml', each)
         store.add({**dict.fromkeys(schema().names), 'sensor': 's', 'key': str(k), 'status': 'ok',
                    'content': str(k), 'date': each.date, 'recording': f'{k}.csv',
-                   'calibration': f'{k}.yaml'})
+                   'calibration': f'{k}.yaml', 'determined': True})
     row = merge_sensor('s', store)
     assert [(each['recording'], each['for_good']) for each in row['changes']] == [
         (f'{k}.csv', for_good) for k, for_good in expected]
@@ -172,6 +174,7 @@ def write_store(folder: Path, count: int, dates: int = 6, name: str = 'robot_{}/
                 **nothing, 'key': f'{k}-{date}', 'recording': f'logs/{k}_{date}.mcap',
                 'sensor_model': 'A', 'date': f'2026-{date + 1:02d}-03T09:00:00+00:00',
                 'status': 'ok', 'rating': 'GOOD', 'calibration': f'{k}-{date}.yaml',
+                'determined': date > 0 or k != 1,
                 'parameters': [], **dict(zip(NAMES, values.tolist(), strict=True)),
                 **{f'{each}.sd': 3e-4 for each in NAMES}})
         _write_rows(store, name.format(k), rows)

@@ -30,7 +30,7 @@ from itertools import groupby
 import numpy as np
 
 from .prior import FEWEST
-from .store import Row
+from .store import has_values, Row
 from ..compare.parameters import NAMES
 from ..effects import LADDER
 from ..errors import counted
@@ -108,7 +108,7 @@ class OfModel:
     months: Months
 
 
-@dataclass(frozen=True)
+@dataclass
 class Overview:
     """
     Statistics over a fleet.
@@ -121,12 +121,15 @@ class Overview:
         The first `MOST_ERRORS` rows with an error.
     counts : mapping of str to int
         Recordings by rating, or by status without a rating.
+    undetermined : int
+        Recordings whose poses do not determine all values.
 
     """
 
     models: dict[str, OfModel] = field(default_factory=dict)
     errors: list[Row] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    undetermined: int = 0
 
 
 def overview(rows: Iterable[Row]) -> Overview:
@@ -138,8 +141,10 @@ def overview(rows: Iterable[Row]) -> Overview:
             found.counts[row['rating'] or row['status']] += 1
             if row['status'] != 'ok':
                 found.errors.extend([row] if len(found.errors) < MOST_ERRORS else [])
-            elif row['rating'] != 'BAD':
+            elif has_values(row):
                 by_model[row['sensor_model'] or ''].append(row)
+            elif row['calibration']:
+                found.undetermined += 1
         for model, good in by_model.items():
             known = found.models.setdefault(model, OfModel({}, {}, {}, Months(rng)))
             _add_sensor(known, sensor, good)

@@ -52,7 +52,8 @@ def schema() -> pa.Schema:
     parameter = pa.struct([('name', pa.string()), ('value', pa.float64()), ('sd', pa.float64())])
     return pa.schema([
         *((name, pa.string()) for name in _TEXTS), *((name, pa.int64()) for name in _COUNTS),
-        *((name, pa.float64()) for name in _NUMBERS), ('effects', texts), ('warnings', texts),
+        *((name, pa.float64()) for name in _NUMBERS), ('determined', pa.bool_()),
+        ('effects', texts), ('warnings', texts),
         ('parameters', pa.list_(parameter)), ('prior_values', numbers),
         ('prior_covariance', numbers)])
 
@@ -207,6 +208,11 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
 
     table = pa.Table.from_pylist(rows, columns)
     write_atomically(path, lambda file: pq.write_table(table, file.buffer))
+
+
+def has_values(row: Row) -> bool:
+    """Return whether the values of a row are compared: its poses determine all of them."""
+    return bool(row['calibration'] and row['determined'])
 
 
 def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:

@@ -28,6 +28,8 @@ from .inputs import content_hash, Input, on_disk
 from .store import Row, Store
 from .. import __version__
 from ..calibrate import Calibration, fit_poses
+from ..calibrate.pose_planning import determines
+from ..calibrate.unknown_orientation import directions_of
 from ..compare.parameters import NAMES, rotation_free
 from ..crash import crash_words
 from ..errors import AccelCalibError, RefusedFitError, system_error
@@ -39,13 +41,13 @@ from ..model import MODELS
 from ..pipeline import calibrated, Outcome
 from ..table import Poses
 
-RESULTS = 1
+RESULTS = 2
 """Version of the rows. Another version makes all recordings be calibrated again."""
 
 STATUS = ('ok', 'error', 'unread', 'skipped')
 """What can happen to a recording; unread: it could not be read, and is tried again."""
 
-_PRIOR_MODEL = '10'
+_WHOLE_MODEL = '10'
 
 
 @dataclass(frozen=True)
@@ -234,6 +236,7 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         'rms_after_mg': quality.rms_after_mg, 'held_out_rms_mg': quality.held_out_rms_mg,
         'noise_floor_mg': quality.noise_floor_mg, 'coverage': quality.coverage,
         'temperature': warm, 'warnings': list(calibration.warnings),
+        'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
         'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
@@ -252,9 +255,9 @@ def _for_prior(intake: Intake, found: Calibration) -> Row:
     """Return values and covariance of model 10, if the poses determine it."""
     if intake.units.name == 'native':
         return {}
-    if found.model.effects != MODELS[_PRIOR_MODEL]:
+    if found.model.effects != MODELS[_WHOLE_MODEL]:
         try:
-            found = fit_poses(intake.poses, intake.units, model=_PRIOR_MODEL)
+            found = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
         except RefusedFitError:
             return {}
     return {'prior_values': found.model.vector.tolist(),
