@@ -23,6 +23,7 @@ from accel_calib.errors import InputError
 from accel_calib.files import read_calibration
 from accel_calib.files.exports import export
 from accel_calib.fleet import cluster, Input, run, Store
+from accel_calib.fleet.alike import alike
 from accel_calib.fleet.identity import as_folder, date_of, sensor_of
 from accel_calib.fleet.inputs import content_hash, on_disk
 from fleet_case import found_in, OFFSET, QUICK, rows_of, write_fleet, write_poses
@@ -131,8 +132,23 @@ def test_poses_that_do_not_determine_all_values_are_no_change(client: Any, tmp_p
     assert abs(rows[few.name]['gain.x'] - 1.004) > 5.0 * rows[few.name]['gain.x.sd']
     (sensor,) = summary.sensors
     assert (sensor['agree'], sensor['changes'], sensor['calibrations']) == (True, [], 2)
-    assert 'The poses of 1 recording do not determine' in (
+    assert 'Not compared: 1 recording whose poses do not determine' in (
         tmp_path / 'out' / 'fleet.html').read_text(encoding='utf-8')
+
+
+def test_only_calibrations_with_the_effects_of_most_are_compared() -> None:
+    def row(name: str, *more: str, **known: Any) -> dict[str, Any]:
+        return {'calibration': name, 'determined': True,
+                'effects': ['offset', 'axis_gain', 'cross_axis', *more], **known}
+
+    warm = [row('a', 'offset_temperature'), row('b', 'offset_temperature')]
+    others = [row('c', 'offset_step'), row('d'), {**warm[0], 'determined': False},
+              {**warm[0], 'calibration': None}, {**warm[0], 'effects': [
+                  'offset', 'axis_gain', 'offset_temperature']}]
+    assert alike([*others, *warm]) == warm
+    plain = [row('e'), row('f', effects=['offset', 'gain']), row('g', effects=['offset'])]
+    assert alike([*plain, *warm]) == plain
+    assert alike(others[2:4]) == []
 
 
 def test_addresses_are_read_like_files(client: Any, tmp_path: Path) -> None:

@@ -76,13 +76,14 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     def row(status: str, rating: str | None, offset: float) -> dict[str, object]:
         return {'sensor': 's', 'sensor_model': None, 'status': status, 'rating': rating,
                 'calibration': 'a.yaml' if rating in ('GOOD', 'USABLE') else None,
-                'determined': offset < 1.0, 'parameters': [], **dict.fromkeys(NAMES, offset)}
+                'determined': offset < 1.0, 'effects': [], 'parameters': [],
+                **dict.fromkeys(NAMES, offset)}
 
     known = overview([row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
                       row('ok', 'USABLE', 7.0), row('error', None, 9.0)])
     np.testing.assert_allclose(known.models[''].values['s'], 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 2, 'BAD': 1, 'error': 1}
-    assert known.undetermined == 1
+    assert known.left_out == 1
     assert len(known.errors) == 1
 
 
@@ -146,7 +147,7 @@ def test_a_step_is_told_from_a_steady_drift(
         write_calibration(tmp_path / f'{k}.yaml', each)
         store.add({**dict.fromkeys(schema().names), 'sensor': 's', 'key': str(k), 'status': 'ok',
                    'content': str(k), 'date': each.date, 'recording': f'{k}.csv',
-                   'calibration': f'{k}.yaml', 'determined': True})
+                   'calibration': f'{k}.yaml', 'determined': True, 'effects': []})
     row = merge_sensor('s', store)
     assert [(each['recording'], each['for_good']) for each in row['changes']] == [
         (f'{k}.csv', for_good) for k, for_good in expected]
@@ -173,7 +174,7 @@ def write_store(folder: Path, count: int, dates: int = 6, name: str = 'robot_{}/
             rows.append({
                 **nothing, 'key': f'{k}-{date}', 'recording': f'logs/{k}_{date}.mcap',
                 'sensor_model': 'A', 'date': f'2026-{date + 1:02d}-03T09:00:00+00:00',
-                'status': 'ok', 'rating': 'GOOD', 'calibration': f'{k}-{date}.yaml',
+                'status': 'ok', 'rating': 'GOOD', 'calibration': f'{k}-{date}.yaml', 'effects': [],
                 'determined': date > 0 or k != 1,
                 'parameters': [], **dict(zip(NAMES, values.tolist(), strict=True)),
                 **{f'{each}.sd': 3e-4 for each in NAMES}})

@@ -29,8 +29,9 @@ from itertools import groupby
 
 import numpy as np
 
+from .alike import alike
 from .prior import FEWEST
-from .store import has_values, Row
+from .store import Row
 from ..compare.parameters import NAMES
 from ..effects import LADDER
 from ..errors import counted
@@ -121,15 +122,15 @@ class Overview:
         The first `MOST_ERRORS` rows with an error.
     counts : mapping of str to int
         Recordings by rating, or by status without a rating.
-    undetermined : int
-        Recordings whose poses do not determine all values.
+    left_out : int
+        Recordings with a calibration whose values are not compared.
 
     """
 
     models: dict[str, OfModel] = field(default_factory=dict)
     errors: list[Row] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    undetermined: int = 0
+    left_out: int = 0
 
 
 def overview(rows: Iterable[Row]) -> Overview:
@@ -141,11 +142,13 @@ def overview(rows: Iterable[Row]) -> Overview:
             found.counts[row['rating'] or row['status']] += 1
             if row['status'] != 'ok':
                 found.errors.extend([row] if len(found.errors) < MOST_ERRORS else [])
-            elif has_values(row):
-                by_model[row['sensor_model'] or ''].append(row)
             elif row['calibration']:
-                found.undetermined += 1
-        for model, good in by_model.items():
+                by_model[row['sensor_model'] or ''].append(row)
+        for model, all_rows in by_model.items():
+            good = alike(all_rows)
+            found.left_out += len(all_rows) - len(good)
+            if not good:
+                continue
             known = found.models.setdefault(model, OfModel({}, {}, {}, Months(rng)))
             _add_sensor(known, sensor, good)
     return found

@@ -18,6 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from .alike import alike
 from .charts import (
     change_words,
     drift_words,
@@ -29,7 +30,7 @@ from .charts import (
     of_values,
 )
 from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
-from .store import has_values, Row, Store
+from .store import Row, Store
 from .. import __version__
 from ..calibrate.fleet_prior import FleetPrior
 from ..compare.parameters import NAMES
@@ -65,7 +66,7 @@ _DRIFTS = 0.05
 """Probability below which a drift is stated."""
 
 _COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
-            'calibration', 'determined', 'parameters',
+            'calibration', 'determined', 'effects', 'parameters',
             *(column for name in NAMES for column in (name, f'{name}.sd')))
 
 
@@ -104,9 +105,9 @@ def _body(store: Store, known: Overview, sensors: Sequence[Row],
         f'accel_calib {__version__}'])
     if not has_matplotlib():
         yield paragraph('This page has no figures, because matplotlib is not installed.')
-    yield paragraph(f'The poses of {counted(known.undetermined, "recording")} do not determine '
-                    'offset, gain and cross-axis gain. Their values are not compared.'
-                    if known.undetermined else '', 'soft')
+    yield paragraph(f'Not compared: {counted(known.left_out, "recording")} whose poses do not '
+                    'determine offset, gain and cross-axis gain, or with other effects than most '
+                    'recordings of the sensor.' if known.left_out else '', 'soft')
     odd_names: list[str] = []
     models = sorted(known.models.items(), key=lambda each: (-len(each[1].values), each[0]))
     for number, (model, of_model) in enumerate(models):
@@ -227,8 +228,7 @@ def _by_weight(sensors: Iterable[Row]) -> list[Row]:
 
 def _drawn(rows: Sequence[Row], name: str, sensor: Row, *, changed: bool) -> Drawing:
     """Return the figure of one sensor; its changes are marked if they are significant."""
-    good = [row for row in rows if has_values(row)]
-    return of_sensor(name, sensor['sensor'], good, sensor['changes'] if changed else [])
+    return of_sensor(name, sensor['sensor'], alike(rows), sensor['changes'] if changed else [])
 
 
 def _errors(known: Overview) -> str:

@@ -25,7 +25,8 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .store import has_values, Row, Store, write_parquet
+from .alike import alike
+from .store import Row, Store, write_parquet
 from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL
 from ..errors import AccelCalibError
@@ -85,7 +86,7 @@ def merge_sensor(name: str, store: Store) -> Row:
     """
     store.merge(name)
     rows = store.of_sensor(name)
-    good = [row for row in rows if has_values(row)][-_MOST_COMPARED:]
+    good = alike(rows)[-_MOST_COMPARED:]
     about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': unquote(name),
                   'recordings': len(rows), 'calibrations': len(good),
                   'errors': sum(row['status'] != 'ok' for row in rows), 'changes': [],

@@ -210,11 +210,6 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
     write_atomically(path, lambda file: pq.write_table(table, file.buffer))
 
 
-def has_values(row: Row) -> bool:
-    """Return whether the values of a row are compared: its poses determine all of them."""
-    return bool(row['calibration'] and row['determined'])
-
-
 def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
     """Return the rows in order of date, and the keys of old rows that new ones replace."""
     newest = {row['content']: row for row in new}
