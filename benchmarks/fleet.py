@@ -59,6 +59,11 @@ DAMAGED = 0.03
 KINDS = {'odd': 0.01, 'drifts': 0.02, 'changes': 0.03}
 """Share of the sensors by what is special about them, cumulative from 0."""
 
+KINDS_WORDS = {'': 'constant', 'odd': 'constant, with an odd offset',
+               'drifts': 'drifting', 'changes': 'changed for good once'}
+RIGHT_WORDS = {'drifts': 'the right drift within 3 standard deviations',
+               'changes': 'this change alone for good'}
+
 OFFSET_G, GAIN, CROSS = 0.020, 0.008, 0.002
 """Standard deviations over the sensors."""
 
@@ -73,7 +78,7 @@ EVERY = timedelta(days=18)
 YEAR = timedelta(days=365.25)
 
 LIMIT_SD = 3.0
-"""Largest error of a stated drift, relative to its standard deviation."""
+"""As in `RIGHT_WORDS`."""
 
 LEAST_RATIO = 1.8
 MOST_RISE = 0.1
@@ -89,29 +94,31 @@ TIMED = {True: 200, False: 1200}
 TURNS = 3
 """Number of times that both are timed, in turns."""
 
-STAGED = 200
-"""Recordings for the cost by stage, in one process."""
+STAGED = 10
+"""Sensors for the cost by stage, in one process."""
 
 MILLION = 1_000_000
 HOUR_S = 3600.0
 
 ABOUT = """# Speed and memory of a fleet
 
-Made by `python benchmarks/fleet.py {command} --markdown FILE`. {sensors:,} simulated sensors with
-{calibrations} pose tables of {poses} poses each, on a cluster of this machine; {damaged:.0f} % of
-the files are damaged. Every process has one thread. Speed with one and two workers is the median
-of {turns} turns of some recordings, without the first and last tenth of each. The workers share
-the processors with the program and the scheduler. Memory is the resident memory of the largest
-worker, and of the program with the scheduler.
+Made by `python benchmarks/fleet.py {command} --markdown FILE`.
+
+{sensors:,} simulated sensors with {calibrations} pose tables of {poses} poses each, on a cluster
+of this machine; {damaged:.0f} % of the files are damaged. The offset of every second sensor
+depends on the temperature, which rises in each of its tables (model B). Every process has one
+thread. Speed with one and two workers is the median of {turns} turns of some recordings, without
+the first and last tenth of each. The workers share the processors with the program and the
+scheduler. Memory is the resident memory of the largest worker, and of the program with the
+scheduler.
 
 Machine: {machine}."""
 
 AFTER = """
-A stage is timed in one process on {staged} recordings, in milliseconds of the processor, without
-waiting for the disk. The stages that follow the recordings are timed for their sensors. The rest
-of a recording on a worker is the work of Dask. A million robots with {calibrations} recordings
-each need the core hours of the last lines: recordings, merge and comparison, from the whole run;
-the search from its stage."""
+A stage is timed in one process on {staged} recordings of whole sensors, in milliseconds of the
+processor, without waiting for the disk. The rest of a recording on a worker is the work of Dask. A
+million robots with {calibrations} recordings each need the core hours of the last lines:
+recordings, merge and comparison, from the whole run; the search from its stage."""
 
 
 @dataclass(frozen=True)
@@ -365,24 +372,18 @@ def memory_lines(log: Path, workers: int) -> Iterator[Line]:
 def found_lines(sensors: Sequence[Row], given: argparse.Namespace) -> Iterator[Line]:
     """Yield how many sensors of each kind the page lists as changed, and whether rightly so."""
     listed = {row['sensor']: row for row in not_agreeing(sensors)}
-    made = [sensor(k, given.calibrations, given.seed) for k in range(given.sensors)]
-    for kind in ('changes', 'drifts', 'odd', ''):
-        own = [each for each in made if each.kind == kind]
+    kinds: dict[tuple[str, str], list[Sensor]] = {}
+    for k in range(given.sensors):
+        made = sensor(k, given.calibrations, given.seed)
+        kinds.setdefault((made.name[0], made.kind), []).append(made)
+    for (model, kind), own in sorted(kinds.items()):
         rows = [(each, listed[each.name]) for each in own if each.name in listed]
-        if own:
-            yield Line(f'sensors of kind {kind or "constant"} that are listed as changed',
-                       f'{len(rows)} of {len(own)}', '', len(own), None)
-        if kind == 'changes' and rows:
-            right = sum(is_change_right(*each) for each in rows)
-            yield Line('of them, with this change alone, for good', f'{right} of {len(rows)}', '',
-                       len(rows), None)
-        if kind == 'drifts' and rows:
-            right = sum(is_drift_right(*each) for each in rows)
-            yield Line(f'of them, with a drift within {LIMIT_SD:g} standard deviations',
-                       f'{right} of {len(rows)}', '', len(rows), None)
-            steps = sum(any(change['for_good'] for change in row['changes']) for _, row in rows)
-            yield Line('of them, with a change for good', f'{steps} of {len(rows)}', '',
-                       len(rows), None)
+        what = f'model {model}, {KINDS_WORDS[kind]}'
+        yield Line(f'{what}: listed as changed', f'{len(rows)} of {len(own)}', '', len(own), None)
+        right = {'changes': is_change_right, 'drifts': is_drift_right}.get(kind)
+        if right and rows:
+            yield Line(f'{what}: of them, with {RIGHT_WORDS[kind]}',
+                       f'{sum(right(*each) for each in rows)} of {len(rows)}', '', len(rows), None)
 
 
 def is_change_right(made: Sensor, row: Row) -> bool:
@@ -421,7 +422,8 @@ def cost_lines(spent: dict[str, float], done: Whole, given: argparse.Namespace
     """Yield the cost by stage, and what a million robots need."""
     for stage, cost in spent.items():
         if stage != 'all':
-            yield Line(f'{stage}, ms of processor per recording', f'{cost:.2f}', '', STAGED, None)
+            yield Line(f'{stage}, ms of processor per recording', f'{cost:.2f}', '',
+                       STAGED * given.calibrations, None)
     each_s = given.workers / done.per_s
     yield Line('a recording of the whole run on a worker, ms', f'{1e3 * each_s:.1f}', '', 1, None)
     count = sum(done.summary.counts.values())
@@ -459,7 +461,9 @@ def measured(given: argparse.Namespace, folder: Path) -> str:
     mixed = np.random.default_rng(given.seed).permutation(len(found)).tolist()
     some = [found[k] for k in mixed[:max(TIMED.values())]]
     ratios = list(ratio_lines(some, options, folder))
-    spent = costs(some[:STAGED], replace(options, refined=True), folder)
+    firsts = dict.fromkeys(k - k % given.calibrations for k in mixed[:STAGED])
+    staged = [found[first + k] for first in firsts for k in range(given.calibrations)]
+    spent = costs(staged, replace(options, refined=True), folder)
     done = whole(found, options, given.workers, folder)
     lines = [*ratios, *memory_lines(folder / 'memory.jsonl', given.workers),
              *run_lines(done, given), *cost_lines(spent, done, given)]
@@ -467,7 +471,7 @@ def measured(given: argparse.Namespace, folder: Path) -> str:
     about = ABOUT.format(command=command + ' --no-refine' * given.no_refine, machine=machine,
                          sensors=given.sensors, calibrations=given.calibrations, poses=POSES,
                          damaged=100.0 * DAMAGED, turns=TURNS)
-    after = AFTER.format(staged=min(STAGED, len(some)), calibrations=given.calibrations)
+    after = AFTER.format(staged=len(staged), calibrations=given.calibrations)
     return f'{about}\n\n{table(lines)}\n{after}'
 
 
