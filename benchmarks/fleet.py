@@ -407,7 +407,7 @@ def run_lines(done: Whole, given: argparse.Namespace) -> Iterator[Line]:
     counts = done.summary.counts
     total = sum(counts.values())
     words = ', '.join(f'{count:,} {name}' for name, count in sorted(counts.items()))
-    yield Line(f'all recordings, minutes ({words})', f'{done.seconds / 60.0:.1f}', '', total, None)
+    yield Line(f'whole run, minutes ({words})', f'{done.seconds / 60.0:.1f}', '', total, None)
     yield Line(f'all recordings, per second with {given.workers} workers', f'{done.per_s:.1f}',
                '', total, None)
     yield Line('program with the scheduler, ms of processor per recording',
