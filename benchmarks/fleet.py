@@ -54,14 +54,18 @@ RUN, SENSORS, TASK = (import_module(f'accel_calib.fleet.{name}')
 
 POSES = 14
 DAMAGED = 0.03
-"""Share of the files that cannot be calibrated."""
+"""Share of the files that are damaged: as many without a table, with four poses, and empty."""
 
 KINDS = {'odd': 0.01, 'drifts': 0.02, 'changes': 0.03}
 """Share of the sensors by what is special about them, cumulative from 0."""
 
-KINDS_WORDS = {'': 'constant', 'odd': 'constant, with an odd offset',
-               'drifts': 'drifting', 'changes': 'changed for good once'}
-RIGHT_WORDS = {'drifts': 'the right drift within 3 standard deviations',
+KIND_WORDS = {'': 'constant', 'odd': 'constant, with an odd offset', 'drifts': 'drifting',
+              'changes': 'changed for good once'}
+
+LIMIT_SD = 3.0
+"""Largest error of a stated drift that counts as right, relative to its standard deviation."""
+
+RIGHT_WORDS = {'drifts': f'the right drift within {LIMIT_SD:g} standard deviations',
                'changes': 'this change alone for good'}
 
 OFFSET_G, GAIN, CROSS = 0.020, 0.008, 0.002
@@ -76,9 +80,6 @@ TCO = 0.0006
 FIRST = datetime(2026, 1, 1, tzinfo=timezone.utc)
 EVERY = timedelta(days=18)
 YEAR = timedelta(days=365.25)
-
-LIMIT_SD = 3.0
-"""As in `RIGHT_WORDS`."""
 
 LEAST_RATIO = 1.8
 MOST_RISE = 0.1
@@ -378,7 +379,7 @@ def found_lines(sensors: Sequence[Row], given: argparse.Namespace) -> Iterator[L
         kinds.setdefault((made.name[0], made.kind), []).append(made)
     for (model, kind), own in sorted(kinds.items()):
         rows = [(each, listed[each.name]) for each in own if each.name in listed]
-        what = f'model {model}, {KINDS_WORDS[kind]}'
+        what = f'model {model}, {KIND_WORDS[kind]}'
         yield Line(f'{what}: listed as changed', f'{len(rows)} of {len(own)}', '', len(own), None)
         right = {'changes': is_change_right, 'drifts': is_drift_right}.get(kind)
         if right and rows:
