@@ -41,6 +41,11 @@ def of_samples(known: Context, count: int, model: Model,
     stream : ThermalStream, optional
         Temperature before these samples; these samples are added.
 
+    Returns
+    -------
+    mapping of str to array
+        The columns that the model needs, ``count`` rows each.
+
     """
     none = np.zeros((count, 3))
     found = {**known, 'std': none, 'previous': none,

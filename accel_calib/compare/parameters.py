@@ -34,9 +34,9 @@ mean m, weighted by C_i⁻¹,
     T² = Σ (x_i - m)ᵀ C_i⁻¹ (x_i - m)
 
 divided by the rank of T² have an F distribution with the degrees of freedom of the noise. T² tests
-all directions at once. `SAME_G` is added to the standard deviations, so that C_i has an inverse
-also if a model omits a parameter. A difference between values that no model fits is exactly zero
-and adds nothing to the rank.
+all directions at once. The square of `SAME_G` is added to the variances, so that C_i has an
+inverse also if a model omits a parameter. A difference between values that no model fits is
+exactly zero and adds nothing to the rank.
 
 In addition, each parameter of each run is compared with the mean of the other runs (Student's t),
 to detect a change of a single parameter. The smaller of the two probabilities is used, corrected
