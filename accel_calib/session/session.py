@@ -495,13 +495,13 @@ class Session:
                 return error
             return None
 
-        def plan_next(not_stored: OSError | None) -> str | Job:
+        def plan_next(not_stored: OSError | None) -> Job:
             if not_stored is not None:
                 self._log('error', f'the poses could not be stored: {not_stored}; '
                           f'{writing_advice(not_stored)}', once_in=_AGAIN)
-            if not due:  # only an average has changed
-                return finish(None)
-            return Job(lambda compute: _plan(compute, poses, units, model), finish, computes=True)
+            # Computed even where only an average has changed, so that the lines keep their order.
+            return Job(lambda compute: _plan(compute, poses, units, model) if due else None,
+                       finish, computes=True)
 
         def finish(plan: Plan | None) -> str:
             if plan is not None and guide is self.guide:  # otherwise, it is of another sensor
