@@ -54,21 +54,34 @@ class TemperatureHistory:
             self._columns.extend(_replayed(self._stream, self._points))
 
     def add(self, time: Floats, temperature: Floats) -> None:
-        """Add samples; a temperature that is NaN is ignored."""
+        """
+        Add samples; a temperature that is NaN is ignored.
+
+        The points do not depend on how the samples are divided into calls: of a recording that is
+        played fast, a call may have the samples of many seconds.
+
+        """
         known = np.isfinite(time + temperature)
         if not np.any(known):
             return
         time, temperature = time[known], temperature[known]
-        if self._stream is not None:
-            self._stream.add_all(time, temperature)
-        now = float(time[-1])
-        if self._points and now < self._points[-1][0]:  # the stream starts again
+        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
             self._points.clear()
             self._columns.clear()
-        if not self._points or now >= self._points[-1][0] + _APART:
-            self._points.append((now, float(temperature[-1])))
+        back = np.flatnonzero(np.diff(time) < -_APART)
+        begin = int(back[-1]) + 1 if len(back) else 0
+        while begin < len(time):
+            due = self._points[-1][0] + _APART if self._points else -np.inf
+            later = np.flatnonzero(time[begin:] >= due)
+            end = begin + int(later[0]) + 1 if len(later) else len(time)
             if self._stream is not None:
-                self._columns.append((now, self._stream.value))
+                self._stream.add_all(time[begin:end], temperature[begin:end])
+            if len(later):
+                now = float(time[end - 1])
+                self._points.append((now, float(temperature[end - 1])))
+                if self._stream is not None:
+                    self._columns.append((now, self._stream.value))
+            begin = end
 
     @property
     def columns(self) -> Mapping[str, float]:
