@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from accel_calib.api import simulate
+from accel_calib import simulate
 from accel_calib.files import write_table
 from accel_calib.fleet import Input, Options, recordings
 import numpy as np

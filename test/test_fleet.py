@@ -1,12 +1,18 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many recordings on a real cluster of two workers."""
+"""
+Many recordings on a real cluster of two workers, which all tests share.
+
+They are in one file, so that they run in one process. Runs draw no figures, which take longer than
+all the rest; test_fleet_page.py tests them.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 import functools
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import json
@@ -21,16 +27,25 @@ from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.files import read_calibration
-from accel_calib.files.exports import export
 from accel_calib.fleet import cluster, Input, run, Store
-from accel_calib.fleet.alike import alike
-from accel_calib.fleet.identity import as_folder, date_of, sensor_of
-from accel_calib.fleet.inputs import content_hash, on_disk
-from fleet_case import found_in, OFFSET, QUICK, rows_of, write_fleet, write_poses
+from faults.sample import sample
+from fleet_case import found_in, OFFSET, QUICK, rows_of, state_of, write_fleet, write_poses
+from inside import (
+    alike,
+    as_folder,
+    COMMAND,
+    content_hash,
+    date_of,
+    export,
+    main,
+    mapped,
+    on_disk,
+    sensor_of,
+)
 import numpy as np
 import pytest
 
-pytest.importorskip('distributed')
+KilledWorker = pytest.importorskip('distributed').KilledWorker
 pytest.importorskip('pyarrow')
 
 
@@ -38,6 +53,11 @@ pytest.importorskip('pyarrow')
 def client() -> Iterator[Any]:
     with cluster(workers=2) as started:
         yield started
+
+
+@pytest.fixture(autouse=True)
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
 
 
 def test_each_recording_becomes_a_row_and_a_calibration(client: Any, tmp_path: Path) -> None:
@@ -194,55 +214,6 @@ def test_two_programs_do_not_write_to_one_folder(client: Any, tmp_path: Path) ->
         run(client, [], QUICK, store)
 
 
-def test_a_run_whose_scheduler_is_gone_ends_with_an_error_and_is_continued(
-        client: Any, tmp_path: Path) -> None:
-    folder, store = write_fleet(tmp_path / 'in', 3, 4), Store(tmp_path / 'out')
-    command = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--port', '0', '--host',
-               '127.0.0.1', '--no-dashboard', '--scheduler-file', str(tmp_path / 'address.json')]
-    scheduler = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    worker = subprocess.Popen(
-        [sys.executable, '-m', 'distributed.cli.dask_worker', '--no-nanny', '--nthreads', '1',
-         '--no-dashboard', '--scheduler-file', str(tmp_path / 'address.json'),
-         '--death-timeout', '20'], stderr=subprocess.DEVNULL)
-    try:
-        while not (tmp_path / 'address.json').exists():
-            assert scheduler.poll() is None
-            time.sleep(0.1)
-        address = json.loads((tmp_path / 'address.json').read_text())['address']
-        with cluster(address) as far:
-            far.wait_for_workers(1, timeout=60)
-            with pytest.raises(InputError, match='the scheduler .* is gone'):
-                run(far, found_in(folder), QUICK, store,
-                    lambda done, count: scheduler.kill() if done == 2 else None)
-    finally:
-        for process in (scheduler, worker):
-            process.kill()
-            process.wait()
-    summary = run(client, found_in(folder), QUICK, store)
-    assert summary.counts['skipped'] >= 2
-    assert len(rows_of(store.folder)) == len({row['key'] for row in rows_of(store.folder)}) == 12
-
-
-def test_killed_workers_lose_and_double_nothing(tmp_path: Path) -> None:
-    folder, store = write_fleet(tmp_path / 'in', 4, 4), Store(tmp_path / 'out')
-    with cluster(workers=2) as client:
-        killed = []
-
-        def kill_one(done: int, count: int) -> None:
-            if done in (2, 7):
-                pid = next(iter(client.run(os.getpid).values()))
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
-
-        summary = run(client, found_in(folder), QUICK, store, kill_one)
-    rows = rows_of(store.folder)
-    assert len(killed) == 2
-    assert sum(summary.counts.values()) == 16
-    assert set(summary.counts) <= {'ok', 'skipped'}
-    assert len(rows) == len({row['recording'] for row in rows}) == 16
-    assert {row['status'] for row in rows} == {'ok'}
-
-
 @pytest.mark.parametrize(('inside', 'name', 'expected'), [
     ('robot_17/2026-11-22.mcap', 'imu_link', 'robot_17/imu_link'),
     ('2026-11/a.csv', 'SN123', 'SN123'),
@@ -357,3 +328,223 @@ def test_typical_values_that_no_longer_hold_are_removed(client: Any, tmp_path: P
     assert (tmp_path / 'out' / 'fleet.yaml').exists()
     assert not run(client, found, replace(QUICK, model_from=r'robot_\d'), store).priors
     assert not (tmp_path / 'out' / 'fleet.yaml').exists()
+
+
+# ------------------------------------------------------------------------------ disturbed runs
+
+ROBOTS, DATES = 5, 2
+COUNT = ROBOTS * DATES + 1
+FULL_KB = 48
+"""Size of a disk that has room for some of the results."""
+
+WAIT_S = 300.0
+
+
+@dataclass(frozen=True)
+class Site:
+    """
+    Where a run is disturbed.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        The cluster.
+    recorded, results, folder : Path
+        The recordings, the results, and a folder for all the rest.
+
+    """
+
+    client: Any
+    recorded: Path
+    results: Path
+    folder: Path
+
+    def command(self, *more: str) -> list[str]:
+        """Return the arguments of the command line."""
+        return ['fleet', str(self.recorded), '-o', str(self.results), '--no-refine', *more]
+
+    def on_cluster(self) -> list[str]:
+        """Return the arguments of the command line for the cluster."""
+        return self.command('--scheduler', self.client.scheduler.address)
+
+    def run(self, client: Any, progress: Callable[[int, int], object]) -> None:
+        """Calibrate the recordings."""
+        run(client, found_in(self.recorded), QUICK, Store(self.results), progress)
+
+
+def wait(until: Callable[[], object]) -> None:
+    """Wait until a condition holds."""
+    ends = time.monotonic() + WAIT_S
+    while not until():
+        assert time.monotonic() < ends, f'not so within {WAIT_S:g} s'
+        time.sleep(0.001)
+
+
+def killed(pattern: str, enough: int) -> Callable[[Site], None]:
+    """Return a function that kills the program as soon as there are so many files."""
+    def disturb(site: Site) -> None:
+        program = subprocess.Popen([sys.executable, *COMMAND,
+                                    *site.on_cluster()], stdout=subprocess.DEVNULL)
+        wait(lambda: program.poll() is not None
+             or len([*site.results.glob(pattern)]) >= enough)
+        program.kill()
+        # After the last stage it may have been done.
+        assert program.wait() == -signal.SIGKILL or pattern == 'sensors.parquet'
+
+    return disturb
+
+
+def full_disk(site: Site) -> None:
+    """Run on a file system that is too small, and copy what is there."""
+    if subprocess.run(['unshare', '-r', '-m', 'true'], check=False).returncode:
+        pytest.skip('this user may not mount a file system')
+    site.results.mkdir()
+    copy, script = site.folder / 'copy', site.folder / 'script'
+    copy.mkdir()
+    script.write_text(
+        f'set -e; mount -t tmpfs -o size={FULL_KB}k tmpfs "{site.results}"\n'
+        '"$@" >/dev/null 2>"$0.full" && exit 7\n'
+        f'cp -r "{site.results}/." "{copy}"\n')
+    done = subprocess.run(
+        ['unshare', '-r', '-m', 'bash', str(script), sys.executable, *COMMAND,
+         *site.command('--workers', '2')], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (line,) = (site.folder / 'script.full').read_text().splitlines()
+    assert 'No space left on device' in line
+    copy.replace(site.results)
+
+
+def worker_killed(site: Site) -> None:
+    """Kill a worker after two recordings; the run goes on."""
+    pids = []
+
+    def kill_one(done: int, count: int) -> None:
+        if done == 2:
+            pids.append(next(iter(site.client.run(os.getpid).values())))
+            os.kill(pids[0], signal.SIGKILL)
+
+    site.run(site.client, kill_one)
+    assert pids
+    assert {row['status'] for row in rows_of(site.results)} == {'ok', 'error'}
+
+
+def scheduler_killed(site: Site) -> None:
+    """Kill the scheduler of another cluster after two recordings."""
+    address = site.folder / 'address.json'
+    common = ['--no-dashboard', '--scheduler-file', str(address)]
+    scheduler, worker = (subprocess.Popen(
+        [sys.executable, '-m', f'distributed.cli.{name}', *common, *more],
+        stderr=subprocess.DEVNULL) for name, more in (
+            ('dask_scheduler', ['--port', '0', '--host', '127.0.0.1']),
+            ('dask_worker', ['--no-nanny', '--nthreads', '1', '--death-timeout', '60'])))
+    try:
+        wait(lambda: scheduler.poll() is not None or (
+            address.exists() and address.read_text().endswith('}')))
+        with cluster(json.loads(address.read_text())['address']) as far:
+            far.wait_for_workers(1, timeout=WAIT_S)
+            with pytest.raises(InputError, match='the scheduler .* is gone'):
+                site.run(far, lambda done, count: scheduler.kill() if done == 2 else None)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+
+
+DISTURBANCES = {
+    'worker killed': worker_killed,
+    'program killed at the first results': killed('pending/*/*.json', 2),
+    'program killed at the last results': killed('pending/*/*.json', COUNT - 2),
+    'program killed between two sensors': killed('recordings/*/data.parquet', 2),
+    'program killed after the last sensor': killed('sensors.parquet', 1),
+    'scheduler killed': scheduler_killed, 'disk full': full_disk}
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of recordings; one of them cannot be calibrated."""
+    folder = write_fleet(tmp_path_factory.mktemp('recorded'), ROBOTS, DATES)
+    (folder / 'robot_0' / 'bad.csv').write_text('nothing of use\n')
+    return folder
+
+
+@pytest.fixture(scope='module')
+def undisturbed(client: Any, recorded: Path, tmp_path_factory: pytest.TempPathFactory
+                ) -> dict[str, Any]:
+    """Return the results of one run."""
+    results = tmp_path_factory.mktemp('undisturbed')
+    summary = run(client, found_in(recorded), QUICK, Store(results))
+    assert summary.counts == {'ok': COUNT - 1, 'error': 1}
+    found = state_of(results)
+    assert len(found['rows']) == len(found['done']) == COUNT
+    assert len(found['texts']) == COUNT - 1
+    return found
+
+
+@pytest.mark.parametrize('disturbance', sample(DISTURBANCES, 2, seed=2))
+def test_the_run_after_a_disturbed_one_loses_and_doubles_nothing(
+        disturbance: str, client: Any, recorded: Path, undisturbed: dict[str, Any],
+        tmp_path: Path) -> None:
+    site = Site(client, recorded, tmp_path / 'out', tmp_path)
+    DISTURBANCES[disturbance](site)
+    assert main([*site.on_cluster(), '--json', str(tmp_path / 'out.json')]) == 0
+    found = json.loads((tmp_path / 'out.json').read_text())
+    assert sum(found[name] for name in ('ok', 'error', 'skipped')) == COUNT
+    assert found['unread'] == 0
+    assert state_of(site.results) == undisturbed
+
+
+def deadly(name: str) -> str:
+    """Kill the worker at one of the items."""
+    if name == 'deadly':
+        os.kill(os.getpid(), signal.SIGKILL)
+    return name
+
+
+def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) -> None:
+    items = [*map(str, range(30)), 'deadly', *map(str, range(30, 40))]
+    scheduler = client.cluster.scheduler
+    before, scheduler.allowed_failures = scheduler.allowed_failures, 0
+    try:
+        found = dict(mapped(client, deadly, items))
+    finally:
+        scheduler.allowed_failures = before
+    assert isinstance(found.pop('deadly'), KilledWorker)
+    assert found == {name: name for name in items if name != 'deadly'}
+
+
+def set_environment(values: dict[str, str]) -> None:
+    os.environ.update(values)
+
+
+def test_recordings_are_read_from_a_store_of_s3(
+        client: Any, recorded: Path, undisturbed: dict[str, Any], tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    server_of = pytest.importorskip('moto.server')
+    s3fs = pytest.importorskip('s3fs')
+    server = server_of.ThreadedMotoServer(ip_address='127.0.0.1', port=0)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        known = {'AWS_ACCESS_KEY_ID': 'key', 'AWS_SECRET_ACCESS_KEY': 'secret',
+                 'AWS_DEFAULT_REGION': 'us-east-1', 'AWS_ENDPOINT_URL': f'http://{host}:{port}'}
+        for name, value in known.items():
+            monkeypatch.setenv(name, value)
+        client.run(set_environment, known)
+        store = s3fs.S3FileSystem(skip_instance_cache=True)
+        store.mkdir('fleet')
+        store.put(f'{recorded}/', 'fleet/recorded/', recursive=True)
+        far = Site(client, 's3://fleet/recorded/robot_*', tmp_path / 'out', tmp_path)
+        assert main(far.on_cluster()) == 0
+        assert (f'{COUNT - 1} calibrated, 1 with an error, 0 could not be read, 0 skipped'
+                in ' '.join(capsys.readouterr().out.split()))
+        assert main(replace(far, recorded='s3://fleet/nothing/').on_cluster()) == 2
+        assert 's3://fleet/nothing/ holds no recording' in capsys.readouterr().err
+    finally:
+        server.stop()
+    rows = {row['recording']: row for row in rows_of(tmp_path / 'out')}
+    local = {row['recording']: row for row in undisturbed['rows']}
+    assert len(rows) == COUNT
+    for name, row in rows.items():
+        same = local[name.replace('s3://fleet/recorded', str(recorded))]
+        assert [row[key] for key in ('content', 'sensor', 'status', 'offset.x')] == [
+            same[key] for key in ('content', 'sensor', 'status', 'offset.x')]

@@ -10,23 +10,26 @@ import re
 from typing import Any
 from urllib.parse import unquote
 
-from accel_calib.api import simulate
+from accel_calib import simulate
 from accel_calib.calibrate import fit_poses, FleetPrior
 from accel_calib.compare import history_of
-from accel_calib.estimate.fit import Prior
+from accel_calib.estimate import Prior
 from accel_calib.files import write_calibration
-from accel_calib.fleet.identity import as_folder
-from accel_calib.fleet.overview import (
+from accel_calib.fleet import Store
+from accel_calib.units import Units
+from inside import (
+    as_folder,
+    drift_of,
+    merge_sensor,
     Months,
     not_agreeing,
     odd_sensors,
     overview,
+    schema,
     shared_effects,
+    write_fleet_page,
+    write_parquet,
 )
-from accel_calib.fleet.page import write_fleet_page
-from accel_calib.fleet.sensors import drift_of, merge_sensor
-from accel_calib.fleet.store import schema, Store, write_parquet
-from accel_calib.units import Units
 import numpy as np
 import pytest
 
@@ -200,11 +203,15 @@ def page_of(store: Store, sensors: list[dict[str, Any]],
     return (store.folder / 'fleet.html').read_text(encoding='utf-8')
 
 
-def test_the_page_draws_the_values_the_drift_and_the_sensors_that_changed(tmp_path: Path) -> None:
-    pytest.importorskip('matplotlib')
-    store, sensors = write_store(tmp_path, 30)
+@pytest.fixture(scope='module')
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the page of 30 sensors."""
     prior = FleetPrior('A', 30, Prior(np.full(9, 0.0123), np.eye(9) * 0.02 ** 2))
-    page = page_of(store, sensors, priors={'A': prior})
+    return page_of(*write_store(tmp_path_factory.mktemp('store'), 30), priors={'A': prior})
+
+
+def test_the_page_draws_the_values_the_drift_and_the_sensors_that_changed(page: str) -> None:
+    pytest.importorskip('matplotlib')
     figures = re.findall(r'<figure>.*?</figure>', page, re.DOTALL)
     texts = [' '.join(re.findall(r'>([^<]+)<', figure)) for figure in figures]
     (histogram,) = (text for text in texts if 'Zero-g offset [mg]' in text)
@@ -217,9 +224,7 @@ def test_the_page_draws_the_values_the_drift_and_the_sensors_that_changed(tmp_pa
     assert 'other sensors not shown' in page
 
 
-def test_the_page_needs_no_script_and_no_other_file(tmp_path: Path) -> None:
-    store, sensors = write_store(tmp_path, 6)
-    page = page_of(store, sensors)
+def test_the_page_needs_no_script_and_no_other_file(page: str) -> None:
     assert '<script' not in page
     assert not re.search(r'(src|href)="(?!#)', page)
     assert not re.search(r'\son\w+=', page)
@@ -227,10 +232,8 @@ def test_the_page_needs_no_script_and_no_other_file(tmp_path: Path) -> None:
     assert len(ids) == len(set(ids))
 
 
-def test_the_page_of_many_sensors_is_hardly_larger(tmp_path: Path) -> None:
-    few = page_of(*write_store(tmp_path / 'few', 20))
-    many = page_of(*write_store(tmp_path / 'many', 400))
-    assert len(many) < 1.3 * len(few)
+def test_the_page_of_many_sensors_is_hardly_larger(page: str, tmp_path: Path) -> None:
+    assert len(page_of(*write_store(tmp_path, 120))) < 1.05 * len(page)
 
 
 def test_names_of_sensors_are_text_not_markup(tmp_path: Path) -> None:

@@ -50,8 +50,14 @@ _NEWEST = 0.2
 
 _CONNECT_S = 30.0
 
-_CONFIG = {'distributed.worker.profile.enabled': False}
-"""Settings of a cluster on this machine. The profiles of a worker grow to some 300 MB."""
+_CONFIG = {'distributed.worker.profile.enabled': False,
+           'distributed.scheduler.worker-saturation': 1.0,
+           'distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED': 'critical'}
+"""
+Settings of a cluster on this machine. The profiles of a worker grow to some 300 MB. If a worker
+dies, Dask suspects all its tasks: it has only the one that it runs. A worker that notices the end
+of the scheduler before its own end would print a traceback.
+"""
 
 
 @dataclass(frozen=True)
