@@ -136,8 +136,26 @@ def _between(start: Floats, end: Floats) -> Floats:
     return normal / np.linalg.norm(normal)
 
 
-def _turn(start: Floats, end: Floats, seconds: float, count: int) -> tuple[Floats, Floats]:
-    """Return the (count, 3) force and rate of a smooth turn along the shortest arc."""
+def turn_between(start: Floats, end: Floats, seconds: float, count: int
+                 ) -> tuple[Floats, Floats]:
+    """
+    Return a smooth turn along the shortest arc.
+
+    Parameters
+    ----------
+    start, end : (3,) array
+        Directions of up, unit vectors.
+    seconds : float
+        Duration [s].
+    count : int
+        Number of samples, all of them between both directions.
+
+    Returns
+    -------
+    (count, 3) array, (count, 3) array
+        Specific force [g] and angular rate [rad/s] of each sample, both in the levelled frame.
+
+    """
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
     share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
     speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
@@ -173,7 +191,7 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
     rates: list[Floats] = []
     for k, direction in enumerate(directions):
         if k:
-            force, rate = _turn(directions[k - 1], direction, turn, turning)
+            force, rate = turn_between(directions[k - 1], direction, turn, turning)
             forces.append(force)
             rates.append(rate)
         forces.append(np.tile(direction, (resting, 1)))

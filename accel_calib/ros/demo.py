@@ -4,9 +4,14 @@
 """
 A demonstration without hardware: simulator and calibrator in separate processes, over DDS.
 
-This process acts as the user. It waits for the poses and calls ``~/fit`` and ``~/set_level``. Then
-it compares raw and corrected messages with the truth of the simulator while the sensor turns
-again.
+This process acts as the user. It holds the simulated sensor in a pose until the calibrator has
+captured it, turns it to the next one, and calls ``~/fit`` and ``~/set_level``. Then it compares
+the messages with the truth of the simulator in other poses. If the sensor hides an effect, the fit
+lacks it, and so does the level; ``~/refine`` and another ``~/set_level`` follow, and the next
+poses show what remains.
+
+Every step waits for what the nodes report, and none for a time, so that the demonstration also
+succeeds on a slow machine.
 
 """
 
@@ -16,8 +21,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
-import math
 import os
 from pathlib import Path
 import random
@@ -39,61 +42,130 @@ from visualization_msgs.msg import MarkerArray
 
 from . import qos
 from ..errors import AccelCalibError, counted
+from ..files import read_calibration
+from ..simulate import parse_effect
 from ..table import Floats
 from ..units import MG, STANDARD_GRAVITY
 
-POSES = 12
+_POSES, _POSES_HIDDEN = 12, 16
+"""Poses of the fit; more of them if the sensor hides an effect."""
+
+_CHECKED, _CHECKED_HIDDEN = 5, 10
+"""Rests that are compared with the truth, before and after ``~/refine``."""
+
+_SAMPLES = 100
+"""Messages of a rest that are averaged."""
+
+_SETTLED = 20
+"""Equal truths after which the sensor rests in the next pose."""
+
+_LONGEST_REST = 4000
+"""Messages of a rest after which ``~/set_level`` must have succeeded."""
+
+_SAME_POSE = np.cos(np.radians(10.0))
+"""Cosine of the largest angle between a captured pose and the raw reading in it."""
+
 _EFFECTS = ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
             'cross_axis=0.006,-0.004,0.003']
-_SIMULATED = {'poses': POSES, 'dwell': 1.5, 'turn': 0.5, 'mounting': [8.0, -5.0, 0.0],
-              'effects': _EFFECTS, 'loop': True}
-"""Parameters of the simulator."""
+_SENSOR = {'mounting': [8.0, -5.0, 0.0], 'noise': 0.01, 'loop': True, 'wait': 10.0}
+_HELD = {**_SENSOR, 'poses': 48, 'mixed': True, 'dwell': 0.0, 'turn': 0.3, 'flat_last': False,
+         'temperature': [17.0, 33.0], 'temperature_period': 40.0}
+_TIMED = {**_SENSOR, 'poses': _POSES, 'dwell': 1.5, 'turn': 0.5, 'effects': _EFFECTS}
+"""Parameters of the simulator: of a person who waits in each pose, and of one with a clock."""
 
-_CHECKED, _LEAST_SAMPLES = 5, 100
-_PATIENCE, _LOOK_EVERY, _AGAIN = 45.0, 0.1, 0.2
+_NODE = {'sensor': 'demo', 'still_window': 0.25, 'min_dwell': 0.6}
 
+_SERVICES = ('calibrator/fit', 'calibrator/refine', 'calibrator/set_level', 'simulator/flat',
+             'simulator/next')
+
+_PATIENCE = 120.0
+"""Longest time that a step may take, on the slowest machine [s]."""
+
+_LOOK_EVERY = 0.05
+"""Interval at which conditions are checked [s]."""
 
 Spin = Callable[[Callable[[], bool], str], None]
 """Function that spins until a condition is true; the text names the condition in errors."""
+
+Rest = dict[str, Floats]
+"""Means of raw, corrected and true acceleration over a rest [g], (3,) arrays."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """
+    Errors of a topic over rests in several poses.
+
+    Parameters
+    ----------
+    vector_mg : float
+        RMS of the difference from the truth, as a vector [mg].
+    rms_mg : float
+        RMS of |a| - 1 g [mg].
+    max_mg : float
+        Largest | |a| - 1 g | [mg].
+    tilt_deg : float
+        RMS angle between measured and true direction of up [°].
+
+    """
+
+    vector_mg: float
+    rms_mg: float
+    max_mg: float
+    tilt_deg: float
 
 
 @dataclass(frozen=True)
 class Outcome:
     """
-    Errors of raw and corrected messages, over rests in several orientations.
+    Errors before and after a correction.
+
+    Before is ``imu/data_raw`` and after is ``imu/data_calibrated``; with a hidden effect, before
+    and after are ``imu/data_calibrated`` before and after ``~/refine``.
 
     Parameters
     ----------
     rests : int
-        Number of rests.
-    rms_before_mg, rms_after_mg : float
-        RMS of |a| - 1 g [mg].
-    max_before_mg, max_after_mg : float
-        Largest | |a| - 1 g | [mg].
-    tilt_before_deg, tilt_after_deg : float
-        RMS angle between measured and true direction of up [°].
+        Number of rests, before and after.
+    before, after : Errors
+        The errors.
     seconds : float
         Duration of the demonstration.
+    hidden : str
+        Effect that the sensor hides; empty: none.
+    found : tuple of str
+        Effects of the refined calibration that the fit did not contain.
+    lag_s : float
+        Lag of the found effect [s]; 0: none.
 
     """
 
     rests: int
-    rms_before_mg: float
-    rms_after_mg: float
-    max_before_mg: float
-    max_after_mg: float
-    tilt_before_deg: float
-    tilt_after_deg: float
+    before: Errors
+    after: Errors
     seconds: float
+    hidden: str = ''
+    found: tuple[str, ...] = ()
+    lag_s: float = 0.0
+
+    @property
+    def succeeded(self) -> bool:
+        """Return whether the errors are smaller, and the hidden effect is found."""
+        return (self.after.vector_mg < self.before.vector_mg
+                and (not self.hidden or self.hidden in self.found))
+
+
+class DemoError(AccelCalibError):
+    """The demonstration failed."""
 
 
 class User(Node):
-    """A node that receives the messages of both nodes and calls the calibrator."""
+    """A node that receives the messages of both nodes, and calls their services."""
 
     def __init__(self) -> None:
         super().__init__('demo')
-        self.poses = 0
-        self.temperature = math.nan
+        self.temperature = float('nan')
+        self.poses = np.zeros((0, 3))
         self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
             'raw': {}, 'corrected': {}, 'truth': {}}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, qos.LATCHED)
@@ -102,9 +174,12 @@ class User(Node):
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
             self.create_subscription(kind, topic, self._keeper(name), qos.SENSOR)
+        # Made once: DDS drops an answer to a client that the node has not discovered yet.
+        self.triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
     def _on_poses(self, markers: MarkerArray) -> None:
-        self.poses = sum(marker.ns == 'poses' for marker in markers.markers)
+        at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
+        self.poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
 
     def _on_temperature(self, message: Temperature) -> None:
         self.temperature = message.temperature
@@ -119,26 +194,122 @@ class User(Node):
 
         return keep
 
-    def is_flat(self) -> bool:
-        """Return whether the robot is flat now."""
+    def forget(self) -> None:
+        """Forget the messages so far."""
+        for kept in self.messages.values():
+            kept.clear()
+
+    @property
+    def up(self) -> tuple[float, ...]:
+        """Return the newest truth [m/s²]; empty before the first one."""
         truth = self.messages['truth']
-        return bool(truth) and truth[max(truth)] == (0.0, 0.0, STANDARD_GRAVITY)
+        return truth[max(truth)] if truth else ()
+
+    def rest(self, *names: str) -> list[Rest]:
+        """Return the messages of these kinds in the ongoing rest, oldest first [g]."""
+        truth = self.messages['truth']
+        common = sorted(set.intersection(*(set(self.messages[name]) for name in names)))
+        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self.up), 0)
+        return [{name: np.array(self.messages[name][stamp]) / STANDARD_GRAVITY for name in names}
+                for stamp in common[moving:]]
+
+    def has_captured(self) -> bool:
+        """Return whether there is a pose in the direction of the ongoing rest."""
+        rest = self.rest('raw', 'truth')
+        if not rest:
+            return False
+        up = np.mean([each['raw'] for each in rest], axis=0)
+        return bool(np.any(self.poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
 
-def _has_passed(instant: float) -> bool:
-    return time.monotonic() > instant
+class Demonstration:
+    """
+    The user's steps.
+
+    Parameters
+    ----------
+    user : User
+        The node of the user.
+    spin : callable
+        Function that spins until a condition is true.
+    report : callable
+        Function that is called with a line for each step.
+
+    """
+
+    def __init__(self, user: User, spin: Spin, report: Callable[[str], None]) -> None:
+        self._user, self._spin, self._report = user, spin, report
+
+    def turn(self, service: str = 'next') -> None:
+        """Turn the sensor, and wait until it rests."""
+        user = self._user
+        self._spin(lambda: bool(user.up), 'a message of the simulator')
+        before = user.up
+        self.call(f'simulator/{service}')
+        user.forget()
+        self._spin(lambda: user.up not in ((), before)
+                   and len(user.rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
+
+    def capture(self, count: int) -> None:
+        """Let the calibrator capture this number of poses."""
+        for done in range(1, count + 1):
+            if done > 1:
+                self.turn()
+            self._spin(self._user.has_captured, f'pose {done}')
+            if done % 4 == 0:
+                self._report(f'captured {done} poses')
+
+    def measure(self, count: int) -> list[Rest]:
+        """Return the means over the rests in this number of further poses."""
+        rests = []
+        for done in range(1, count + 1):
+            self.turn()
+            self._spin(lambda: len(self._common()) >= _SAMPLES and self._user.has_captured(),
+                       f'rest {done}')
+            samples = self._common()
+            rests.append({name: np.mean([each[name] for each in samples], axis=0)
+                          for name in samples[0]})
+            error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
+            self._report(f'  rest {done:2d} of {count}, now {self._user.temperature:.1f} °C: '
+                         f'imu/data_calibrated is {error:5.2f} mg from the truth')
+        return rests
+
+    def _common(self) -> list[Rest]:
+        return self._user.rest('raw', 'corrected', 'truth')
+
+    def _has_rested(self, count: int) -> bool:
+        return len(self._user.rest('raw', 'truth')) >= count
+
+    def level(self) -> str:
+        """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
+        self.turn('flat')
+        for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
+            self._spin(partial(self._has_rested, count), 'a longer rest')
+            answer = self._request('calibrator/set_level')
+            if answer.success:
+                return str(answer.message)
+        raise _refused('calibrator/set_level', answer)
+
+    def call(self, service: str) -> str:
+        """Call a service, and return its answer; raise DemoError if it fails."""
+        answer = self._request(service)
+        if not answer.success:
+            raise _refused(service, answer)
+        return str(answer.message)
+
+    def _request(self, service: str) -> Trigger.Response:
+        client = self._user.triggers[service]
+        self._spin(client.service_is_ready, f'the service {service}')
+        future = client.call_async(Trigger.Request())
+        self._spin(future.done, f'the answer of {service}')
+        return future.result()
 
 
-def at_least(user: User, count: int) -> bool:
-    """Return whether the node has captured this number of poses."""
-    return user.poses >= count
+def _refused(service: str, answer: Trigger.Response) -> DemoError:
+    return DemoError(f'{service} answered: {answer.message}', 'run the demonstration again')
 
 
-class DemoError(AccelCalibError):
-    """The demonstration failed."""
-
-
-def demonstrate(report: Callable[[str], None]) -> Outcome:
+def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     """
     Run the demonstration.
 
@@ -146,6 +317,8 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
     ----------
     report : callable
         Function that is called with a line for each step.
+    hidden : str
+        Effect that the sensor hides, such as ``quadratic=0.004``; empty: none.
 
     Returns
     -------
@@ -155,28 +328,52 @@ def demonstrate(report: Callable[[str], None]) -> Outcome:
     Raises
     ------
     DemoError
-        If a step takes too long.
+        If a step takes too long, or a service refuses.
 
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
         set_environment(Path(folder))
-        report('starting a simulated Imu, turned by hand, and the calibrator node')
-        processes = [
-            stack.enter_context(running('node', {'sensor': 'demo'})),
-            stack.enter_context(running('simulator', {**_SIMULATED, 'wait': 10.0}))]
-        user, spin = stack.enter_context(user_of(processes))
-        spin(lambda: user.poses > 0, 'the first pose')
-        for count in range(4, POSES + 1, 4):
-            spin(partial(at_least, user, count), f'{count} poses')
-            report(f'captured {count} poses')
-        report(f'~/fit: {call(user, spin, "fit")}')
-        spin(user.is_flat, 'the flat pose')
-        report(f'~/set_level: {_call_patiently(user, spin, "set_level")}')
-        for messages in user.messages.values():
-            messages.clear()
-        spin(lambda: len(rests_of(user)) > _CHECKED, f'{_CHECKED} more rests')
-        return _outcome(rests_of(user)[1:], time.monotonic() - began)
+        report('starting the calibrator node and a simulated Imu, turned by hand'
+               + (f', that hides {hidden}' if hidden else ''))
+        simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
+        processes = [stack.enter_context(running('node', _NODE)),
+                     stack.enter_context(running('simulator', simulated))]
+        demo = Demonstration(*stack.enter_context(user_of(processes)), report)
+        demo.capture(_POSES_HIDDEN if hidden else _POSES)
+        report(f'~/fit: {demo.call("calibrator/fit")}')
+        report(f'~/set_level: {demo.level()}')
+        rests = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
+        raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
+        if not hidden:
+            return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
+        stored = Path(folder) / 'accel_calib' / 'demo.yaml'
+        fitted = read_calibration(stored).model
+        report(f'~/refine: {demo.call("calibrator/refine")}')
+        report(f'~/set_level: {demo.level()}')
+        refined = read_calibration(stored).model
+        again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
+        lag = refined.lags.get('temperature_of_offset')
+        return Outcome(
+            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
+            tuple(name for name in refined.effects if name not in fitted.effects),
+            0.0 if lag is None else lag.seconds)
+
+
+def _errors(rests: Sequence[Rest], name: str) -> Errors:
+    """Return the errors of a topic."""
+    truth = np.array([rest['truth'] for rest in rests])
+    values = np.array([rest[name] for rest in rests])
+    sizes = np.linalg.norm(values, axis=1)
+    errors = (sizes - 1.0) * MG
+    cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
+    return Errors(_rms(np.linalg.norm(values - truth, axis=1)) * MG, _rms(errors),
+                  float(np.max(np.abs(errors))),
+                  _rms(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))
 
 
 def demonstrate_page(port: int, report: Callable[[str], None],
@@ -203,7 +400,7 @@ def demonstrate_page(port: int, report: Callable[[str], None],
                'wait for the poses, and press Fit. Ctrl-C ends it')
         processes = [
             stack.enter_context(running('node', {'sensor': 'demo', 'web_port': port}, 'info')),
-            stack.enter_context(running('simulator', {**_SIMULATED, 'wait': 10.0}))]
+            stack.enter_context(running('simulator', _TIMED))]
         while not is_over():
             _check_running(processes)
             time.sleep(_LOOK_EVERY)
@@ -254,7 +451,7 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
             _check_running(processes)
             if time.monotonic() > ends:
                 raise DemoError(f'{what}: not available within {_PATIENCE:.0f} s, '
-                                f'{counted(user.poses, "pose")} so far',
+                                f'{counted(len(user.poses), "pose")} so far',
                                 'check whether a firewall blocks DDS on this machine')
             look_again = time.monotonic() + _LOOK_EVERY
             while time.monotonic() < look_again:
@@ -271,62 +468,3 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
 def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:
     if any(process.poll() is not None for process in processes):
         raise DemoError('a node has ended unexpectedly', 'see its output above')
-
-
-def _request(user: User, spin: Spin, name: str) -> Trigger.Response:
-    client = user.create_client(Trigger, f'calibrator/{name}')
-    spin(client.service_is_ready, f'the service {name}')
-    future = client.call_async(Trigger.Request())
-    spin(future.done, f'the answer of {name}')
-    user.destroy_client(client)
-    return future.result()
-
-
-def call(user: User, spin: Spin, name: str) -> str:
-    """Call a service of the calibrator; raise DemoError if it fails."""
-    answer = _request(user, spin, name)
-    if not answer.success:
-        raise DemoError(f'~/{name} answered: {answer.message}', 'run the demonstration again')
-    return str(answer.message)
-
-
-def _call_patiently(user: User, spin: Spin, name: str) -> str:
-    """Call a service repeatedly until the sensor has been still for long enough."""
-    while user.is_flat():
-        answer = _request(user, spin, name)
-        if answer.success:
-            return str(answer.message)
-        spin(partial(_has_passed, time.monotonic() + _AGAIN), 'a moment')
-    return call(user, spin, name)
-
-
-def rests_of(user: User) -> list[dict[str, Floats]]:
-    """Return the means of raw, corrected and true acceleration over each complete rest [g]."""
-    common = sorted(set.intersection(*(set(kept) for kept in user.messages.values())))
-    if len(common) < 2:
-        return []
-    arrays = {name: np.array([kept[stamp] for stamp in common]) / STANDARD_GRAVITY
-              for name, kept in user.messages.items()}
-    moving = np.any(np.diff(arrays['truth'], axis=0) != 0.0, axis=1)
-    ends = np.flatnonzero(np.concatenate([[True], moving, [True]]))
-    return [{name: values[a:b].mean(axis=0) for name, values in arrays.items()}
-            for a, b in pairwise(ends) if b - a > _LEAST_SAMPLES]
-
-
-def _outcome(rests: list[dict[str, Floats]], seconds: float) -> Outcome:
-    errors, tilts = {}, {}
-    truth = np.array([rest['truth'] for rest in rests])
-    for name in ('raw', 'corrected'):
-        values = np.array([rest[name] for rest in rests])
-        sizes = np.linalg.norm(values, axis=1)
-        errors[name] = (sizes - 1.0) * MG
-        cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
-        tilts[name] = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return Outcome(len(rests), rms(errors['raw']), rms(errors['corrected']),
-                   float(np.max(np.abs(errors['raw']))),
-                   float(np.max(np.abs(errors['corrected']))), rms(tilts['raw']),
-                   rms(tilts['corrected']), seconds)
-
-
-def rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values ** 2)))

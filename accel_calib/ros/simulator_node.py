@@ -4,9 +4,11 @@
 """
 The simulator node: it publishes an Imu that turns through poses, and its temperature.
 
-`accel_calib.simulate` simulates all samples before the first message. A timer then publishes the
-samples that are due, with stamps at intervals of exactly 1/rate. The acceleration is in m/s².
-``~/truth`` is the specific force of the robot, without effects, noise and mounting.
+A timer publishes the samples that are due, with stamps at intervals of exactly 1/rate. The
+acceleration is in m/s². ``~/truth`` is the specific force of the robot, without effects, noise and
+mounting. ``~/next`` turns the sensor to the next pose, and ``~/flat`` puts the robot flat. With
+``dwell:=0`` the sensor stays in each pose until one of them is called, as a person waits who holds
+it.
 
 """
 
@@ -23,18 +25,20 @@ from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 
 from . import qos
 from .declare import declared
+from ..calibrate import of_samples, thermal_stream
 from ..calibrate.mounting import mounting_of
 from ..model import predict
 from ..session.settings import parameter
-from ..simulate import model_with, parse_effect, simulate_recording
+from ..simulate import model_with, parse_effect, turn_between
 from ..sphere import spread_directions
-from ..table import Floats, Recording
+from ..table import Floats, numbered, Recording
 from ..units import STANDARD_GRAVITY
 
-_FLAT = np.array([[0.0, 0.0, 1.0]])
+_FLAT = np.array([0.0, 0.0, 1.0])
 _TEMPERATURE_EVERY = 0.1
 """Interval between temperature messages [s]."""
 
@@ -52,7 +56,9 @@ class SimulatorSettings:
     frame_id: str = parameter('imu', 'frame_id of the messages')
     rate: float = parameter(200.0, 'Messages per second [Hz]', limits=(1.0, 10000.0))
     poses: int = parameter(12, 'Number of poses, spread evenly over the sphere', limits=(1, 1000))
-    dwell: float = parameter(3.0, 'Duration of each pose [s]', limits=(0.01, 3600.0))
+    dwell: float = parameter(
+        3.0, 'Duration of each pose [s]. 0: until ~/next or ~/flat is called',
+        limits=(0.0, 3600.0))
     mixed: bool = parameter(
         False, 'Take the poses in mixed order, so that direction is not correlated with time or '
         'temperature')
@@ -83,16 +89,127 @@ class SimulatorSettings:
     seed: int = parameter(1, 'Seed of the noise', limits=(0, 2 ** 31 - 1))
 
 
+class SimulatedImu:
+    """
+    The samples of a sensor that is turned through poses.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+        The parameters.
+
+    Attributes
+    ----------
+    next_pose : int
+        Number of poses that the sensor was turned to so far.
+
+    Raises
+    ------
+    InputError
+        If an effect is not in the catalogue.
+
+    """
+
+    def __init__(self, settings: SimulatorSettings) -> None:
+        # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
+        rotation = mounting_of([math.radians(angle) for angle in settings.mounting])
+        self._settings = settings
+        self._model = model_with(
+            dict(parse_effect(text) for text in settings.effects if text), rotation)
+        self._thermal = thermal_stream(self._model)
+        self._rng = np.random.default_rng(settings.seed)
+        self.directions = _directions(settings)
+        self._up = self.directions[0]
+        self.next_pose = 1
+        self._resting = round(settings.dwell * settings.rate)
+        self._path = self._rest(max(1, self._resting))
+        self._sent = 0
+
+    @property
+    def duration(self) -> float:
+        """Time for all poses once [s]."""
+        settings, count = self._settings, len(self.directions)
+        return count * settings.dwell + (count - 1) * settings.turn
+
+    def turn_to(self, up: Floats) -> None:
+        """Let the sensor turn to a direction now; what was to come before is left out."""
+        self._up, self._path = self._path[0, :3] if len(self._path) else self._up, self._path[:0]
+        self._append(up)
+
+    def turn_on(self) -> bool:
+        """Let the sensor turn to the next pose now; return whether there is one."""
+        if self.next_pose >= len(self.directions) and not self._settings.loop:
+            return False
+        self.turn_to(self.directions[self.next_pose % len(self.directions)])
+        self.next_pose += 1
+        return True
+
+    def samples(self, count: int) -> Recording:
+        """Return the next samples [g], at most this number; none after the end."""
+        while len(self._path) < count and self._extend(count - len(self._path)):
+            pass
+        path, self._path = self._path[:count], self._path[count:]
+        force, rate = path[:, :3], path[:, 3:]
+        time = (self._sent + np.arange(len(path))) / self._settings.rate
+        self._sent += len(path)
+        noise_g = self._settings.noise / self._settings.gravity
+        known = {'time': time, 'temperature': self._temperatures(time)}
+        context = {**of_samples(known, len(path), self._model, self._thermal),
+                   'std': np.full_like(force, noise_g)}
+        rng, rotation = self._rng, self._model.rotation
+        columns = {
+            **known, 'reference': force,
+            'reading': predict(self._model, force, context) + rng.normal(
+                size=force.shape) * noise_g,
+            'rate': rate @ rotation.T + rng.normal(size=force.shape) * self._settings.gyro_noise}
+        return Recording(columns, numbered(columns))
+
+    def _extend(self, lacking: int) -> bool:
+        """Append the next pose, or this number of samples at rest; return whether there is any."""
+        settings = self._settings
+        over = self.next_pose >= len(self.directions) and not settings.loop
+        if not self._resting or (over and settings.hold):
+            self._path = np.concatenate([self._path, self._rest(lacking)])
+        elif over:
+            return False
+        else:
+            self._append(self.directions[self.next_pose % len(self.directions)])
+            self.next_pose += 1
+        return True
+
+    def _append(self, up: Floats) -> None:
+        """Append the turn to a direction, and the rest there."""
+        turning = max(1, round(self._settings.turn * self._settings.rate))
+        force, rate = turn_between(self._up, up, self._settings.turn, turning)
+        self._up = up
+        self._path = np.concatenate([self._path, np.hstack([force, rate]),
+                                     self._rest(self._resting)])
+
+    def _rest(self, count: int) -> Floats:
+        """Return force and rate of a rest, (count, 6)."""
+        return np.tile(np.append(self._up, np.zeros(3)), (count, 1))
+
+    def _temperatures(self, time: Floats) -> Floats:
+        """Return the temperature at each sample, which starts at the first value."""
+        first, last = self._settings.temperature
+        period = self._settings.temperature_period
+        if not period:
+            return np.interp(time, [0.0, self.duration], [first, last])
+        return first + (last - first) * (0.5 - 0.5 * np.cos(2.0 * np.pi * time / period))
+
+
 class SimulatorNode(Node):
     """Publish the readings of a simulated sensor."""
 
     def __init__(self) -> None:
         super().__init__('simulator')
         self.settings = declared(self, SimulatorSettings)
-        self._recording = recording_of(self.settings)
+        self._simulated = SimulatedImu(self.settings)
         self._imu = self.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
         self._temperature = self.create_publisher(Temperature, 'temperature', qos.STREAM)
         self._truth = self.create_publisher(Vector3Stamped, '~/truth', qos.STREAM)
+        self.create_service(Trigger, '~/next', self._on_next)
+        self.create_service(Trigger, '~/flat', self._on_flat)
         self._message = _empty_message(self.settings)
         self._sent = 0
         self._began = Time()
@@ -104,6 +221,21 @@ class SimulatorNode(Node):
         self.create_timer(min(1.0 / self.settings.rate, _LONGEST_TICK), self._on_tick,
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    def _on_next(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Turn the sensor to the next pose."""
+        response.success = self._simulated.turn_on()
+        response.message = (
+            f'turning to pose {self._simulated.next_pose}' if response.success else
+            f'all {self.settings.poses} poses are taken, expected another one: restart the '
+            'simulator, or set loop to true')
+        return response
+
+    def _on_flat(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Put the robot flat."""
+        self._simulated.turn_to(_FLAT)
+        response.success, response.message = True, 'turning until z of the robot points up'
+        return response
+
     def _on_tick(self) -> None:
         """Publish the samples that are due."""
         now = time.monotonic()
@@ -113,71 +245,38 @@ class SimulatorNode(Node):
                 return
             self._began, self._began_steady = self.get_clock().now(), now
         due = int((now - self._began_steady) * self.settings.rate) + 1
-        while self._sent < due:
-            row = self._row(self._sent)
-            if row is None:
-                self.context.try_shutdown()
-                return
-            self._send(row)
+        samples = self._simulated.samples(due - self._sent)
+        for row in range(len(samples)):
+            self._send(samples, row)
             self._sent += 1
+        if self._sent < due:
+            self.context.try_shutdown()
 
-    def _row(self, number: int) -> int | None:
-        """Return the row of the n-th sample, or None after the last sample."""
-        count = len(self._recording)
-        if number < count or self.settings.loop:
-            return number % count
-        resting = max(1, round(self.settings.dwell * self.settings.rate))
-        return count - resting + (number - count) % resting if self.settings.hold else None
-
-    def _send(self, row: int) -> None:
+    def _send(self, samples: Recording, row: int) -> None:
         after_start = round(self._sent / self.settings.rate * 1e9)
         stamp = Time(nanoseconds=self._began.nanoseconds + after_start).to_msg()
         header = Header(stamp=stamp, frame_id=self.settings.frame_id)
-        gravity, recording, message = self.settings.gravity, self._recording, self._message
+        gravity, message = self.settings.gravity, self._message
         message.header = header
-        message.linear_acceleration = vector3(recording.reading[row] * gravity)
-        message.angular_velocity = vector3(recording['rate'][row])
+        message.linear_acceleration = vector3(samples.reading[row] * gravity)
+        message.angular_velocity = vector3(samples['rate'][row])
         self._imu.publish(message)
         self._truth.publish(Vector3Stamped(
-            header=header, vector=vector3(recording['reference'][row] * gravity)))
+            header=header, vector=vector3(samples['reference'][row] * gravity)))
         if self._sent % max(1, round(_TEMPERATURE_EVERY * self.settings.rate)) == 0:
             self._temperature.publish(Temperature(
-                header=header, temperature=float(recording['temperature'][row])))
+                header=header, temperature=float(samples['temperature'][row])))
 
     def close(self) -> None:
         """Do nothing, because there is nothing to finish."""
 
 
-def recording_of(settings: SimulatorSettings) -> Recording:
-    """
-    Return all simulated samples.
-
-    Returns
-    -------
-    Recording
-        The samples, in g.
-
-    Raises
-    ------
-    InputError
-        If an effect is not in the catalogue.
-
-    """
-    # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
-    rotation = mounting_of([math.radians(angle) for angle in settings.mounting])
-    model = model_with(dict(parse_effect(text) for text in settings.effects if text), rotation)
-    flat = [_FLAT] * settings.flat_first, [_FLAT] * settings.flat_last
+def _directions(settings: SimulatorSettings) -> Floats:
+    """Return the direction of up in each pose, (n, 3)."""
     spread = spread_directions(settings.poses)
-    directions = np.concatenate([*flat[0], _mixed(spread) if settings.mixed else spread, *flat[1]])
-    ideal = simulate_recording(
-        model_with({}, rotation), directions, np.random.default_rng(settings.seed),
-        noise_g=settings.noise / settings.gravity, rate_hz=settings.rate, dwell=settings.dwell,
-        turn=settings.turn, gyro_noise=settings.gyro_noise)
-    noise = ideal.reading - ideal['reference'] @ rotation.T
-    known = {**ideal.columns, 'temperature': _temperatures(settings, ideal['time']),
-             'std': np.full_like(noise, settings.noise / settings.gravity)}
-    reading = predict(model, ideal['reference'], known) + noise
-    return ideal.with_columns(reading=reading, temperature=known['temperature'])
+    return np.vstack([*[_FLAT] * settings.flat_first,
+                      _mixed(spread) if settings.mixed else spread,
+                      *[_FLAT] * settings.flat_last])
 
 
 def _mixed(directions: Floats) -> Floats:
@@ -186,15 +285,6 @@ def _mixed(directions: Floats) -> Floats:
     stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
                   if math.gcd(step, count) == 1)
     return directions[np.arange(count) * stride % count]
-
-
-def _temperatures(settings: SimulatorSettings, time: Floats) -> Floats:
-    """Return the temperature at each sample, which starts at the first value."""
-    first, last = settings.temperature
-    if not settings.temperature_period:
-        return np.linspace(first, last, len(time))
-    return first + (last - first) * (0.5 - 0.5 * np.cos(
-        2.0 * np.pi * time / settings.temperature_period))
 
 
 def _empty_message(settings: SimulatorSettings) -> Imu:

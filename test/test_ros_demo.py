@@ -1,0 +1,124 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The simulated Imu, and the demonstration with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from pathlib import Path
+from typing import Any
+
+from accel_calib.estimate import coverage
+from geometry_msgs.msg import Vector3Stamped
+from inside import DEMO_CHOICES, main
+from inside_ros import SimulatedImu, SimulatorSettings
+import numpy as np
+import pytest
+from std_srvs.srv import Trigger
+
+RATE = 50.0
+SETTINGS = SimulatorSettings(poses=40, mixed=True, dwell=0.4, turn=0.1, rate=RATE,
+                             flat_last=False, temperature=[15.0, 35.0], temperature_period=5.0)
+
+
+def test_temperature_swings_and_each_part_of_the_poses_is_spread() -> None:
+    samples = SimulatedImu(SETTINGS).samples(1000)
+    expected = 25.0 - 10.0 * np.cos(2.0 * np.pi * samples['time'] / 5.0)
+    np.testing.assert_allclose(samples['temperature'], expected, atol=1e-9)
+    starts = np.round(np.arange(40) * 25).astype(int)
+    for first in (0, 12, 24):
+        assert coverage(samples['reference'][starts[first:first + 16]]) > 0.9
+    ordered = SimulatedImu(replace(SETTINGS, mixed=False)).samples(1000)['reference'][starts]
+    assert coverage(ordered[:16]) < 0.8
+
+
+def test_parts_of_the_samples_are_the_samples_at_once() -> None:
+    settings = replace(SETTINGS, noise=0.0, gyro_noise=0.0, effects=[
+        'offset_temperature=8e-4,-6e-4,1e-3,12,0'])
+    parts, whole = SimulatedImu(settings), SimulatedImu(settings).samples(600)
+    sizes = [1, 7, 200, 392]
+    found = [parts.samples(size) for size in sizes]
+    assert [len(part) for part in found] == sizes
+    for key in ('time', 'reading', 'reference', 'rate', 'temperature'):
+        np.testing.assert_allclose(np.concatenate([part[key] for part in found]), whole[key],
+                                   atol=1e-12)
+
+
+def test_the_samples_end_after_the_last_pose_unless_it_is_held_or_comes_again() -> None:
+    poses, whole = 3, 3 * 20 + 2 * 5
+    ended = SimulatedImu(replace(SETTINGS, poses=poses, hold=False)).samples(1000)
+    assert len(ended) == whole
+    held = SimulatedImu(replace(SETTINGS, poses=poses)).samples(1000)['reference']
+    assert np.all(held[whole:] == held[whole - 1])
+    again = SimulatedImu(replace(SETTINGS, poses=poses, loop=True)).samples(1000)['reference']
+    np.testing.assert_array_equal(again[whole + 5:whole + 5 + 20], again[:20])
+
+
+def test_the_sensor_stays_in_a_pose_until_it_is_turned_on() -> None:
+    simulated = SimulatedImu(replace(SETTINGS, poses=2, dwell=0.0))
+    first, second = simulated.directions
+    assert np.all(simulated.samples(500)['reference'] == first)
+    assert simulated.turn_on()
+    turned = simulated.samples(500)['reference']
+    assert not np.any(np.all(turned[:5] == turned[-1], axis=1))
+    assert np.all(turned[5:] == second)
+    assert not simulated.turn_on()
+    simulated.turn_to(np.array([0.0, 0.0, 1.0]))
+    assert np.all(simulated.samples(10)['reference'][5:] == [0.0, 0.0, 1.0])
+
+
+def test_the_node_is_turned_by_its_services(bench: Any) -> None:
+    truth = bench.listen(Vector3Stamped, 'simulator/truth')
+    bench.start('simulator', poses=2, dwell=0.0, turn=0.2, flat_last=False)
+
+    def call(name: str) -> Any:
+        client = bench.node.create_client(Trigger, f'simulator/{name}')
+        bench.spin(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        bench.spin(future.done)
+        return future.result()
+
+    def up() -> tuple[float, ...]:
+        vector = truth[-1].vector
+        return vector.x, vector.y, vector.z
+
+    bench.spin(lambda: len(truth) > 100)
+    first = up()
+    assert call('next').success
+    bench.spin(lambda: up() != first and all(
+        each.vector == truth[-1].vector for each in truth[-100:]))
+    refused = call('next')
+    assert not refused.success
+    assert 'loop' in refused.message
+    assert call('flat').success
+    bench.spin(lambda: up() == (0.0, 0.0, 9.80665))
+
+
+@pytest.fixture
+def own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restore what the demonstration sets."""
+    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.setenv(name, '')
+
+
+@pytest.mark.parametrize('hidden', [None, 'temperature'])
+def test_the_demonstration_calibrates_and_finds_what_is_hidden(
+        hidden: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        own_environment: None) -> None:
+    result = tmp_path / 'result.json'
+    given = ['--hidden', hidden] if hidden else []
+    assert main(['demo', *given, '--json', str(result)]) == 0
+    outcome = json.loads(result.read_text())
+    assert outcome['found'] == ([outcome['hidden']] if hidden else [])
+    assert outcome['hidden'] == (DEMO_CHOICES[hidden].partition('=')[0] if hidden else '')
+    assert outcome['vector_before_mg'] > 2.0
+    assert outcome['vector_after_mg'] < 0.3 * outcome['vector_before_mg']
+    assert outcome['rms_after_mg'] < 1.0
+    assert outcome['tilt_after_deg'] < 0.2
+    printed = capsys.readouterr().out
+    assert 'RMS [mg]' in printed  # a table takes brackets for markup
+    assert '\\' not in printed
+    assert ('~/refine: ' in printed) == bool(hidden)
+    assert printed.count('mg from the truth') == outcome['rests'] * (2 if hidden else 1)
