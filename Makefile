@@ -32,7 +32,7 @@ help:
 	@echo 'make test   the tests; PYTEST_ARGS="-k name" for some of them'
 	@echo 'make lint   linter and type check'
 	@echo 'make docs   the documentation site, in build/docs'
-	@echo 'make faults many damaged files and failed writes; half an hour'
+	@echo 'make faults the whole series of damaged files, failed writes and kills; half an hour'
 	@echo 'make bench  measures speed, beside what it is compared to, and writes it to the docs'
 	@echo 'make clean  removes .venv and what was built'
 
@@ -53,8 +53,8 @@ docs: $(VENV)/extra-docs
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
 
 faults: $(VENV)/extra-test $(VENV)/package
-	@ACCEL_CALIB_TRIALS=5 $(BIN)/python -m pytest -s test/faults test/test_targets.py \
-		test/test_*damage*.py test/test_bombs.py
+	@ACCEL_CALIB_TRIALS=5 $(BIN)/python -m pytest -s test/faults test/test_*damage*.py \
+		test/test_fleet.py
 	@for seed in 1 2 3 4 5; do \
 		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 
