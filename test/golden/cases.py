@@ -1,0 +1,94 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The result of a golden case: the table of the cases is ``cases.yaml``."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stderr, redirect_stdout
+import csv
+import io
+import json
+import os
+from pathlib import Path
+import re
+import shlex
+from typing import Any
+
+from accel_calib.files import LogOptions
+from golden import inputs
+from golden.driven import session
+from golden.figures import attempt, LOOKS
+from golden.record import parted, plain
+from golden.sweeps import SWEEPS
+from inside import main, poses_of
+import numpy as np
+import yaml
+
+CASES: dict[str, Any] = yaml.safe_load(
+    Path(__file__).with_name('cases.yaml').read_text(encoding='utf-8'))
+_WITHOUT_JSON = ('apply', 'report', 'simulate')
+_SETTINGS = ('run', 'look', 'units', 'session')
+
+
+def result_of(name: str, folder: Path) -> Any:
+    """Return the result of a case, computed in an empty folder."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        return parted(plain(SWEEPS[name]() if name in SWEEPS else _of_case(CASES[name])))
+    finally:
+        os.chdir(before)
+
+
+def _of_case(case: dict[str, Any]) -> Any:
+    files = {file: made for file, made in case.items() if file not in _SETTINGS}
+    for file, made in files.items():
+        (kind, options), = made.items()
+        getattr(inputs, kind)(Path(file), **options)
+    found = {command: _ran(command) for command in case.get('run', ())}
+    if 'look' in case:
+        intake = poses_of(Path(next(iter(files))), LogOptions(units=case.get('units', '')))
+        found['intake'] = intake
+        for look in case['look']:
+            kind, *given = look.split()
+            found[look] = plain(attempt(LOOKS[kind], intake.poses, intake.units, *given))
+    return {**found, 'session': session(case['session'])} if 'session' in case else found
+
+
+def _ran(command: str) -> Any:
+    """Return what a command writes."""
+    arguments = shlex.split(command)
+    if arguments[0] not in _WITHOUT_JSON:
+        arguments += ['--json', 'result.json']
+    before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
+    errors = io.StringIO()
+    with redirect_stdout(io.StringIO()), redirect_stderr(errors):
+        status = main(arguments)
+    written = sorted(path for path in Path().iterdir()
+                     if before.get(path) != path.stat().st_mtime_ns)
+    return {'status': status, 'errors': errors.getvalue() if status == 2 else '',
+            **{path.name: _content(path) for path in written}}
+
+
+def _content(path: Path) -> Any:
+    """Return what a file holds; of a page its text, of a calibration not its poses."""
+    text = path.read_text(encoding='utf-8')
+    if path.suffix == '.csv':
+        head, *rows = csv.reader(line for line in text.splitlines() if line[:1] != '#')
+        return {name: _column(each) for name, each in zip(head, zip(*rows), strict=True)}
+    if path.suffix == '.json':
+        return json.loads(text)
+    if path.suffix == '.yaml':
+        return {key: each for key, each in yaml.safe_load(text).items()
+                if key not in ('date', 'package_version', 'checksum', 'poses')}
+    if path.suffix == '.html':
+        text = re.sub(r'(?s)<(svg|script|style).*?</\1>|<[^>]*>', '\n', text)
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _column(values: tuple[str, ...]) -> Any:
+    try:
+        return np.array(values, float)
+    except ValueError:
+        return list(values)

@@ -1,0 +1,175 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Golden results of what runs while samples arrive: sessions without ROS, and messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+import struct
+from typing import Any
+
+import accel_calib as ac
+from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
+from accel_calib.messages import (
+    corrected,
+    doubles_at,
+    frame_ids,
+    joined,
+    layout_of,
+    motion_of,
+    output_frame,
+    renamed,
+    Rewriter,
+    samples_of,
+    stamps_of,
+)
+from accel_calib.session import CalibratorSettings, findings, Job, Log, Session, ShowPoses
+from accel_calib.units import units_of
+from golden.figures import attempt
+from golden.inputs import G, samples
+from inside import figures as health_figures
+from inside import layout_with, Model
+import numpy as np
+
+SENSOR: dict[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array(
+    [0.01, -0.02, 0.015]), 'cross_axis': np.array([0.004, 0.002, -0.003])}
+EFFECTS: dict[str, Any] = {
+    'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 40.0, 0.0]), 'lever_arm': np.array(
+        [0.1, -0.05, 0.02]), 'quadratic': np.array([1e-3, -2e-3, 1e-3]),
+    'temperature_rate': np.array([0.02, 0.01, -0.03])}
+
+
+class _Driver:
+    """A session whose jobs are done at once, with its own clock; each step returns a result."""
+
+    def start(self, **settings: Any) -> None:
+        self.now, self.log, self.shown = 0.0, [], None
+        self.session = Session(CalibratorSettings(calibration_file='c.yaml', **settings), '/imu',
+                               lambda: self.now)
+        self._handle()
+
+    def _handle(self) -> None:
+        for event in self.session.events():
+            if isinstance(event, Job):
+                self._done(event)
+            elif isinstance(event, Log):
+                self.log.append(f'{event.severity}: {event.words}')
+            elif isinstance(event, ShowPoses):
+                self.shown = event
+
+    def _done(self, job: Any) -> Any:
+        while isinstance(job, Job):
+            job = job.finish(job.run(lambda function, *given: function(*given)))
+        self._handle()
+        return job
+
+    def ask(self, *names: str) -> Any:
+        """Return the answers of commands, or their refusals."""
+        return [attempt(lambda name=name: self._done(getattr(self.session.commands, name)()))
+                for name in names]
+
+    def feed(self, ups: Sequence[Any], at: float, t: float = np.nan, frame_id: str = 'imu',
+             per_g: float = G, gain: float = 1.0, s: float = 2.4, **part: Any) -> None:
+        """Push the samples of rests in blocks."""
+        table = samples([{'up': up, 's': s, **part} for up in ups], seed=int(at))
+        table[:, 1:4] *= per_g * gain
+        for block in np.array_split(table, len(table) // 15):
+            self.now += 0.3
+            if self.session.accepts(frame_id):
+                rows = np.full((len(block), 9), np.nan)
+                rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
+                self.session.set_temperature(t)
+                self.session.push(rows, self.now)
+            self._handle()
+        self.session.tick()
+        self._handle()
+
+    def state(self) -> Any:
+        """Return progress, diagnostics, findings and poses."""
+        health = self.session.health()
+        return [self.session.progress(), dict(health_figures(health)), findings(health),
+                self.shown, self.session.live.book.poses(), self.session.active.drift]
+
+    def lines(self) -> Any:
+        return self.log
+
+
+def session(steps: Sequence[Any]) -> Any:
+    """Return the results of the steps of a session."""
+    driver, found = _Driver(), []
+    for step in steps:
+        (name, given), = step.items() if isinstance(step, dict) else ((step, ()),)
+        act = getattr(driver, name)
+        found.append(act(**given) if isinstance(given, dict) else act(*given))
+    driver.session.close()
+    return found
+
+
+def _calibrations() -> Iterator[Calibration]:
+    """Yield calibrations with exact values: plain, levelled, and with effects."""
+    made = fit_poses(ac.simulate(SENSOR, poses=16, units='m/s2', temperature=(20.0, 30.0),
+                                 time=30.0 * np.arange(16)), units_of('m/s2'), model='10')
+    plain = replace(made, model=Model(SENSOR), covariance=np.diag(np.arange(1.0, 10.0)) * 1e-7)
+    flat = level(plain, plain.predict(np.array([[1.5, -2.0, 9.4]]))[0], 'ros')
+    warm = Model({**SENSOR, **EFFECTS}, flat.rotation)
+    yield from (plain, flat, replace(flat, model=warm, covariance=1e-8 * np.eye(len(warm.vector))))
+
+
+def _messages(frame_id: str, seed: int) -> Iterator[bytes]:
+    """Yield serialized Imu messages with covariances of all kinds."""
+    rng, letters = np.random.default_rng(seed), frame_id.encode() + b'\0'
+    for k, kind in enumerate(('full', 'unknown', 'absent', 'nan', 'full', 'full')):
+        doubles = rng.normal(size=37) * np.where(np.arange(37) // 3 == 8, 6.0, 1.0)
+        for start in (4, 16, 28):
+            root = rng.normal(size=(3, 3)) * 0.01
+            doubles[start:start + 9] = (root @ root.T).ravel() if kind in ('full', 'nan') else 0.0
+            doubles[start] = -1.0 if kind == 'absent' else doubles[start]
+        doubles[30] = np.nan if kind == 'nan' else doubles[30]
+        head = struct.pack('<4siII', b'\0\1\0\0', 100 + 7 * k, 250_000_000 * (k % 4), len(letters))
+        yield (head + letters + b'\xab' * (-(len(head + letters) - 4) % 8)
+               + doubles.astype('<f8').tobytes())
+
+
+def messages() -> Any:
+    """Return corrected messages: the bytes before the numbers, and the numbers."""
+    found: dict[str, Any] = {}
+    noise = SampleNoise(np.array([0.01, 0.02, 0.03]), np.array([1e-3, 2e-3, 4e-3]))
+    for calibration, frame_id in zip(_calibrations(), ('imu', 'base/imu_7', ''), strict=True):
+        raws = list(_messages(frame_id, len(frame_id)))
+        layout, to = layout_of(raws[0]), output_frame(calibration, frame_id)
+        assert layout is not None
+        write, single = Rewriter(layout, calibration, 1.0, G, to, noise if frame_id else None), []
+        for k, raw in enumerate(raws):
+            write.bias = (0.01, -0.02, 0.03) if k == 5 else (0.0, 0.0, 0.0)
+            out, begin = write(raw, 20.0 + 2.0 * k) or b'', write.layout.begin
+            single += [out[:begin], np.frombuffer(out[begin:]).tolist()]
+        every, large = joined(raws, 37, 'imu'), [
+            raws[0][:-96] + struct.pack('<3d', 0.0, size, 0.0) + raws[0][-72:]
+            for size in (np.nan, 900.0, 990.0, -1100.0)]
+        known = {'time': stamps_of(every), 'temperature': 20.0 + 2.0 * np.arange(6.0),
+                 'rate': samples_of(every)['rate']}
+        found[frame_id] = {
+            'single': single, 'together': corrected(calibration, doubles_at(every, slice(0, 37)),
+                                                    known), 'layout': layout, 'frame': to,
+            'ids': frame_ids(every), 'samples': samples_of(every), 'renamed': [
+                bytes(each)[:48] for each in renamed(every, 'other').each()][:2],
+            'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:], 'large': [
+                isinstance(attempt(write, each, 20.0), bytes) for each in large]}
+    raw = next(_messages('imu', 1))
+    swapped = raw[:1] + b'\0' + raw[2:4] + b''.join(
+        raw[k:k + 4][::-1] for k in range(4, 16, 4)) + raw[16:20] + b''.join(
+        raw[k:k + 8][::-1] for k in range(20, len(raw), 8))
+    ros1 = raw[:12] + struct.pack('<I', 3) + b'imu' + raw[-296:]
+    for name, raws, ros2 in (('big endian', [raw, swapped], True), ('ROS 1', [ros1], False)):
+        made = joined(raws, 37, 'imu', ros2=ros2)
+        found[name] = [stamps_of(made), doubles_at(made, slice(25, 28)), frame_ids(made),
+                       [bytes(each)[:40] for each in renamed(made, 'longer_name').each()]]
+    found['layouts'] = [layout_with(each) for each in ('', 'imu', 'imu_link', 'übung')]
+    found['damaged'] = [layout_of(each) is None for each in (
+        raw, raw[:-1], raw + b'\0', b'\0\0' + raw[2:], raw[:12] + b'\0' + raw[13:], raw[:20])]
+    found['refused'] = [getattr(attempt(joined, each, 37, 'imu', before=3), 'args', '')
+                        for each in ([raw, raw[:-9]], [b'\7' + raw[1:]], [raw + bytes(3)],
+                                     [raw, raw, raw + bytes(4)])]
+    return found

@@ -1,0 +1,167 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The figures of results that the JSON of the commands rounds or leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from accel_calib.calibrate import (
+    Calibration,
+    fit_partial,
+    fit_poses,
+    in_g,
+    mounting_only,
+    outlook,
+    outside,
+    verify,
+    with_history,
+)
+from accel_calib.errors import AccelCalibError
+from accel_calib.estimate import estimate, Fit, judge
+from accel_calib.monitor import monitor
+from accel_calib.rating import Expected, rate
+from accel_calib.refine import refine
+from accel_calib.table import Poses
+from accel_calib.units import Units
+from inside import (
+    carried,
+    kinds,
+    Model,
+    probabilities,
+    rotation_free,
+    scatter_of,
+    search_effects,
+    spread_directions,
+    unseen_mistakes,
+)
+import numpy as np
+
+UP = spread_directions(4)
+
+
+def attempt(function: Callable[..., Any], *given: Any, **options: Any) -> Any:
+    """Return a result, or the error in its place."""
+    try:
+        return function(*given, **options)
+    except (AccelCalibError, ValueError, KeyError, np.linalg.LinAlgError) as error:
+        return error
+
+
+def those(of: Any, names: str) -> dict[str, Any]:
+    """Return some of the members of an object."""
+    return {name: getattr(of, name) for name in names.split()}
+
+
+def by_effect(model: Model, covariance: Any) -> dict[str, Any]:
+    """Return values and standard deviations by effect, and the correlation of all values."""
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    size, found, start = np.where(deviation > 0.0, deviation, 1.0), {}, 0
+    for name, values in model.values.items():
+        found[name] = values, deviation[start:start + len(values)]
+        start += len(values)
+    return {**found, 'correlation': covariance / np.outer(size, size)}
+
+
+def spread(covariances: Any) -> Any:
+    """Return the standard deviations of (n, 3) vectors along the axes and along (1, 1, 1)."""
+    return np.sqrt(np.column_stack([np.diagonal(covariances, axis1=1, axis2=2),
+                                    np.sum(covariances, axis=(1, 2))]))
+
+
+def of_calibration(calibration: Calibration) -> dict[str, Any]:
+    """Return the figures of a calibration, and of what follows from it."""
+    units, effects = calibration.units, calibration.model.effects
+    known = calibration.typical_context(len(UP))
+    one = {key: each[:1] for key, each in known.items()}
+    force = UP * calibration.force_per_g * [[0.3], [0.8], [1.1], [1.6]]
+    wide = {key: (each.T * [0.4, 0.9, 1.1, 1.8]).T for key, each in known.items()}
+    free = attempt(rotation_free, calibration, one, units.per_g)
+    return {
+        **those(calibration, 'name method units sensor frame rotation offset gain offset_sd '
+                'gain_sd ranges quality rejected reason warnings gyro noise'),
+        'values': by_effect(calibration.model, calibration.covariance),
+        'rating': rate(calibration), 'outlook': outlook(calibration),
+        'expected': of_expected(Expected(calibration)),
+        'reading': attempt(calibration.predict, force, known),
+        'force': attempt(calibration.correct, units.from_g(UP), wide),
+        'spread': attempt(lambda: spread(calibration.force_covariance(force, known))),
+        'free': free if isinstance(free, Exception) else {
+            **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
+        'scatter': those(scatter_of(calibration), 'chi2 dof stated belief') if effects else '',
+        'repeats': monitor(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
+        'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
+
+
+def of_expected(expected: Expected) -> dict[str, Any]:
+    """Return the parts of the expected error."""
+    return those(expected, 'dof stated_mg worst_mg omitted_mg noise_mg few hidden_mg '
+                 'not_corrected inexact_mg error_mg own_mg before_mg')
+
+
+def of_fit(fit: Fit) -> dict[str, Any]:
+    """Return the figures of a fit."""
+    return {'values': by_effect(fit.model, fit.covariance), 'residual': fit.residual,
+            'columns': fit.columns, 'unseen': unseen_mistakes(fit),
+            'of poses': fit.equations.of_poses(fit.residual),
+            **those(fit.equations, 'count scale force pose'),
+            **those(fit, 'dof chi2 variance variance_dof variance_factor undetermined at_bound')}
+
+
+def fits(poses: Poses, units: Units, *asked: str) -> dict[str, Any]:
+    """Return calibrations by model, ``model/algebraic``, ``prior`` or ``mounting``."""
+    def fitted(name: str) -> Any:
+        if name in ('prior', 'mounting'):
+            made = (fit_partial if name == 'prior' else mounting_only)(poses, units)
+            return of_calibration(made)
+        model, _, method = name.partition('/')
+        made = fit_poses(poses, units, model=model, method='algebraic' if method else 'ml')
+        return {**of_calibration(made), 'verified': verify(made, poses)}
+
+    return {name: attempt(fitted, name) for name in asked}
+
+
+def refined(poses: Poses, units: Units, base: str) -> dict[str, Any]:
+    """Return the figures of a refinement."""
+    found = refine(poses, units, base=base)
+    return {**those(found, 'verdict gap_mg remaining_gap_mg steps not_testable advice refusal '
+                    'stages plan force'), 'calibration': of_calibration(found.calibration)}
+
+
+def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
+    """Return what a search found near its final model, with the table of candidates."""
+    calibration = fit_poses(poses, units, model=base)
+    model = Model(calibration.model.values)
+    found = search_effects(with_history(in_g(poses, calibration.units), model), model)
+    near, linear, chosen = found.near, found.near.linear, found.near.chosen
+    gain, rank = linear.gains(chosen)
+    best: dict[str, tuple[float, ...]] = {}
+    for k, block in enumerate(linear.blocks):
+        each = (float(gain[k]), float(rank[k]), block.tried, linear.score_with(
+            chosen, k, gain[k], rank[k]))
+        best[block.effect] = max(each, best.get(block.effect, each))
+    return {
+        **those(found, 'added outliers taken_back grid_g clipped curve'), 'candidates': best,
+        'walk': found.walk and those(found.walk, 'ratio score likelihood_ratio'),
+        'states': [those(each, 'rss dof floor_mg is_noise residual held_out')
+                   for each in (found.base, found.final)],
+        'chosen': {**those(chosen, 'out rss ranks parameters charge score'), 'names': near.names,
+                   'shapes': [linear.blocks[k].shape for k in chosen.blocks]},
+        'linear': {**those(linear, 'worth dof base_rss choice penalty poses'),
+                   'visible': linear.visible()},
+        'probabilities': {name: probabilities(name, near) for name in near.names}}
+
+
+def solved(poses: Poses, units: Units, *effects: str) -> dict[str, Any]:
+    """Return the fit of any effects to the poses, and their equations before it."""
+    poses_g = with_history(in_g(poses, units), Model({}))
+    start = Model({name: np.zeros(1 if name == 'gain' else 3) for name in effects})
+    return {'kinds': kinds(poses_g), 'start': of_fit(judge(start, poses_g)),
+            'fit': of_fit(estimate(start, poses_g))}
+
+
+LOOKS: dict[str, Callable[..., Any]] = {
+    'fits': fits, 'refine': refined, 'search': searched, 'solve': solved}
+"""Looks at poses, by name."""

@@ -1,0 +1,30 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The results of all commands and of the library are those that are stored.
+
+``python test/golden/make.py NAME`` stores the result of a case anew, if it is meant to change.
+
+"""
+
+import json
+from pathlib import Path
+
+from golden.cases import CASES, result_of
+from golden.record import differences, EXPECTED, text_of
+from golden.sweeps import SWEEPS
+import pytest
+
+MOST = 12
+
+
+@pytest.mark.parametrize('name', [*SWEEPS, *CASES])
+def test_the_result_is_the_one_that_is_stored(name: str, tmp_path: Path) -> None:
+    expected = json.loads((EXPECTED / f'{name}.json').read_text(encoding='utf-8'))
+    found = list(differences(expected, json.loads(text_of(result_of(name, tmp_path)))))
+    assert not found, '\n'.join([f'{len(found)} differences', *found[:MOST]])
+
+
+def test_there_is_no_result_without_a_case() -> None:
+    assert {path.stem for path in EXPECTED.iterdir()} == {*CASES, *SWEEPS}
