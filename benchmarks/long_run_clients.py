@@ -18,7 +18,7 @@ from pathlib import Path
 import struct
 import time
 
-from accel_calib.ros.simulator_node import recording_of, SimulatorSettings
+from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
 from imu_clients import ended, NANO, relay, STREAM, USER
 import numpy as np
 import rclpy
@@ -48,7 +48,8 @@ def readings(rate: float) -> tuple[bytes, list[float]]:
     settings = SimulatorSettings(
         rate=rate, poses=POSES, dwell=DWELL, turn=TURN, mixed=True, flat_last=False,
         effects=EFFECTS, temperature=[15.0, 35.0], temperature_period=CYCLE)
-    made = recording_of(settings)
+    simulated = SimulatedImu(settings)
+    made = simulated.samples(round(simulated.duration * rate))
     columns = np.hstack([made.reading * settings.gravity, made['rate']])
     return columns.astype('<f8').tobytes(), made['temperature'].tolist()
 

@@ -13,12 +13,16 @@ condition and a time limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.util import find_spec
 import itertools
 import os
 from pathlib import Path
+import shutil
+from socket import AF_INET, SOCK_DGRAM, socket
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any
 
@@ -26,19 +30,67 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+UDP = ROOT / 'config' / 'fast_dds_udp.xml'
+"""Profile of Fast DDS with the discovery range of LOCALHOST, and without shared memory."""
+
 collect_ignore_glob = [] if find_spec('rclpy') else ['test_ros_*.py']
 """Without ROS only the other tests run."""
+
+PATIENCE = 60.0
+"""
+Longest wait for a condition [s].
+
+A wait ends with its condition, so that only a failure takes this time. On a loaded machine, the
+start of a node and the answer of DDS take much longer than on an idle one.
+
+"""
+
 _DOMAINS = itertools.cycle(range(1, 102))
-for _ in range(os.getpid() % 101):
-    next(_DOMAINS)  # two test runs on one machine need different domains
+for _ in range(37 * os.getpid() % 101):
+    next(_DOMAINS)  # test runs at the same time begin far from each other
 
 GRAVITY = 9.80665
 RATE = 50.0
 _BATCH = 20
 
 
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """
+    Yield a DDS domain that no other test on this machine has.
+
+    Of the UDP ports of a domain, DDS does not use the third one. This process holds it, so that
+    processes that run tests at the same time have different domains. A domain in which somebody
+    else has a first participant is left out, too.
+
+    """
+    for domain in itertools.islice(_DOMAINS, 101):
+        ports = 7400 + 250 * domain
+        with socket(AF_INET, SOCK_DGRAM) as held, socket(AF_INET, SOCK_DGRAM) as participant:
+            try:
+                held.bind(('127.0.0.1', ports + 2))
+                participant.bind(('', ports + 10))
+            except OSError:
+                continue
+            participant.close()
+            yield domain
+            return
+    raise RuntimeError('all of the domains 1 to 101 are in use')
+
+
 class Bench:
-    """A node that drives and observes the nodes under test."""
+    """
+    A node that drives and observes the nodes under test.
+
+    Attributes
+    ----------
+    deep : dict
+        Parameter of a calibrator: a queue for a sensor that does not wait for it. On a loaded
+        machine a calibrator may stop for a second, and the simulator then sends all that is due.
+
+    """
+
+    deep: Mapping[str, int] = {'qos_overrides./imu/data_raw.subscription.depth': 5000}
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.home = folder / 'home'
@@ -72,11 +124,25 @@ class Bench:
         self._leave()
         self._join()
 
+    def without_shared_memory(self) -> None:
+        """
+        Let processes that are started from now on use UDP alone.
+
+        A test that kills them needs this. If a process is killed while it writes a message to the
+        shared memory of the bench, it leaves a locked mutex there. After a second, a thread of
+        Fast DDS (2.14.5) replaces this memory. Meanwhile `_leave` may wait for the mutex, and the
+        process of the tests ends with a segmentation fault.
+
+        """
+        self._environment |= {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
+                              'FASTRTPS_DEFAULT_PROFILES_FILE': str(UDP)}
+
     def start(self, name: str, **parameters: Any) -> subprocess.Popen[str]:
         """Start a node of the package as a process."""
+        from inside import NODES
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_yaml(value)}')]
-        return self.run('-m', f'accel_calib.ros.{name}', '--ros-args', *given)
+        return self.run(*NODES[name], '--ros-args', *given)
 
     def run(self, *arguments: str) -> subprocess.Popen[str]:
         """Start Python as a process in the domain of this bench."""
@@ -100,10 +166,10 @@ class Bench:
     def end(self, process: subprocess.Popen[str], number: int) -> tuple[int, str]:
         """Send a signal, and return the exit status and the output."""
         process.send_signal(number)
-        printed = process.communicate(timeout=10)[0]
+        printed = process.communicate(timeout=PATIENCE)[0]
         return process.returncode, printed
 
-    def spin(self, until: Callable[[], Any], seconds: float = 15.0) -> None:
+    def spin(self, until: Callable[[], Any], seconds: float = PATIENCE) -> None:
         """Spin until a condition holds."""
         ends = time.monotonic() + seconds
         while not until():
@@ -192,20 +258,26 @@ class Bench:
         if not self.came_out:
             rng = np.random.default_rng(1)  # moving, until both sides have discovered each other
             self.exchange(self.came_out, lambda: self.imu(readings[0] + 3.0 * rng.normal(size=3)))
-            self.spin(lambda ends=time.monotonic() + 0.2: time.monotonic() > ends)
         for start in range(0, len(readings), _BATCH):
             batch = [self.imu(reading) for reading in readings[start:start + _BATCH]]
             self.came_out.clear()
             for message in batch:
                 self.send(message)
-            self.spin(lambda batch=batch: len(self.came_out) >= len(batch), 5.0)
+            self.spin(lambda last=batch[-1]: _came(last, self.came_out))
 
     def echo(self, messages: Iterable[Any], heard: list[Any]) -> list[Any]:
-        """Publish messages, each after the output of the previous one, and return the output."""
-        heard.clear()
-        for k, message in enumerate(messages):
+        """
+        Publish messages, each after the output of the previous one, and return their output.
+
+        The list contains nothing else, such as late output of earlier messages.
+
+        """
+        output = []
+        for message in messages:
             self.send(message)
-            self.spin(lambda count=k: len(heard) > count, 2.0)
+            self.spin(lambda message=message: _came(message, heard))
+            output.append(heard[-1])
+        heard[:] = output
         return heard
 
     def exchange(self, heard: list[Any], make: Callable[[], Any]) -> Any:
@@ -228,26 +300,58 @@ class Bench:
             sys.stdout.write(process.communicate()[0])  # pytest shows it if a test fails
 
 
+def _came(message: Any, heard: list[Any]) -> bool:
+    """Return whether the output of a message is the last one."""
+    return bool(heard) and heard[-1].header.stamp == message.header.stamp
+
+
 def _yaml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-@pytest.fixture(autouse=True)
-def defects_are_failures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let an exception that nobody expected fail a test, instead of the command's last resort."""
-    def fail(error: BaseException) -> str:
-        raise error
+@pytest.fixture(scope='session')
+def temporary() -> Iterator[Path]:
+    """Yield a folder for temporary files, in which any user can write."""
+    # TMPDIR may be a folder of root alone.
+    folder = Path(tempfile.mkdtemp(dir='/tmp' if os.geteuid() == 0 else None))
+    folder.chmod(0o1777)
+    yield folder
+    shutil.rmtree(folder)
 
-    monkeypatch.setattr('accel_calib.cli.main.crash_words', fail)
-    monkeypatch.setattr('accel_calib.session.store.crash_words', fail)
+
+@pytest.fixture(autouse=True)
+def defects_are_failures(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Fail a test that left the details of an exception that nobody expected."""
+    monkeypatch.setattr(tempfile, 'tempdir', str(temporary))
+    yield
+    details = []
+    for path in temporary.glob('accel_calib-*.txt'):
+        details.append(path.read_text(encoding='utf-8'))
+        path.unlink()
+    if details:
+        pytest.fail('\n'.join(details), pytrace=False)
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+def domain() -> Iterator[int]:
+    """Yield a DDS domain of this test."""
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture(scope='module')
+def domain_of_module() -> Iterator[int]:
+    """Yield a DDS domain of the tests of a module."""
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Bench]:
     """Yield a bench in a DDS domain of its own."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    made = Bench(tmp_path, next(_DOMAINS))
+    made = Bench(tmp_path, domain)
     yield made
     made.close()
 
@@ -280,7 +384,7 @@ EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),
 @pytest.fixture
 def readings() -> Callable[..., Any]:
     """Return a function that simulates readings of a sensor that is turned."""
-    from accel_calib.simulate import model_with, simulate_recording
+    from inside import model_with, simulate_recording
 
     def make(directions: Any, *, dwell: float = 1.8, rotation: Any = None,
              effects: Mapping[str, Any] = EFFECTS) -> Any:
@@ -297,9 +401,8 @@ def stored(tmp_path: Path) -> Callable[..., Path]:
     """Return a function that stores a calibration of known parameters."""
     from accel_calib.calibrate import fit_poses, level
     from accel_calib.files import write_calibration
-    from accel_calib.simulate import model_with, simulate_poses
-    from accel_calib.sphere import spread_directions
     from accel_calib.units import units_of
+    from inside import model_with, simulate_poses, spread_directions
 
     def make(name: str = 'known.yaml', *, sensor: str = '', unit: Any = 'm/s2',
              flat: Any = None) -> Path:

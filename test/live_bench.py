@@ -20,12 +20,9 @@ import shutil
 from threading import Event, Thread
 import time
 
-from accel_calib.live.host import Host
-from accel_calib.model import predict
 from accel_calib.session import CalibratorSettings, Log
-from accel_calib.simulate import model_with
-from accel_calib.sphere import unit
 from accel_calib.table import Floats
+from inside import Host, model_with, predict, unit
 import numpy as np
 from playwright.sync_api import Browser, expect, Page, Playwright
 import pytest
@@ -33,8 +30,10 @@ import pytest
 GRAVITY = 9.80665
 TRUTH = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.005)}
 SIZES = ((360, 740), (740, 360), (820, 1180), (1440, 900), (2560, 1440))
-PATIENCE = 30_000
-"""Longest time until the page shows something [ms]."""
+PATIENCE = 120_000
+"""Longest time until the page shows something [ms]; it is waited for no longer than necessary."""
+
+expect.set_options(timeout=PATIENCE)
 
 _FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
           '--disable-background-networking', '--disable-component-update', '--disable-sync')
@@ -43,16 +42,27 @@ _SIDES = {'front': (0, 1), 'back': (0, -1), 'left': (1, 1), 'right': (1, -1), 't
 _GOAL = re.compile(r'([\w ]+) (?:side|edge|corner) up', re.IGNORECASE)
 _RATE = 100.0
 _TURN = 1.2
+_REST = 4.0
 _NOISE = 0.002
 
 
 class TurnedSensor:
-    """A sensor that is turned by hand; it is the source of a host. Its time runs faster."""
+    """
+    A sensor that is turned by hand; it is the source of a host.
+
+    Parameters
+    ----------
+    speed : float
+        Speed of its time until it has been at rest for a pose; later it is 1.
+    sensor : str
+        Its name.
+
+    """
 
     name = 'simulated'
     problem = str
 
-    def __init__(self, speed: float = 6.0, sensor: str = 'imu_link') -> None:
+    def __init__(self, speed: float = 20.0, sensor: str = 'imu_link') -> None:
         self.speed, self.sensor = speed, sensor
         self.silent = False
         self._model = model_with(TRUTH)
@@ -62,7 +72,7 @@ class TurnedSensor:
 
     def turn_to(self, direction: Floats) -> None:
         """Turn the sensor so that about this direction points up."""
-        self._start = self._force(self._stamp)
+        self._start = self._forces(np.array([self._stamp]))[0]
         shaky = np.asarray(direction) + 0.03 * self._rng.normal(size=3)
         self._end, self._since = unit(shaky[np.newaxis])[0], self._stamp
 
@@ -71,15 +81,17 @@ class TurnedSensor:
         """Direction that points up in the last pose."""
         return self._end
 
-    def _force(self, stamp: float) -> Floats:
-        if stamp < self._since:  # it tumbles until it is turned
-            tumbling = np.array([[np.sin(2.0 * stamp), 0.4, np.cos(2.0 * stamp)]])
-            return unit(tumbling)[0]
-        share = min(1.0, (stamp - self._since) / _TURN)
+    def _forces(self, stamps: Floats) -> Floats:
+        """Return the (n, 3) force at these times."""
+        at = stamps[:, np.newaxis]
+        if not math.isfinite(self._since):  # it tumbles until it is turned
+            return unit(np.hstack([np.sin(2.0 * at), np.full_like(at, 0.4), np.cos(2.0 * at)]))
+        share = np.clip((at - self._since) / _TURN, 0.0, 1.0)
         aside = np.cross(self._start, self._end)
         between = self._start + share * (self._end - self._start) + np.sin(np.pi * share) * aside
-        force: Floats = unit(between[np.newaxis])[0]
-        return force if share == 1.0 else force * (1.0 + 0.1 * np.sin(20.0 * stamp))
+        shaken = np.where(share < 1.0, 0.1 * np.sin(20.0 * at), 0.0)
+        force: Floats = unit(between) * (1.0 + shaken)
+        return force
 
     @property
     def blocks(self) -> Iterator[Floats]:
@@ -88,15 +100,18 @@ class TurnedSensor:
         while True:
             time.sleep(0.02)
             now = time.monotonic()
-            count = int((now - last) * self.speed * _RATE)
-            last += count / (self.speed * _RATE)
+            hurries = 0.0 <= self._stamp - self._since < _TURN + _REST
+            rate = _RATE * (self.speed if hurries else 1.0)
+            count = int((now - last) * rate)
+            last += count / rate
             stamps = self._stamp + np.arange(1, count + 1) / _RATE
             rows = np.zeros((count, 9))
-            for row, stamp in zip(rows, stamps, strict=True):
-                row[0], self._stamp = 1000.0 + stamp, float(stamp)
-                row[1:4] = GRAVITY * (predict(self._model, self._force(stamp)[np.newaxis], {})[0]
-                                      + _NOISE * self._rng.normal(size=3))
-                row[7:] = 30.0, np.nan
+            if count:
+                self._stamp = float(stamps[-1])
+                noise = _NOISE * self._rng.normal(size=(count, 3))
+                rows[:, 0] = 1000.0 + stamps
+                rows[:, 1:4] = GRAVITY * (predict(self._model, self._forces(stamps), {}) + noise)
+                rows[:, 7:] = 30.0, np.nan
             yield rows[:0] if self.silent else rows
 
 
@@ -126,22 +141,20 @@ class LivePage:
         assert asked is not None
         goal = direction_of(asked.group(1))
         self.sensor.turn_to(self.sensor.up + goal)
-        page.wait_for_timeout(1000.0 * _TURN / self.sensor.speed + 300.0)
+        expect(page.locator('#ring')).to_have_attribute('data-kind', 'holding')
 
 
 def follow(page: Page, turn_to: Callable[[Floats], object], poses: int = 100) -> None:
     """Turn a sensor as the page says, until it has so many poses, or asks for the fit."""
     while True:
-        expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'),
-                                                   timeout=PATIENCE)
+        expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'))
         words = page.locator('#next').inner_text()
         count = int(page.locator('#poses').inner_text().split()[0])
         asked = _GOAL.fullmatch(words)
         if asked is None or count >= poses:
             return
         turn_to(direction_of(asked.group(1)))
-        expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'),
-                                                        timeout=PATIENCE)
+        expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'))
 
 
 def direction_of(sides: str) -> Floats:
@@ -154,7 +167,7 @@ def direction_of(sides: str) -> Floats:
 
 
 @contextmanager
-def live_page(folder: Path, *, speed: float = 6.0, name: str = 'imu_link', file: str = 'imu.yaml',
+def live_page(folder: Path, *, speed: float = 20.0, name: str = 'imu_link', file: str = 'imu.yaml',
               web_host: str = '127.0.0.1') -> Iterator[LivePage]:
     """Serve the page of a simulated sensor; the calibration is stored in this folder."""
     sensor, lines, over = TurnedSensor(speed, name), list[Log](), Event()
@@ -194,6 +207,7 @@ class Viewers:
         """Open a page in a context of its own; `script` runs before those of the page."""
         context = self._browser.new_context(
             viewport={'width': size[0], 'height': size[1]}, **options)  # type: ignore[arg-type]
+        context.set_default_timeout(PATIENCE)
         page = context.new_page()
         page.add_init_script(script)
         page.on('console', lambda line: self.complaints.append(line.text)

@@ -5,8 +5,7 @@
 
 from pathlib import Path
 
-from accel_calib.model import Model
-from accel_calib.simulate import model_with
+from inside import Model, model_with
 import numpy as np
 import pytest
 

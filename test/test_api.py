@@ -98,6 +98,9 @@ def test_a_calibration_is_stored_read_and_used_again(calibration, poses, tmp_pat
     assert isinstance(found.noise_floor_mg, float)
     assert type(found.noise_floor_mg) is float
     assert ac.compare([path, calibration]).agree
+    pytest.importorskip('matplotlib')
+    read.report(tmp_path / 'page.html')
+    assert '<svg' in (tmp_path / 'page.html').read_text(encoding='utf-8')
 
 
 def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
@@ -112,20 +115,6 @@ def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
     assert len(ac.capture(recording, min_dwell=2.0)) == 6
     with pytest.raises(InputError, match='has no still stretch'):
         ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
-
-
-def test_refine_starts_from_a_stored_calibration_and_reports(calibration, tmp_path):
-    pytest.importorskip('matplotlib')
-    rng = np.random.default_rng(4)
-    temperature = rng.uniform(15.0, 45.0, 40)
-    poses = ac.simulate({**SENSOR, 'offset_temperature': [6e-4, -4e-4, 5e-4]}, poses=40, seed=5,
-                        temperature=temperature)
-    found = ac.refine(poses, base=calibration)
-    assert isinstance(found, ac.Refinement)
-    assert 'offset_temperature' in [step.effect for step in found.steps]
-    assert isinstance(found.calibration, ac.Calibration)
-    found.calibration.report(tmp_path / 'page.html')
-    assert '<svg' in (tmp_path / 'page.html').read_text(encoding='utf-8')
 
 
 def test_records_are_shown_in_a_line_and_as_html(calibration, poses):

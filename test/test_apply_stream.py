@@ -11,10 +11,9 @@ import tracemalloc
 from typing import Any
 
 from accel_calib.calibrate import of_samples
-from accel_calib.cli.main import main
 from accel_calib.files import read_recording, write_blocks, write_calibration, write_table
-from accel_calib.files.logs import text
 from accel_calib.table import numbered, Recording
+from inside import main, ROWS_OF_A_TEXT
 import numpy as np
 import pytest
 from test_outside import calibrated
@@ -51,15 +50,14 @@ def applied(path: Path, stored: Path, out: Path) -> Path:
     return out
 
 
-@pytest.mark.parametrize('rows', [700, 4000])
-def test_blocks_give_the_same_as_the_whole(rows: int, calibration: Any, stored: Path,
+def test_blocks_give_the_same_as_the_whole(calibration: Any, stored: Path,
                                            tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                                            capsys: pytest.CaptureFixture[str]) -> None:
-    samples, path = recording(10_000), tmp_path / 'recording.csv'
+    samples, path, rows = recording(6000), tmp_path / 'recording.csv', 700
     write_table(path, samples)
     whole = read_recording(applied(path, stored, tmp_path / 'whole.csv'))
     printed = capsys.readouterr().out.replace('whole.csv', '')
-    monkeypatch.setattr(text, 'ROWS', rows)
+    monkeypatch.setattr(*ROWS_OF_A_TEXT, rows)
     blocks = read_recording(applied(path, stored, tmp_path / 'blocks.csv'))
     assert capsys.readouterr().out.replace('blocks.csv', '') == printed
     expected = calibration.correct(samples.reading, of_samples(
@@ -76,22 +74,22 @@ def test_blocks_give_the_same_as_the_whole(rows: int, calibration: Any, stored: 
 
 def test_the_memory_does_not_grow_with_the_length(stored: Path, tmp_path: Path,
                                                   monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(text, 'ROWS', 2000)
+    monkeypatch.setattr(*ROWS_OF_A_TEXT, 2000)
     path, peaks = tmp_path / 'recording.csv', []
-    for count in (8000, 40_000):
+    for count in (8000, 24_000):
         write_table(path, recording(count))
         tracemalloc.start()
         applied(path, stored, tmp_path / 'out.csv')
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0]
-    assert len(read_recording(tmp_path / 'out.csv')) == 40_000
+    assert len(read_recording(tmp_path / 'out.csv')) == 24_000
 
 
 def test_an_error_in_a_late_block_leaves_the_earlier_file(
         stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(text, 'ROWS', 1000)
+    monkeypatch.setattr(*ROWS_OF_A_TEXT, 1000)
     path, out = tmp_path / 'recording.csv', tmp_path / 'out.csv'
     write_table(path, recording(5000))
     lines = path.read_text().splitlines(keepends=True)

@@ -12,11 +12,9 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
 from accel_calib.files import correct_bag, write_calibration
-from accel_calib.files.bag import open_samples, together
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.table import Recording
 from accel_calib.units import units_of
+from inside import model_with, open_samples, simulate_poses, spread_directions, together
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
@@ -292,7 +290,7 @@ def test_a_bag_is_corrected_with_a_named_temperature(thermal: Calibration, tmp_p
 
 def test_a_calibration_that_depends_on_a_temperature_names_the_topics(
         thermal: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from accel_calib.cli.main import main
+    from inside import main
 
     path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float64', warming)})
     write_calibration(tmp_path / 'c.yaml', thermal)

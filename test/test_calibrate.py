@@ -5,9 +5,8 @@
 
 import json
 
-from accel_calib.cli.main import main
 from accel_calib.files import read_calibration
-from accel_calib.files.logs import are_samples
+from inside import are_samples, main
 import numpy as np
 import pytest
 from shared import data
@@ -45,6 +44,7 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     np.testing.assert_allclose(np.array(result['offset']) / 9.80665, OFFSET, atol=2e-3)
     stored = read_calibration(out)
     assert stored.is_levelled
+    np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
     np.testing.assert_allclose(stored.offset, result['offset'])
     page = (tmp_path / 'c.html').read_text(encoding='utf-8')
     assert 'GOOD' in page
@@ -94,49 +94,39 @@ def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):
     assert not out.exists()
 
 
-@pytest.mark.parametrize('flat', ['first', 'last', '14'])
-def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, recording, tmp_path, capsys):
+@pytest.mark.parametrize(('flat', 'row'), [('last', 13), ('3', 2)])
+def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, row, recording, tmp_path, capsys):
     out = tmp_path / 'c.yaml'
-    calibrated(capsys, recording, '-o', out, '--flat', flat)
+    calibrated(capsys, recording, '-o', out, '--flat', flat, '--no-refine')
     stored = read_calibration(out)
-    row = {'first': 0, 'last': 13}.get(flat, int(flat) - 1 if flat.isdigit() else 0)
     np.testing.assert_allclose(stored.apply(stored.poses.reading[row]), (0, 0, 9.80665), atol=0.05)
 
 
-@pytest.mark.parametrize(('command', 'rows'), [('fit', 1614), ('verify', 1614)])
-def test_fit_and_verify_capture_a_recording_first(command, rows, recording, tmp_path, capsys):
+def test_fit_and_verify_capture_a_recording_first(recording, tmp_path, capsys):
     stored = tmp_path / 'c.yaml'
     assert run('fit', recording, '-o', stored) == 0
     assert 'captured 14 poses' in capsys.readouterr().out
     assert len(read_calibration(stored).poses) == 14
-    if command == 'verify':
-        assert run('verify', recording, '-c', stored) == 0
-        assert 'captured 14 poses' in capsys.readouterr().out
-
-
-def test_verify_fails_above_the_largest_residual(recording, tmp_path, capsys):
-    stored = tmp_path / 'c.yaml'
-    assert run('fit', recording, '-o', stored) == 0
     assert run('verify', recording, '-c', stored, '--max', 10) == 0
+    assert 'captured 14 poses' in capsys.readouterr().out
     assert run('verify', recording, '-c', stored, '--max', 0.001) == 1
     assert 'GOOD' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('command', ['fit', 'verify', 'refine', 'compare', 'calibrate'])
-def test_every_command_with_a_calibration_adds_its_rating(command, tmp_path, capsys):
+def test_every_command_with_a_calibration_adds_its_rating(tmp_path, capsys):
     poses, stored = tmp_path / 'poses.csv', tmp_path / 'c.yaml'
     run('simulate', '-o', poses, '--poses', 40, *EFFECTS)
     run('fit', poses, '-o', stored)
-    arguments = {'verify': (poses, '-c', stored), 'compare': (stored, stored),
-                 'calibrate': (poses, '-o', tmp_path / 'd.yaml')}.get(command, (poses,))
-    capsys.readouterr()
-    assert run(command, *arguments, '--json', '-') == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result['rating'] == 'GOOD'
-    assert result['rating_reason']
+    for command in (('fit', poses), ('verify', poses, '-c', stored), ('refine', poses),
+                    ('compare', stored, stored)):
+        capsys.readouterr()
+        assert run(*command, '--json', '-') == 0
+        result = json.loads(capsys.readouterr().out)
+        assert result['rating'] == 'GOOD', command
+        assert result['rating_reason']
 
 
-@pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu0', 'mpu9150_imu1'])
+@pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu1'])
 def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, capsys):
     status, result, _ = calibrated(capsys, data(f'{name}.csv'), '-o', tmp_path / 'c.yaml',
                                    '--no-refine')

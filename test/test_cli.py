@@ -9,13 +9,8 @@ from pathlib import Path
 import subprocess
 import sys
 
-from accel_calib.cli.main import main, parser
-from accel_calib.cli.options import plain
-from accel_calib.cli.terminal import progress
-from accel_calib.crash import crash_words
-from accel_calib.files import read_calibration, read_poses, write_table
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import parse_effect
+from accel_calib.files import read_poses
+from inside import main, parse_effect, parser, plain_json, rotation_from_rpy
 import numpy as np
 import pytest
 
@@ -162,7 +157,7 @@ def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     folder = tmp_path / 'out'
     folder.mkdir()
     capsys.readouterr()
-    status, results = run_json(capsys, 'fit', *tables, '--jobs', 2, '-o', folder)
+    status, results = run_json(capsys, 'fit', *tables, '-o', folder)
     assert status == 2
     assert [result['file'] for result in results] == [str(table) for table in tables]
     assert 'lacks ay' in results[1]['error'] or 'lacks az' in results[1]['error']
@@ -241,19 +236,6 @@ def test_a_recording_that_never_rests_is_refused(tmp_path, capsys):
     assert 'no still stretch' in capsys.readouterr().err
 
 
-def test_a_newer_calibration_is_refused(calibration, poses, capsys):
-    calibration.write_text(calibration.read_text().replace('version: 2\n', 'version: 7\n'))
-    capsys.readouterr()
-    assert run('verify', poses, '-c', calibration) == 2
-    assert 'has version 7, expected 2 or less' in capsys.readouterr().err
-
-
-def test_stored_calibration_names_its_sensor(calibration):
-    found = read_calibration(calibration)
-    assert found.sensor == 'imu_link'
-    assert found.date[:2] == '20'
-
-
 def commands():
     return list(parser()._subparsers._group_actions[0].choices)
 
@@ -274,65 +256,36 @@ def test_wrong_arguments_exit_with_2(capsys):
     capsys.readouterr()
 
 
-def test_module_runs_as_a_process(poses):
-    done = subprocess.run([sys.executable, '-m', 'accel_calib.cli.main', 'fit', str(poses)],
-                          capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0
-    assert 'noise floor' in done.stdout
-
-
 @pytest.mark.parametrize(('arguments', 'without'), [
     (['--help'], ['numpy', 'yaml', 'rich']), (['fly'], ['numpy']),
     (['fit', '{poses}'], ['matplotlib', 'rosbags', 'accel_calib.refine', 'accel_calib.report'])])
 def test_only_what_is_used_is_imported(arguments, without, poses):
-    code = ('import sys\nfrom accel_calib.cli.main import main\n'
+    code = (f'import sys\nfrom {main.__module__} import main\n'
             'try:\n    main()\nexcept SystemExit:\n    pass\n'
             'print(*sys.modules, file=sys.stderr)')
     done = subprocess.run([sys.executable, '-c', code, *(
         argument.format(poses=poses) for argument in arguments)], capture_output=True, text=True,
-        timeout=60, check=True)
+        check=True)
+    assert ('noise floor' in done.stdout) is (arguments[0] == 'fit')
     assert not set(without) & set(done.stderr.split())
-    assert 'accel_calib.cli.main' in done.stderr
-
-
-@pytest.mark.parametrize('terminal', [True, False])
-def test_progress_is_shown_only_on_a_terminal(terminal, monkeypatch, capsys):
-    monkeypatch.setenv('TERM', 'xterm')
-    monkeypatch.setattr(sys.stderr, 'isatty', lambda: terminal)
-    with progress('samples') as update:
-        update(500, 1000)
-    shown = capsys.readouterr()
-    assert shown.out == ''
-    assert ('500 of 1,000 samples' in shown.err) is terminal
-    assert shown.err or not terminal
+    assert main.__module__ in done.stderr.split()
 
 
 def test_json_holds_no_nan():
-    assert plain({'a': np.array([1.0, np.nan]), 'b': (np.inf, None)}) == {
+    assert plain_json({'a': np.array([1.0, np.nan]), 'b': (np.inf, None)}) == {
         'a': [1.0, None], 'b': [None, None]}
 
 
-def test_outlier_is_reported_with_its_row(poses, capsys):
-    table = read_poses(poses)
-    reading = table.reading.copy()
-    reading[6] *= 1.05
-    write_table(poses, table.with_columns(reading=reading))
-    _, result = run_json(capsys, 'fit', poses)
-    assert [rejected['row'] for rejected in result['poses_rejected']] == [7]
-    assert 'outlier' in result['poses_rejected'][0]['reason']
-
-
-@pytest.mark.parametrize('jobs', [1, 2])
-def test_files_of_the_current_folder_are_never_run(jobs, tmp_path, monkeypatch, capsys):
+def test_files_of_the_current_folder_are_never_run(tmp_path):
     for name in ('one.csv', 'two.csv'):
         run('simulate', '-o', tmp_path / name)
     for name in ('pickle', 'numpy', 'multiprocessing', 'select', 'queue', 'accel_calib'):
         (tmp_path / f'{name}.py').write_text('open("run", "w").close()\nraise SystemExit(9)\n')
     code = ('import sys; sys.path[:] = filter(None, sys.path)\n'
-            'from accel_calib.cli.main import main; sys.exit(main())')
+            f'from {main.__module__} import main; sys.exit(main())')
     done = subprocess.run([sys.executable, '-c', code, 'fit', 'one.csv', 'two.csv', '--jobs',
-                           str(jobs), '--json', '-'], cwd=tmp_path, capture_output=True, text=True,
-                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+                           '2', '--json', '-'], cwd=tmp_path, capture_output=True, text=True,
+                          check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
     assert done.returncode == 0, done.stderr
     assert [each['rating'] for each in json.loads(done.stdout)] == ['GOOD', 'GOOD']
     assert not (tmp_path / 'run').exists()
@@ -342,8 +295,7 @@ def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, 
     def break_(*given, **options):
         raise ValueError('of two\nlines')
 
-    monkeypatch.setattr('accel_calib.cli.main.crash_words', crash_words)
-    monkeypatch.setattr('accel_calib.cli.simulate.simulate', break_)
+    monkeypatch.setattr('numpy.random.default_rng', break_)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
     assert run('simulate', '-o', tmp_path / 'x.csv') == 2
     error = capsys.readouterr().err

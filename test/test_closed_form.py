@@ -5,11 +5,10 @@
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate.closed_form import closed_form, faces, fit_12
-from accel_calib.model import MODELS, predict
-from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.estimate import closed_form, faces, fit_12
 from accel_calib.table import Poses
 from accel_calib.units import units_of
+from inside import MODELS, predict, random_directions, spread_directions
 import numpy as np
 import pytest
 from shared import sensor

@@ -7,17 +7,23 @@ from dataclasses import replace
 import json
 
 from accel_calib.calibrate import fit_poses, level
-from accel_calib.cli.main import main
 from accel_calib.compare import compare, history_of
-from accel_calib.compare.parameters import NAMES, rotation_free, Runs
 from accel_calib.errors import InputError
-from accel_calib.estimate.fit import estimate
+from accel_calib.estimate import estimate
 from accel_calib.files import write_calibration
-from accel_calib.model import Model
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import Units, units_of
+from inside import (
+    main,
+    Model,
+    model_with,
+    PARAMETER_NAMES,
+    random_directions,
+    rotation_free,
+    rotation_from_rpy,
+    Runs,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 from shared import sensor
@@ -46,7 +52,7 @@ def with_offset(model, axis, change):
     return model_with({**model.values, 'offset': offset})
 
 
-@pytest.mark.parametrize(('count', 'sets'), [(2, 60), (5, 20)])
+@pytest.mark.parametrize(('count', 'sets'), [(2, 30), (5, 10)])
 @pytest.mark.parametrize('measured', [True, False])
 def test_runs_of_one_sensor_agree(count, sets, measured):
     alarms = 0
@@ -65,7 +71,7 @@ def test_the_spread_of_twenty_runs_matches_their_uncertainty():
     assert found.agree
     assert found.dof == 19 * 9
     assert found.chi2 == pytest.approx(found.dof, rel=0.4)
-    assert tuple(one.name for one in found.parameters) == NAMES
+    assert tuple(one.name for one in found.parameters) == PARAMETER_NAMES
     assert np.mean([one.ratio for one in found.parameters]) == pytest.approx(1.0, abs=0.2)
     assert np.mean([run.rms_mg / run.expected_mg for run in found.runs]) == pytest.approx(
         1.0, abs=0.2)
@@ -128,7 +134,7 @@ def test_slope_of_the_rotation_free_parameters_is_their_derivative():
 @pytest.mark.parametrize(('first', 'second'), [('9', '10'), ('12', '10'), ('12', '9')])
 def test_models_with_other_axes_agree(first, second):
     alarms = 0
-    for seed in range(10):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
         runs = []
@@ -163,7 +169,7 @@ def test_smaller_models_agree_where_they_are_right():
 
 def test_runs_with_different_models_by_auto_agree():
     alarms, models = 0, set()
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         model = sensor(rng)
         model = model_with({**model.values, 'cross_axis': 0.03 * model.values['cross_axis']})
@@ -171,7 +177,7 @@ def test_runs_with_different_models_by_auto_agree():
         models |= {run.name for run in runs}
         alarms += not compare(runs).agree
     assert models >= {'7', '10'}
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one():

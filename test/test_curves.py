@@ -16,14 +16,23 @@ from accel_calib.effects import (
     VARIABLES,
 )
 from accel_calib.errors import StoredCalibrationError
-from accel_calib.files.calibration_yaml import format_calibration, parse_calibration
-from accel_calib.model import correct, Model, parameter_basis, parameter_names, predict
 from accel_calib.refine import refine
-from accel_calib.refine.curves import best_curve, is_curve
-from accel_calib.refine.state import beginning, fitted_state
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions
 from accel_calib.units import units_of
+from inside import (
+    beginning,
+    best_curve,
+    correct,
+    fitted_state,
+    format_calibration,
+    is_curve,
+    Model,
+    parameter_basis,
+    parameter_names,
+    parse_calibration,
+    predict,
+    random_directions,
+    simulate_poses,
+)
 import numpy as np
 import pytest
 from shared import sensor
@@ -144,15 +153,14 @@ def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
     np.testing.assert_array_equal(added[:, 1:], 0.0)
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_curve_is_recovered_within_its_uncertainty(seed):
+def test_a_curve_is_recovered_within_its_uncertainty():
     def form(temperature):
         share = (temperature - low) / (high - low)
         return 5e-3 * np.cos(2.0 * np.pi * share) - 4e-3 * np.cos(5.0 * np.pi * share)
 
-    warm = with_curve(np.zeros_like, seed)[0]['temperature']
+    warm = with_curve(np.zeros_like)[0]['temperature']
     low, high = np.min(warm), np.max(warm)
-    poses, truth = with_curve(form, seed)
+    poses, truth = with_curve(form)
     state = base_of(poses)
     curve = best_curve(state, poses, ())
     carrier, variable, modes = empirical_parts(curve.name)
@@ -169,9 +177,14 @@ def test_a_curve_is_recovered_within_its_uncertainty(seed):
     assert np.max(deviation) < 5e-4
 
 
-def test_a_hump_over_the_temperature_is_located_and_described():
-    poses, _ = with_curve(hump)
-    found = refine(poses, G, base='10')
+@pytest.fixture(scope='module')
+def described():
+    """Return the refinement of poses with a hump."""
+    return refine(with_curve(hump)[0], G, base='10')
+
+
+def test_a_hump_over_the_temperature_is_located_and_described(described):
+    found = described
     assert found.verdict == 'described'
     assert [step.effect for step in found.steps] == ['empirical']
     step = found.steps[0]
@@ -183,22 +196,21 @@ def test_a_hump_over_the_temperature_is_located_and_described():
 
 
 def test_noise_alone_has_no_curve():
-    for seed in range(5):
+    for seed in range(2):
         poses, _ = with_curve(np.zeros_like, seed)
         assert best_curve(base_of(poses), poses, ()) is None
 
 
 def test_poses_that_repeat_badly_have_no_curve():
-    for seed in range(5):
+    for seed in range(2):
         poses, _ = with_curve(np.zeros_like, seed)
         scatter = 2e-3 * np.random.default_rng(seed).normal(size=(COUNT, 3))
         poses = poses.with_columns(reading=poses.reading + scatter)
         assert best_curve(base_of(poses), poses, ()) is None
 
 
-def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits():
-    poses, _ = with_curve(hump)
-    calibration = refine(poses, G, base='10').calibration
+def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described):
+    calibration = described.calibration
     name = next(name for name in calibration.model.values if is_curve(name))
     text = format_calibration(calibration)
     found = parse_calibration(text, 'calibration.yaml')
@@ -210,9 +222,8 @@ def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits():
     np.testing.assert_array_equal(found.correct(reading, at), calibration.correct(reading, at))
 
 
-def test_a_stored_curve_with_an_impossible_name_is_refused():
-    poses, _ = with_curve(hump)
-    calibration = refine(poses, G, base='10').calibration
+def test_a_stored_curve_with_an_impossible_name_is_refused(described):
+    calibration = described.calibration
     name = next(name for name in calibration.model.values if is_curve(name))
     text = format_calibration(calibration).replace(name, name.replace('temperature', 'weather'))
     with pytest.raises(StoredCalibrationError, match='is damaged .* expected a whole calibration'):

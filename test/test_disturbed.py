@@ -5,11 +5,9 @@
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import RefusedFitError
-from accel_calib.model import Model
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.table import Poses
 from accel_calib.units import units_of
+from inside import Model, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import sensor
@@ -31,17 +29,15 @@ def left_out(poses, **settings):
 
 
 def test_two_knocked_poses_of_twelve_are_found_with_few_clean_poses_lost():
-    clean = [len(left_out(knocked(seed, 12, 2)) - {1, 2}) for seed in range(40)]
-    assert np.count_nonzero(clean) <= 6
+    clean = [len(left_out(knocked(seed, 12, 2)) - {1, 2}) for seed in range(20)]
+    assert np.count_nonzero(clean) <= 3
 
 
 @pytest.mark.parametrize('count', [36, 400])
 def test_underestimated_noise_makes_no_outliers(count):
-    thrown = []
-    for seed in range(10):
+    for seed in range(3):
         poses = knocked(seed, count, 0)
-        thrown.append(len(left_out(poses.with_columns(std=poses['std'] / 3.0))))
-    assert sum(thrown) <= 1
+        assert not left_out(poses.with_columns(std=poses['std'] / 3.0))
 
 
 @pytest.mark.parametrize('count', [100, 400])
@@ -77,7 +73,7 @@ def lacking(seed, count, effect):
 @pytest.mark.parametrize('apart', [0.0, 2e-7])
 @pytest.mark.parametrize('measured', [True, False])
 def test_copies_of_a_pose_make_no_pose_an_outlier(copies, measured, apart):
-    for seed in range(10):
+    for seed in range(3):
         poses = lacking(seed, 12, 'offset_temperature')
         poses = Poses({key: poses[key] for key in ('reading', 'std', 'count')[:3 if measured
                                                                               else 1]}, poses.row)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The commands of the documentation run.
+The commands and the snippets of the documentation run.
 
-Every command ``accel-calib`` in a fenced block ``sh`` or ``console`` is run, in the order of the
-page and in one temporary folder. A file that a command reads is one of `FILES`, or the page names
-the sample of ``test/data/logs`` that it is::
+Every command ``accel-calib`` in an indented block, or in a fenced block ``sh`` or ``console``, is
+run, in the order of the page and in one temporary folder. A file that a command reads is one of
+`FILES`, or the page names the sample of ``test/data/logs`` that it is::
 
     <!-- files: log.csv=esp32/counts.log -->
 
@@ -17,16 +17,16 @@ test_live_command.py run them.
 """
 
 from dataclasses import dataclass
+import itertools
 from pathlib import Path
 import re
 import shlex
 import shutil
+from tempfile import TemporaryDirectory
 
 import accel_calib as ac
-from accel_calib.cli.main import COMMANDS, main
 from accel_calib.files import write_table
-from accel_calib.simulate import model_with, simulate_recording
-from accel_calib.sphere import spread_directions
+from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from test_bag import write_bag
@@ -54,8 +54,10 @@ def blocks_of(text):
     files = dict(item.split('=') for found in re.findall(r'<!-- files: (.*?) -->', text)
                  for item in found.split())
     blocks = []
-    pattern = r'(?:<!-- status: (\d) -->\s*)?^```(?:sh|console)\n(.*?)^```'
-    for status, body in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+    pattern = (r'(?:<!-- status: (\d) -->\s*)?^```(?:sh|console)\n(.*?)^```'
+               r'|((?:^ {4,}accel-calib .*\n)+)')
+    for status, fenced, indented in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+        body = fenced or re.sub('(?m)^ +', '', indented)
         lines = body.replace('\\\n', ' ').splitlines()
         commands = [shlex.split(line.removeprefix('$ '), comments=True) for line in lines
                     if re.match(r'(\$ )?accel-calib ', line)]
@@ -78,6 +80,12 @@ def bag(path):
         turn=0.8, temperatures=(24.0, 31.0)))
 
 
+def bag_file(path):
+    with TemporaryDirectory() as folder:
+        bag(Path(folder) / 'bag')
+        next(Path(folder).rglob('*.mcap')).rename(path)
+
+
 def calibration(seed):
     return lambda path: ac.fit(poses(seed), flat=1).save(path)
 
@@ -92,6 +100,7 @@ def fleet(folder):
 
 FILES = {
     'recording': bag,
+    'recording.mcap': bag_file,
     'recordings/': fleet,
     'recording.csv': lambda path: write_table(path, recording(poses=14, seed=9)),
     'poses.csv': lambda path: write_table(path, poses(8)),
@@ -125,27 +134,46 @@ def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
 
 def run(words):
     """Run a command; return its exit status, also where it exits by itself."""
-    for name in set(words) & set(FILES):
-        if words[words.index(name) - 1] not in {'-o', '--output'} and not Path(name).exists():
-            FILES[name](Path(name))
+    for before, name in itertools.pairwise(words):
+        if before not in {'-o', '--output'}:
+            provide(name)
+    if 'report' in words or '--report' in words:
+        pytest.importorskip('matplotlib')
     try:
         return main(words)
     except SystemExit as exit_:
         return exit_.code
 
 
+def provide(name):
+    """Write one of the files that pages name, if it is missing."""
+    if name in FILES and not Path(name).exists():
+        FILES[name](Path(name))
+
+
+@pytest.mark.parametrize('page', [
+    page for page in PAGES if '```python' in text_of(page)
+    and page not in {'docs/api.md', 'docs/fleet.md'}])  # signatures; test_fleet.py runs it
+def test_snippets_of_python_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in re.findall(r"'([\w./]+)'", text_of(page)):
+        provide(name)
+    names = {}
+    for snippet in re.findall(r'^```python\n(.*?)^```', text_of(page), re.MULTILINE | re.DOTALL):
+        exec(compile(snippet, page, 'exec'), names)
+
+
 def test_every_command_without_ros_is_run_by_a_page():
     run_ = {words[0] for page in PAGES for block in blocks_of(text_of(page))[1]
             for words in block.commands}
-    indented = {line.split()[0] for page in PAGES
-                for line in re.findall(r'^ {4,}accel-calib (.*)', text_of(page), re.MULTILINE)}
-    assert set(COMMANDS) - OF_ROS <= run_ | indented
+    assert set(COMMANDS) - OF_ROS <= run_
 
 
 def test_commands_are_found_in_blocks_with_prompts_and_continued_lines():
     files, blocks = blocks_of('<!-- files: a.csv=esp32/a.log b.csv=c/d.log -->\n```console\n'
                               '$ accel-calib fit \\\n    a.csv  # a comment\noutput\n```\n'
                               '<!-- status: 1 -->\n\n```sh\npip install x\naccel-calib x "b c"\n'
-                              '```\n```python\naccel-calib no\n```\n')
+                              '```\n```python\naccel-calib no\n```\n'
+                              '1. Run it:\n\n       accel-calib y  # z\n\nText.\n')
     assert files == {'a.csv': 'esp32/a.log', 'b.csv': 'c/d.log'}
-    assert blocks == [Block([['fit', 'a.csv']], 0), Block([['x', 'b c']], 1)]
+    assert blocks == [Block([['fit', 'a.csv']], 0), Block([['x', 'b c']], 1), Block([['y']], 0)]

@@ -38,17 +38,6 @@ def test_the_drawn_poses_are_twelve_directions_that_determine_the_largest_model(
     assert np.degrees(np.arccos(cosines.max())) > 30.0
 
 
-@pytest.mark.parametrize('axis', range(3))
-@pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_the_side_that_points_up_is_on_top_of_the_drawing(pictures, axis, sign):
-    up = np.zeros(3)
-    up[axis] = sign
-    mat_ws = pictures._attitude(up)
-    np.testing.assert_allclose(mat_ws @ up, [0.0, 0.0, 1.0], atol=1e-12)
-    assert np.linalg.det(mat_ws) == pytest.approx(1.0)
-    assert pictures._seen(mat_ws @ up)[1] < pictures._seen(np.zeros(3))[1]
-
-
 def test_terminals_show_what_the_commands_print(pictures, tmp_path):
     pictures.prepare(tmp_path)
     for name, commands in pictures.TERMINALS.items():
@@ -56,15 +45,6 @@ def test_terminals_show_what_the_commands_print(pictures, tmp_path):
         stored = (FOLDER / f'{name}.svg').read_text('utf-8')
         assert without_numbers(pictures.shown_text(stored)) == without_numbers(
             pictures.shown_text(drawn)), RUN_AGAIN
-
-
-def test_lines_of_a_terminal_appear_one_after_the_other(pictures):
-    lines = [pictures.Line('first', 0.5), pictures.Line('\x1b[1msecond\x1b[0m', 1.25)]
-    svg = pictures.terminal_svg('verify', lines)
-    shown = re.findall(r'animation-delay:([\d.]+)s[^>]*>([^<]+)<', svg)
-    assert [(float(at), text.strip()) for at, text in shown if text.strip()] == [
-        (0.5, 'first'), (1.25, 'second')]
-    assert 'prefers-reduced-motion' in svg
 
 
 @pytest.mark.parametrize('path', sorted(FOLDER.iterdir()), ids=lambda path: path.name)

@@ -42,17 +42,13 @@ def test_recording_is_calibrated_from_end_to_end(tmp_path):
     assert output.endswith('Corrected force in the flat pose [g]: [0. 0. 1.]\n')
 
 
-def test_error_falls_from_model_to_model(tmp_path):
-    output = output_of('error_surfaces.py', tmp_path)
+def test_error_falls_from_model_to_model_and_is_drawn(tmp_path):
+    pytest.importorskip('matplotlib')
+    paths = [tmp_path / name for name in ('surfaces.svg', 'surfaces.png')]
+    output = output_of('error_surfaces.py', tmp_path, *paths)
     largest = [float(value) for value in re.findall(r'largest error (\S+) mg', output)]
     # Figures 1 to 4 of AN5286: about 50, 10, 5 and 2.5 mg.
     np.testing.assert_allclose(largest, [50.0, 10.0, 5.0, 2.5], rtol=0.1)
-
-
-def test_error_surfaces_are_drawn(tmp_path):
-    pytest.importorskip('matplotlib')
-    paths = [tmp_path / name for name in ('surfaces.svg', 'surfaces.png')]
-    output_of('error_surfaces.py', tmp_path, *paths)
     assert '<svg' in paths[0].read_text(encoding='utf-8')
     assert paths[1].read_bytes().startswith(b'\x89PNG')
 

@@ -5,13 +5,10 @@
 
 from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.estimate.closed_form import lower_triangular, sensing_axes
-from accel_calib.model import predict
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.estimate import lower_triangular, sensing_axes
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
+from inside import predict, random_directions, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import sensor
@@ -47,8 +44,8 @@ def test_stated_deviations_contain_the_truth(name, effects):
 def test_auto_takes_the_model_that_the_sensor_has(model):
     effects = {'4': ('offset', 'gain'), '7': ('offset', 'axis_gain'),
                '10': ('offset', 'axis_gain', 'cross_axis')}[model]
-    names = [fit_poses(simulated(seed, 20, *effects)[1], G).name for seed in range(20)]
-    assert names.count(model) >= 17
+    names = [fit_poses(simulated(seed, 20, *effects)[1], G).name for seed in range(12)]
+    assert names.count(model) >= 10
 
 
 def test_auto_states_the_reason_for_its_choice():
@@ -106,7 +103,7 @@ def test_known_orientation_shows_the_rotation_of_the_axes():
 @pytest.mark.parametrize(('count', 'limit_mg'), [(12, 0.33), (36, 0.2)])
 def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
     found, errors = 0, []
-    for seed in range(20):
+    for seed in range(10):
         model, poses = simulated(seed, count)
         rng = np.random.default_rng(seed)
         reading = poses.reading.copy()
@@ -116,13 +113,13 @@ def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
         fresh = random_directions(300, rng)
         force = calibration.correct(predict(model, fresh, {}))
         errors.append(np.std(np.linalg.norm(force, axis=1)) * 1e3)
-    assert found >= 19
+    assert found == 10
     assert np.median(errors) <= limit_mg
 
 
 def test_clean_poses_are_all_kept():
-    kept = [not fit_poses(simulated(seed, 24)[1], G, model='10').rejected for seed in range(40)]
-    assert sum(kept) >= 38
+    kept = [not fit_poses(simulated(seed, 24)[1], G, model='10').rejected for seed in range(20)]
+    assert sum(kept) >= 19
 
 
 def test_algebraic_keeps_every_row():
@@ -261,14 +258,14 @@ def error_mg(calibration, model):
 @pytest.mark.parametrize('model', ['auto', '12'])
 def test_badly_placed_orientations_are_replaced_by_a_fit_of_the_norm(model):
     found, errors, turned = [], [], []
-    for seed in range(20):
+    for seed in range(8):
         truth, poses = placed(seed, 2.0)
         calibration = fit_poses(poses, G, model=model)
         found.append(calibration.name)
         errors.append(error_mg(calibration, truth))
         across = calibration.correct(predict(truth, np.eye(3), {}))
         turned.append(np.degrees(np.max(np.abs(across - across.T)) / 2))
-    assert found == ['10'] * 20
+    assert found == ['10'] * 8
     assert 'uses only |force| = 1 g' in calibration.warnings[0]
     assert '° (RMS) from a fit' in calibration.reason
     assert np.median(errors) < 0.4
@@ -287,8 +284,8 @@ def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
 
 @pytest.mark.parametrize('noise_g', [0.0003, 0.003, 0.03])
 def test_well_placed_orientations_are_used(noise_g):
-    names = [fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name for seed in range(30)]
-    assert names == ['12'] * 30
+    names = [fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name for seed in range(10)]
+    assert names == ['12'] * 10
 
 
 def test_six_faces_alone_warn_of_their_placement():
@@ -322,7 +319,7 @@ def test_force_covariance_is_that_of_repeated_fits():
     model, _ = simulated(17, 14)
     reading = predict(model, force, {})
     fits = []
-    for seed in range(150):
+    for seed in range(80):
         rng = np.random.default_rng(1000 + seed)
         fits.append(fit_poses(simulate_poses(model, spread_directions(14), rng), G, model='10'))
     scatter = np.cov(np.vstack([fit.correct(reading) for fit in fits]).T)

@@ -5,21 +5,21 @@
 import re
 
 from accel_calib.calibrate import fit_poses, next_pose
-from accel_calib.calibrate.pose_planning import determines, missing_poses, refuse_if_unfit
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate.geometry import (
-    dilution,
-    error_left_in,
-    identifiability,
-    poses_needed,
-    rows_of,
-)
-from accel_calib.model import predict
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
+from accel_calib.estimate import dilution, error_left_in, identifiability, poses_needed, rows_of
 from accel_calib.table import Poses
 from accel_calib.units import Units, units_of
+from inside import (
+    determines,
+    missing_poses,
+    model_with,
+    predict,
+    random_directions,
+    refuse_if_unfit,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 from shared import sensor
@@ -191,7 +191,7 @@ def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, ope
 def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, directions):
     rng, errors = np.random.default_rng(11), []
     fresh = random_directions(300, rng)
-    for _ in range(150):
+    for _ in range(100):
         model = model_with({'axis_gain': rng.normal(size=3) * (0.003 if smaller == '4' else 0.0),
                             'cross_axis': rng.normal(size=3) * 0.002})
         poses = simulate_poses(model, directions, rng, noise_g=1e-7)

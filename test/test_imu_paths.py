@@ -6,7 +6,7 @@ Serialized Imu messages against the typed path, with extreme values in every fie
 
 Both paths correct the same random messages: `Rewriter` their bytes, `corrected` the numbers that
 another reader (`struct`) takes from them. The number of messages is the variable IMU_MESSAGES,
-2,000 by default. Bytes that are no message never raise anything but an error of this package.
+800 by default. Bytes that are no message never raise anything but an error of this package.
 
 """
 
@@ -22,14 +22,12 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.files import read_calibration
-from accel_calib.messages.correction import corrected, output_frame, Rewriter
-from accel_calib.messages.layout import joined, layout_of
-from accel_calib.model import Model
-from accel_calib.rotations import rotation_from_rpy
+from accel_calib.messages import corrected, joined, layout_of, output_frame, Rewriter
+from inside import Model, rotation_from_rpy
 import numpy as np
 import pytest
 
-COUNT = int(os.environ.get('IMU_MESSAGES', '2000'))
+COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 GRAVITY = 9.80665
 QUATERNION, RATE, FORCE = slice(0, 4), slice(13, 16), slice(25, 28)
 COVARIANCES = slice(4, 13), slice(16, 25), slice(28, 37)

@@ -20,7 +20,8 @@ import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from accel_calib.session.settings import CalibratorSettings, default_of, WEB_PORT
+from accel_calib.session import CalibratorSettings, WEB_PORT
+from inside import default_of
 import pytest
 
 ROOT = Path(__file__).parent.parent

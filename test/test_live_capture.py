@@ -15,13 +15,22 @@ from accel_calib.calibrate import fit_poses, level
 from accel_calib.capture import CaptureSettings, Dwell, poses_from
 from accel_calib.files import read_calibration
 from accel_calib.session import CalibratorSettings
-from accel_calib.session.active_calibration import ActiveCalibration, rest_after
-from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
-from accel_calib.session.work import fitted, plan_for
-from accel_calib.simulate import model_with, simulate_poses, simulate_recording
-from accel_calib.sphere import spread_directions
 from accel_calib.table import Poses
 from accel_calib.units import units_of
+from inside import (
+    ActiveCalibration,
+    dwells_of,
+    fitted,
+    LiveCapture,
+    model_with,
+    plan_for,
+    PoseBook,
+    rest_after,
+    simulate_poses,
+    simulate_recording,
+    spread_directions,
+    with_temperature,
+)
 import numpy as np
 import pytest
 
@@ -33,13 +42,13 @@ Readings = Callable[..., Any]
 
 
 def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: float = 50.0,
-             capture: bool = True, omega: Any = None) -> list[Any]:
+             capture: bool = True, omega: Any = None, block: int = 5) -> list[Any]:
     """Push readings in small blocks, and return the changes."""
     samples = np.full((len(readings), 9), np.nan)
     samples[:, 0], samples[:, 1:4] = start + np.arange(len(readings)) / rate, readings
     if omega is not None:
         samples[:, 4:7] = omega
-    blocks = np.array_split(samples, max(1, len(samples) // 5))
+    blocks = np.array_split(samples, max(1, len(samples) // block))
     return [change for block in blocks for change in live.push(block, capture)]
 
 
@@ -66,9 +75,9 @@ def test_provisional_poses_are_replaced_by_their_final_average(readings: Reading
     assert np.all(np.diff(live.book.poses()['time']) > 1.5)
 
 
-@pytest.mark.parametrize('dwell', [1.5, 3.0, 10.0])
-@pytest.mark.parametrize('turn', [0.2, 1.0, 5.0])
-@pytest.mark.parametrize('rate', [25.0, 400.0])
+@pytest.mark.parametrize(('rate', 'turn', 'dwell'), [
+    (25.0, 0.2, 1.5), (25.0, 5.0, 3.0), (25.0, 1.0, 10.0), (400.0, 0.2, 3.0), (400.0, 1.0, 1.5),
+    (400.0, 5.0, 1.5)])
 def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate: float) -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     recording = simulate_recording(
@@ -255,18 +264,19 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(
     rng = np.random.default_rng(1)
     counts, left_at = [], 0.0
     base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
-    for k in range(0, 4 * 5000, 4):  # at 4 Hz; the offset begins to change after 2500 s
-        time = (k + np.arange(4)) / 4.0
-        shift = GRAVITY * 0.000003 * np.maximum(0.0, time - 2500.0)
-        readings = base + 0.01 * rng.normal(size=(4, 3)) + shift[:, np.newaxis] * [0.0, 0.0, 1.0]
-        for change in push_all(live, readings, start=time[0], rate=4.0, capture=False):
+    for k in range(0, 4 * 2000, 40):  # at 4 Hz; the offset begins to change after 1000 s
+        time = (k + np.arange(40)) / 4.0
+        shift = GRAVITY * 0.00001 * np.maximum(0.0, time - 1000.0)
+        readings = base + 0.01 * rng.normal(size=(40, 3))
+        readings[:, 2] += shift
+        for change in push_all(live, readings, start=time[0], rate=4.0, capture=False, block=40):
             if change.rest is not None:
                 active.update(change.rest, 0.001)
         if active.drift is not None and active.drift.change is not None:
             left_at = left_at or time[0]
         counts.append(0 if active.drift is None else active.drift.count)
-    assert max(counts) > 12
-    assert 2500.0 < left_at < 4500.0
+    assert max(counts) >= 5  # long rests are compared in parts of 5 minutes
+    assert 1000.0 < left_at < 1800.0
 
 
 def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:

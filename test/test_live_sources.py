@@ -9,13 +9,13 @@ from pathlib import Path
 import time
 
 from accel_calib.errors import InputError
-from accel_calib.files import LogOptions
-from accel_calib.files.logs.read import read_log
-from accel_calib.live.sources import is_port, open_source
+from accel_calib.files import LogOptions, read_log
 from accel_calib.table import Floats
+from inside import CLOCK_OF_A_SOURCE, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT
 import numpy as np
 import pytest
 from serial_board import board
+from viewer import wait
 
 RATE_HZ = 200.0
 
@@ -50,6 +50,12 @@ def numbers(reading: Sequence[float]) -> str:
     return ','.join(f'{part:.5f}' for part in reading)
 
 
+@pytest.fixture(autouse=True)
+def short_head(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a port be understood after a moment, except where its rate is measured."""
+    monkeypatch.setattr(*HEAD_OF_A_PORT, 0.3)
+
+
 def test_lines_of_a_board_become_samples_with_their_times_and_temperature() -> None:
     reading = readings(4000)
     with board(paced(lambda k: f'{5 * k},{numbers(reading[k])},24.5\n')) as port:
@@ -58,7 +64,7 @@ def test_lines_of_a_board_become_samples_with_their_times_and_temperature() -> N
         with open_source(port, options) as source:
             assert source.units.name == 'g'
             assert 'ms' in source.read_as
-            found = samples(source.blocks, 700)
+            found = samples(source.blocks, 300)
     assert np.allclose(np.diff(found[:, 0]), 0.005)
     first = round(found[0, 0] / 0.005)
     np.testing.assert_allclose(found[:, 1:4], reading[first:first + len(found)], atol=1e-5)
@@ -74,12 +80,12 @@ def test_boot_messages_and_garbled_lines_are_skipped() -> None:
             return f'rst:0x1 (POWERON_RESET), boot {k}\r\n'
         if k == 5:
             return 'time_ms;accX;accY;accZ;gyroX_dps;gyroY_dps;gyroZ_dps\r\n'
-        if k in (300, 450):
+        if k in (200, 250):
             return f'{5 * k};0.0\x00\x81;\r\n'
         return f'{5 * k};{numbers(reading[k]).replace(",", ";")};0.1;0.2;0.3\r\n'
 
     with board(paced(line)) as port, open_source(port, LogOptions()) as source:
-        found = samples(source.blocks, 600)
+        found = samples(source.blocks, 300)
     assert np.isfinite(found[:, :7]).all()
     np.testing.assert_allclose(found[:, 4:7], np.tile(np.radians([0.1, 0.2, 0.3]),
                                                       (len(found), 1)))
@@ -87,12 +93,13 @@ def test_boot_messages_and_garbled_lines_are_skipped() -> None:
         np.diff(found[:, 0]), 6)
 
 
-def test_lines_without_times_get_the_measured_rate() -> None:
+def test_lines_without_times_get_the_measured_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
     reading = readings(4000)
     with board(paced(lambda k: f'{numbers(reading[k])}\n')) as port, open_source(
             port, LogOptions()) as source:
         assert '(measured)' in source.read_as
-        found = samples(source.blocks, 600)
+        found = samples(source.blocks, 450)
     assert np.mean(np.diff(found[:, 0])) == pytest.approx(1.0 / RATE_HZ, rel=0.1)
 
 
@@ -100,13 +107,13 @@ def test_a_stated_rate_is_used_for_lines_without_times() -> None:
     with board(paced(lambda k: f'{numbers(readings(1)[0])}\n')) as port, open_source(
             port, LogOptions(rate=100.0)) as source:
         assert '100 Hz (stated)' in source.read_as
-        found = samples(source.blocks, 500)
+        found = samples(source.blocks, 150)
     np.testing.assert_allclose(np.diff(found[:, 0]), 0.01)
 
 
 def test_bytes_at_another_baud_rate_are_refused_with_that_advice(
         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('accel_calib.live.sources._PATIENCE_S', 3.0)
+    monkeypatch.setattr(*PATIENCE_OF_A_PORT, 1.0)
     noise = np.random.default_rng(2).integers(128, 255, size=(4000, 30), dtype=np.uint8)
     with (board(paced(lambda k: noise[k].tobytes().decode('latin-1') + '\n')) as port,
           pytest.raises(InputError, match='baud rate 9600'),
@@ -127,10 +134,7 @@ def test_a_port_that_is_removed_is_waited_for_and_read_again(tmp_path: Path) -> 
         assert source.problem() == ''
         port.unlink()
         first.close()
-        ends = time.monotonic() + 5.0
-        while not source.problem():
-            next(source.blocks)
-            assert time.monotonic() < ends
+        wait(lambda: source.problem() or next(source.blocks) is None)
         assert 'connect the sensor again' in source.problem()
         with board(paced(line)) as second:
             port.symlink_to(second)
@@ -144,10 +148,10 @@ def test_a_number_that_is_too_large_costs_one_line() -> None:
     reading = readings(4000)
 
     def line(k: int) -> str:
-        return f'{5 * k},0.0,1e300,1.0\n' if k == 600 else f'{5 * k},{numbers(reading[k])}\n'
+        return f'{5 * k},0.0,1e300,1.0\n' if k == 200 else f'{5 * k},{numbers(reading[k])}\n'
 
     with board(paced(line)) as port, open_source(port, LogOptions()) as source:
-        found = samples(source.blocks, 800)
+        found = samples(source.blocks, 300)
     assert np.abs(found[:, 1:4]).max() < 2.0
 
 
@@ -157,21 +161,35 @@ def test_a_port_that_does_not_exist_is_refused_in_one_line() -> None:
         pass
 
 
-def test_a_recording_is_played_in_real_time(tmp_path: Path) -> None:
-    reading = readings(400)
+class Clock:
+    """A clock that only sleeping advances."""
+
+    now = 50.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def test_a_recording_is_played_in_real_time(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, clock = readings(400), Clock()
     path = tmp_path / 'recording.csv'
     stamps = np.arange(400) / RATE_HZ
     stamps[300:] += 1000.0
     np.savetxt(path, np.column_stack([stamps, reading]), delimiter=',', header='time,ax,ay,az',
                comments='')
     assert not is_port(str(path))
-    with open_source(str(path), LogOptions(units='g'), speed=2.0) as source:
-        begin = time.monotonic()
-        arrivals = [(time.monotonic() - begin, len(block), block) for block in source.blocks]
-    found = np.concatenate([block for _, _, block in arrivals])
     table = read_log(path, LogOptions(units='g')).table
+    monkeypatch.setattr(*CLOCK_OF_A_SOURCE, clock)
+    with open_source(str(path), LogOptions(units='g'), speed=2.0) as source:
+        arrivals = [(clock.now - 50.0, block) for block in source.blocks]
+    found = np.concatenate([block for _, block in arrivals])
     np.testing.assert_array_equal(found[:, 1:4], table.reading)
     np.testing.assert_array_equal(found[:, 0], table['time'])
-    half = next(when for when, _, block in arrivals if len(block) and block[-1, 0] >= 0.8)
-    assert half > 0.35  # it may be late, but never early
-    assert max(size for _, size, _ in arrivals) < 400
+    late = np.concatenate([when - (block[:, 0] - found[0, 0]) / 2.0 for when, block in arrivals])
+    assert np.all((late[:300] > -1e-9) & (late[:300] < 0.05))
+    assert np.ptp(late[300:]) < 0.05  # the gap of 1000 s is left out
+    assert arrivals[-1][0] < 2.0

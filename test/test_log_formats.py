@@ -14,11 +14,17 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.files.logs import LogOptions, read_log
-from accel_calib.files.logs.ardupilot import is_dataflash, read_dataflash
-from accel_calib.files.logs.formats import FORMATS, named, NAMES, recognise, record_instead
-from accel_calib.files.logs.px4 import is_ulg, read_ulg
+from accel_calib.files import LogOptions, read_log
 from accel_calib.table import Recording
+from inside import (
+    format_named,
+    is_dataflash,
+    is_ulg,
+    read_dataflash,
+    read_ulg,
+    recognise,
+    record_instead,
+)
 import numpy as np
 import pytest
 
@@ -30,7 +36,6 @@ make = importlib.util.module_from_spec(_spec)
 sys.modules['make_logs'] = make
 _spec.loader.exec_module(make)
 
-TEXTS = [name for name in make.TRUTHS if name.endswith('.csv')]
 WITHIN_SD = 5.0
 
 
@@ -107,33 +112,10 @@ def test_another_format_than_that_of_the_file_is_refused_with_what_is_lacking() 
 
 def test_an_unknown_format_is_refused_with_the_one_that_is_meant() -> None:
     with pytest.raises(InputError, match='use phyphox'):
-        named('phypox', ['Time (s)'], 'log.csv')
+        format_named('phypox', ['Time (s)'], 'log.csv')
 
 
 # ------------------------------------------------------------------------------ the formats
-
-def test_all_formats_of_the_command_line_are_there() -> None:
-    assert NAMES == ('phyphox', 'sensor-logger', 'matlab', 'px4', 'ardupilot', 'betaflight',
-                     'esp32')
-
-
-@pytest.mark.parametrize('layout', FORMATS, ids=lambda each: each.name)
-def test_a_format_states_its_source_and_uses_our_names(layout: Any) -> None:
-    assert layout.source.startswith('https://')
-    ours = {'time', 'ax', 'ay', 'az', 'gx', 'gy', 'gz', 'temperature'}
-    assert set(layout.columns) <= ours
-    assert set(layout.scales) | set(layout.divisors) <= set(layout.columns)
-    assert not layout.columns or {'time', 'ax', 'ay', 'az'} <= set(layout.columns)
-    assert not layout.without_gravity or layout.record
-
-
-@pytest.mark.parametrize('name', [each for each in TEXTS if not each.startswith(('esp32', 'mat'))
-                                  and 'explorer' not in each])
-def test_the_layout_of_a_sample_is_plain_from_its_names(name: str) -> None:
-    layout = recognise(header_of(name))
-    assert layout is not None
-    assert layout.name == name.split('/')[0]
-    assert {'time', 'ax', 'ay', 'az'} <= set(layout.present(header_of(name)))
 
 
 @pytest.mark.parametrize('header', ['time,ax,ay,az', 'timestamp,x,y,z', 'time,x,y,z',
@@ -163,50 +145,6 @@ def test_the_frame_of_a_format_makes_a_level_vehicle_read_up() -> None:
     up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
     np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)
-
-
-# ------------------------------------------------------------------------------- the samples
-
-def test_the_samples_are_small() -> None:
-    sizes = [path.stat().st_size for path in LOGS.rglob('*') if path.is_file()]
-    assert max(sizes) < 300_000
-    assert sum(sizes) < 2_000_000
-
-
-def test_the_script_writes_the_stored_samples(tmp_path: Path) -> None:
-    for write in make.MAKERS.values():
-        write(tmp_path)
-    written = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob('*') if path.is_file())
-    assert written == sorted(Path(name) for name in (*make.TRUTHS, *make.WITHOUT_GRAVITY,
-                                                     *make.OTHER_SENSORS))
-    for name in written:
-        stored, new = (LOGS / name).read_bytes(), (tmp_path / name).read_bytes()
-        assert new[:150] == stored[:150], f'{name}: run test/data/logs/make.py'
-        assert len(new) == pytest.approx(len(stored), rel=1e-3)
-
-
-def test_the_csv_of_px4_has_the_columns_that_ulog2csv_writes(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
-    from pyulog.ulog2csv import convert_ulog2csv
-
-    convert_ulog2csv(str(LOGS / 'px4/default.ulg'), '', str(tmp_path), ',', 0, 0)
-    for topic in ('sensor_combined', 'vehicle_imu', 'sensor_accel'):
-        made = (tmp_path / f'default_{topic}_0.csv').read_text().splitlines()
-        stored = (LOGS / f'px4/log_{topic}_0.csv').read_text().splitlines()
-        assert made[0] == stored[0]
-
-
-def test_pymavlink_reads_the_sample_of_ardupilot_as_it_was_simulated() -> None:
-    pytest.importorskip('pymavlink')
-    from pymavlink.DFReader import DFReader_binary
-
-    log = DFReader_binary(str(LOGS / 'ardupilot/two_imus.bin'))
-    first = log.recv_match(type='IMU')
-    name, values = next(row for row in make.dataflash_rows() if row[0] == 'IMU')
-    fields = dict(zip(make.DATAFLASH[name][2].split(','), values))
-    log.close()
-    assert first.to_dict() == {'mavpackettype': 'IMU', **{
-        key: pytest.approx(value, rel=1e-6) for key, value in fields.items()}}
 
 
 # ---------------------------------------------------------------------------------- PX4 logs
@@ -389,15 +327,6 @@ def test_without_pymavlink_a_binary_log_says_how_to_install_it(monkeypatch: pyte
     monkeypatch.setitem(sys.modules, 'pymavlink.DFReader', None)
     with pytest.raises(InputError, match='pip install pymavlink'):
         read_dataflash(LOGS / 'ardupilot/two_imus.bin')
-
-
-def test_a_flight_log_that_is_missing_is_an_error_of_the_file(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
-    for read in (read_ulg, read_dataflash):
-        with pytest.raises(FileNotFoundError):
-            read(tmp_path / 'missing')
-    assert not is_ulg(tmp_path / 'missing')
-    assert not is_dataflash(tmp_path)
 
 
 def test_flight_logs_are_told_from_other_files_by_their_content() -> None:

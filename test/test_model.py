@@ -5,21 +5,21 @@
 
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
-from accel_calib.model import (
+from inside import (
     correct,
     force_slope,
     Model,
     MODELS,
     parameter_basis,
     parameter_names,
+    parse_effect,
     predict,
+    random_directions,
     reading_of,
+    rotation_from_rpy,
     with_linear_part,
     with_vector,
 )
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import parse_effect
-from accel_calib.sphere import random_directions
 import numpy as np
 import pytest
 

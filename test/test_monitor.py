@@ -11,12 +11,16 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
 from accel_calib.files import read_recording
-from accel_calib.model import Model, predict
 from accel_calib.monitor import compared, Drift, monitor, rests_of, status
-from accel_calib.monitor.change_detection import MEMORY
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import units_of
+from inside import (
+    DRIFT_MEMORY,
+    Model,
+    predict,
+    random_directions,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 from shared import data, sensor
@@ -66,7 +70,7 @@ def test_noise_and_uncertainty_of_the_calibration_are_not_a_change() -> None:
         calibration = made(truth, rng)
         state = rested(monitor(calibration), calibration, truth, directions, rng)
         assert (state.change, state.count) == (None, 800)
-        assert len(state.rests) == MEMORY
+        assert len(state.rests) == DRIFT_MEMORY
 
 
 @pytest.mark.parametrize('knock', [-0.05, 0.004, 0.05, 0.2])

@@ -3,16 +3,9 @@
 
 """Mounting from a flat pose, for all frames and orientations, including singular ones."""
 
-from accel_calib.calibrate.mounting import (
-    flat_direction,
-    FRAMES,
-    mounting,
-    with_heading,
-    with_heading_of,
-)
+from accel_calib.calibrate import flat_direction, FRAMES
 from accel_calib.errors import InputError
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.sphere import random_directions
+from inside import mounting, random_directions, rotation_from_rpy, with_heading, with_heading_of
 import numpy as np
 import pytest
 

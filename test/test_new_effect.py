@@ -5,10 +5,8 @@
 
 import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
-from accel_calib.messages.correction import Rewriter
-from accel_calib.messages.layout import layout_of
-from accel_calib.report.page import page
-from accel_calib.sphere import random_directions
+from accel_calib.messages import layout_of, Rewriter
+from inside import random_directions, refinement_page
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
@@ -48,7 +46,7 @@ def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tm
     assert [step.effect for step in found.steps] == ['offset_cubic_temperature']
     np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in AXES], VALUES,
                                atol=1e-3)
-    assert NEW.words.capitalize() in page(found, 'poses')
+    assert NEW.words.capitalize() in refinement_page(found, 'poses')
 
     found.calibration.save(tmp_path / 'calibration.yaml')
     calibration = ac.load(tmp_path / 'calibration.yaml')

@@ -8,12 +8,15 @@ from dataclasses import replace
 from accel_calib.calibrate import fit_poses
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
-from accel_calib.model import Model
-from accel_calib.one_reading import OneReading
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.units import units_of
+from inside import (
+    Model,
+    OneReading,
+    random_directions,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 from shared import sensor

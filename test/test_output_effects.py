@@ -7,14 +7,20 @@ from __future__ import annotations
 
 from accel_calib.calibrate import fit_poses, in_g
 from accel_calib.capture import capture, CaptureSettings, StillDetector
-from accel_calib.capture.window import rounding_left
 from accel_calib.files import read_recording
-from accel_calib.model import Model
-from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
-from accel_calib.simulate import simulate_recording
-from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.table import Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, Units, units_of
+from inside import (
+    clipped,
+    grid_step,
+    Model,
+    off_grid,
+    random_directions,
+    rounding_left,
+    simulate_recording,
+    spread_directions,
+    unclipped,
+)
 import numpy as np
 import pytest
 from shared import data, sensor
@@ -47,7 +53,7 @@ def found(recording, units):
 
 
 @pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
-@pytest.mark.parametrize('limit', [9.0, 9.4, 9.6, 9.75, 9.9])
+@pytest.mark.parametrize('limit', [9.0, 9.75])
 def test_a_clipped_recording_has_the_poses_of_the_recording(name, limit):
     recording = read_recording(data(name))
     whole = capture(recording, MPS2).poses
@@ -74,11 +80,10 @@ def test_a_clipped_stream_has_the_dwells_of_the_recording():
 @pytest.mark.parametrize('limit', [0.8, 0.9, 0.95, 1.0])
 @pytest.mark.parametrize('noise', [3e-4, 3e-3])
 def test_all_rests_of_a_clipped_sensor_are_captured(limit, noise):
-    for seed in range(3):
-        assert len(capture(limited(simulated(seed, noise), -limit, limit), G).poses) == 24
+    assert len(capture(limited(simulated(0, noise), -limit, limit), G).poses) == 24
 
 
-@pytest.mark.parametrize('limit', [9.0, 9.4, 9.6, 9.75])
+@pytest.mark.parametrize('limit', [9.0, 9.6])
 def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
     poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -limit, limit), MPS2)
     clip = clipped(poses)
@@ -118,20 +123,20 @@ def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
 
 @pytest.mark.parametrize('step', [None, 2e-4, 2e-3, 8e-3])
 def test_a_sensor_that_is_not_clipped_has_no_limit(step):
-    for seed in range(6):
+    for seed in range(2):
         recording = simulated(seed)
         poses = found(recording if step is None else rounded(recording, step), G)
         assert clipped(poses) is None
 
 
-@pytest.mark.parametrize(('step_mg', 'least'), [(2, 38), (4, 38), (8, 38), (12, 37), (20, 37)])
+@pytest.mark.parametrize(('step_mg', 'least'), [(2, 38), (8, 38), (20, 37)])
 def test_a_coarsely_quantised_real_recording_has_its_poses(step_mg, least):
     recording = rounded(read_recording(data('xsens_mti_counts.csv')),
                         round(step_mg * 1e-3 * COUNTS_PER_G))
     assert least <= len(capture(recording, NATIVE).poses) <= 38
 
 
-@pytest.mark.parametrize('step_mg', [4, 6, 8, 12, 16, 20])
+@pytest.mark.parametrize('step_mg', [4, 8, 20])
 def test_quantisation_of_a_real_recording_is_detected_with_its_step(step_mg):
     counts = round(step_mg * 1e-3 * COUNTS_PER_G)
     taken = capture(rounded(read_recording(data('xsens_mti_counts.csv')), counts), NATIVE).poses
@@ -146,13 +151,13 @@ def test_quantisation_of_a_real_recording_is_detected_with_its_step(step_mg):
     (0.02, True), (0.1, True), (0.2, True), (0.3, True), (0.5, False), (1.0, False),
     (3.0, False)])
 def test_a_grid_is_named_if_the_noise_is_clearly_less_than_a_step(ratio, relevant):
-    for seed in range(6):
+    for seed in range(2):
         step = grid_step(found(rounded(simulated(seed, 1e-3), 1e-3 / ratio), G))
         assert step == (pytest.approx(1e-3 / ratio, rel=2e-3) if relevant else None)
 
 
 def test_readings_without_a_grid_have_no_step():
-    assert [grid_step(found(simulated(seed), G)) for seed in range(8)] == [None] * 8
+    assert [grid_step(found(simulated(seed), G)) for seed in range(3)] == [None] * 3
     assert grid_step(found(read_recording(data('mpu9150_imu0.csv')), MPS2)) is None
 
 
@@ -169,7 +174,7 @@ def test_the_error_that_rounding_leaves_follows_from_the_variance_of_the_samples
 @pytest.mark.parametrize('ratio', [0.03, 0.1, 0.2, 0.3])
 def test_the_stated_noise_of_means_on_a_coarse_grid_is_correct(ratio):
     scores = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         recording = simulate_recording(Model({}), random_directions(40, rng), rng, noise_g=1e-3,
                                        dwell=3.0, turn=0.6)

@@ -6,14 +6,11 @@
 from dataclasses import replace
 
 from accel_calib.calibrate import fit_poses, joined_ranges, outside
-from accel_calib.cli.main import main
 from accel_calib.effects import empirical_name
 from accel_calib.files import write_calibration, write_table
-from accel_calib.model import Model
 from accel_calib.session import CalibratorSettings, Log, Session
-from accel_calib.simulate import model_with, simulate_poses, simulate_recording
-from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
+from inside import main, Model, model_with, simulate_poses, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from shared import sensor

@@ -11,6 +11,7 @@ from accel_calib.calibrate import (
     directions_of,
     fit_partial,
     fit_poses,
+    gated,
     level,
     lies_in_cone,
     METHODS,
@@ -20,18 +21,26 @@ from accel_calib.calibrate import (
     STORED_METHODS,
     verify,
 )
-from accel_calib.calibrate.gate import gated
-from accel_calib.calibrate.partial import carried, common_sensors, typical_spread
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.estimate.closed_form import along_quadrics
-from accel_calib.estimate.fit import estimate
+from accel_calib.estimate import estimate
 from accel_calib.files import read_calibration, write_calibration
-from accel_calib.model import Model, MODELS, predict, sensor_force, with_vector
 from accel_calib.refine import refine
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import spread_directions, unit
 from accel_calib.table import Poses
 from accel_calib.units import units_of
+from inside import (
+    along_quadrics,
+    carried,
+    common_sensors,
+    Model,
+    MODELS,
+    predict,
+    sensor_force,
+    simulate_poses,
+    spread_directions,
+    typical_spread,
+    unit,
+    with_vector,
+)
 import numpy as np
 import pytest
 
@@ -66,20 +75,38 @@ def errors(calibration, model, up):
     return np.linalg.norm(force, axis=1) - 1.0, np.sqrt(stated)
 
 
-@pytest.mark.parametrize('count', [1, 7])
-def test_stated_uncertainty_holds_over_the_whole_sphere(count):
-    held = []
-    for seed in range(200):
-        model, poses = tilting((seed, count), count)
-        error, stated = errors(fit_partial(poses, G), model, UP)
-        held.append(np.mean(np.abs(error) < 1.96 * stated))
+@pytest.fixture(scope='module', params=[1, 7])
+def fitted(request):
+    """Return common sensors, each with its fit to 1 or 7 poses."""
+    pairs = [tilting((seed, request.param), request.param) for seed in range(100)]
+    return [(model, fit_partial(poses, G)) for model, poses in pairs]
+
+
+def test_stated_uncertainty_holds_over_the_whole_sphere(fitted):
+    held = [np.abs(error) < 1.96 * stated
+            for error, stated in (errors(found, model, UP) for model, found in fitted)]
     assert 0.9 < np.mean(held) < 0.995
+
+
+def test_each_value_is_within_its_stated_deviation(fitted):
+    ratios = [(found.model.vector - model.vector) / np.sqrt(np.diag(found.covariance))
+              for model, found in fitted]
+    sizes = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert np.all((sizes > 0.8) & (sizes < 1.2))
+
+
+def test_stated_tilt_before_levelling_is_that_of_common_sensors(fitted):
+    up, ratios = np.array([[0.0, 0.0, 1.0]]), []
+    for model, found in fitted:
+        seen = unit(sensor_force(found.model, predict(model, up, {}), {}))[0]
+        ratios.append(np.degrees(seen[:2]) / carried(found).tilt_deg)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.1
 
 
 @pytest.mark.parametrize(('count', 'degrees'), [(5, 10.0), (12, 25.0)])
 def test_corrected_length_is_right_within_the_cone(count, degrees):
     held, sizes = [], []
-    for seed in range(60):
+    for seed in range(15):
         model, poses = tilting((seed, count, 1), count, degrees)
         inside = near_up(np.random.default_rng(seed), 50, degrees)
         error, stated = errors(fit_partial(poses, G), model, inside)
@@ -87,17 +114,6 @@ def test_corrected_length_is_right_within_the_cone(count, degrees):
         sizes.append(np.sqrt(np.mean(error ** 2)))
     assert np.mean(held) > 0.88
     assert np.median(sizes) < 1e-3
-
-
-@pytest.mark.parametrize('count', [1, 7])
-def test_each_value_is_within_its_stated_deviation(count):
-    ratios = []
-    for seed in range(100):
-        model, poses = tilting((seed, count, 2), count)
-        found = fit_partial(poses, G)
-        ratios.append((found.model.vector - model.vector) / np.sqrt(np.diag(found.covariance)))
-    sizes = np.sqrt(np.mean(np.square(ratios), axis=0))
-    assert np.all((sizes > 0.8) & (sizes < 1.2))
 
 
 def test_poses_that_tell_nothing_leave_the_spread_of_common_sensors():
@@ -122,10 +138,10 @@ def test_many_poses_over_the_sphere_outweigh_the_prior():
     np.testing.assert_allclose(found.covariance, full.covariance, rtol=0.2, atol=1e-10)
 
 
-@pytest.mark.parametrize('std', [1.0, 0.3, 0.1])
+@pytest.mark.parametrize('std', [1.0, 0.1])
 def test_poses_that_repeat_worse_than_stated_get_a_larger_uncertainty(std):
     along, lost = [], 0
-    for seed in range(25):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         model = common_sensor(rng)
         poses = simulate_poses(model, near_up(rng, 12, 10.0), rng)
@@ -134,7 +150,7 @@ def test_poses_that_repeat_worse_than_stated_get_a_larger_uncertainty(std):
         error, stated = errors(found, model, np.array([[0.0, 0.0, 1.0]]))
         along.append(float(error[0] / stated[0]))
     assert 0.3 < np.sqrt(np.mean(np.square(along))) < 1.6
-    assert lost <= 2
+    assert lost <= 1
 
 
 def test_poses_without_noise_columns_are_fitted_with_a_warning():
@@ -147,7 +163,7 @@ def test_poses_without_noise_columns_are_fitted_with_a_warning():
 
 def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
     lost = missed = 0
-    for seed in range(40):
+    for seed in range(10):
         model, poses = tilting((seed, 3), 9, 15.0)
         lost += len(fit_partial(poses, G).rejected)
         poses.reading[4] *= 1.05
@@ -155,8 +171,7 @@ def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
         missed += [each.row for each in found.rejected] != [5]
         error, stated = errors(found, model, UP)
         assert np.mean(np.abs(error) < 4.0 * stated) > 0.95
-    assert lost <= 1
-    assert missed <= 1
+    assert (lost, missed) == (0, 0)
 
 
 def test_equal_rows_count_as_one_pose():
@@ -204,17 +219,6 @@ def test_one_pose_and_a_mounting_have_words_of_their_own():
     rng = np.random.default_rng(0)
     full = fit_poses(simulate_poses(common_sensor(rng), spread_directions(12), rng), G)
     assert carried_words(full) == ''
-
-
-def test_stated_tilt_before_levelling_is_that_of_common_sensors():
-    ratios = []
-    for seed in range(100):
-        model, poses = tilting((seed, 9))
-        found = fit_partial(poses, G)
-        up = np.array([[0.0, 0.0, 1.0]])
-        seen = unit(sensor_force(found.model, predict(model, up, {}), {}))[0]
-        ratios.append(np.degrees(seen[:2]) / carried(found).tilt_deg)
-    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.1
 
 
 @pytest.mark.parametrize(('up', 'expected'), [

@@ -7,17 +7,25 @@ from dataclasses import replace
 import json
 
 from accel_calib.calibrate import NextPose
-from accel_calib.cli.main import main
 from accel_calib.errors import InputError
-from accel_calib.files.plan_table import read_plan, write_plan
 from accel_calib.refine import PlannedPose, PosePlan, refine
-from accel_calib.refine.plan import _Predictions
-from accel_calib.refine.plan_words import attitude_words, NOTHING, percent
-from accel_calib.session.guidance import Guide, Plan
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import random_directions, unit
 from accel_calib.units import units_of
 from generator import Setup, simulate, write_csv
+from inside import (
+    attitude_words,
+    Guide,
+    main,
+    model_with,
+    NOTHING_TO_PLAN,
+    percent,
+    Plan,
+    Predictions,
+    random_directions,
+    read_plan,
+    simulate_poses,
+    unit,
+    write_plan,
+)
 import numpy as np
 import pytest
 
@@ -36,12 +44,6 @@ def table(path, hidden, *, size, seed, temperature='wandering'):
 
 
 @pytest.fixture
-def twins(tmp_path):
-    """Return a table in which cubic and odd_quadratic are rivals."""
-    return table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
-
-
-@pytest.fixture
 def trends(tmp_path):
     """Return a table in which offset_temperature and offset_drift are rivals."""
     return table(tmp_path / 'trends.csv', 'offset_temperature', size=2, seed=[0, 2],
@@ -54,11 +56,20 @@ def refined(path, capsys, *more):
     return json.loads(capsys.readouterr().out)
 
 
-def test_the_plan_is_written_and_read_back(twins, tmp_path, capsys):
-    path = tmp_path / 'plan.csv'
-    result = refined(twins, capsys, '--plan', path)
-    poses = read_plan(path)
+def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
+    path, found = tmp_path / 'plan.csv', tmp_path / 'found.json'
+    twins = table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
+    assert run('refine', twins, '--plan', path, '--json', found) == 0
+    printed = ' '.join(capsys.readouterr().out.split())
+    for words in ('plan: to separate', 'take these poses:', 'plan: hold the ', ' up (',
+                  'the expected probability of the right one is then', '%)',
+                  'advice: next pose to separate', f'stored in {tmp_path}'):
+        assert words in printed
+    result, poses = json.loads(found.read_text()), read_plan(path)
     assert 1 <= len(poses) <= 6
+    for step in result['steps']:
+        assert sum(step['probabilities'].values()) == pytest.approx(1.0)
+        assert set(step['rivals']) < set(step['probabilities'])
     step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
     for pose in poses:
         assert set(pose.separates) == {'cubic', 'odd_quadratic'}
@@ -71,26 +82,12 @@ def test_the_plan_is_written_and_read_back(twins, tmp_path, capsys):
     assert comments == result['plan']
 
 
-def test_the_terminal_shows_the_plan_and_the_probabilities(twins, tmp_path, capsys):
-    assert run('refine', twins, '--plan', tmp_path / 'plan.csv') == 0
-    printed = ' '.join(capsys.readouterr().out.split())
-    for words in ('plan: to separate', 'take these poses:', 'plan: hold the ', ' up (',
-                  'the expected probability of the right one is then', '%)',
-                  'advice: next pose to separate', f'stored in {tmp_path}'):
-        assert words in printed
-
-
-def test_probabilities_of_a_step_sum_to_one(twins, capsys):
-    for step in refined(twins, capsys)['steps']:
-        assert sum(step['probabilities'].values()) == pytest.approx(1.0)
-        assert set(step['rivals']) < set(step['probabilities'])
-
-
 def test_without_rivals_nothing_is_written(tmp_path, capsys):
-    made = simulate(np.random.default_rng([5, 6]), {'cubic': 30.0}, Setup(poses=60))
+    made = simulate(np.random.default_rng([5, 6]), {'quadratic': 10.0}, Setup(poses=24))
     write_csv(tmp_path / 'clear.csv', made.columns)
     result = refined(tmp_path / 'clear.csv', capsys, '--plan', tmp_path / 'plan.csv')
-    assert result['plan'] == [NOTHING]
+    assert [step['effect'] for step in result['steps']][-1] == 'quadratic'
+    assert result['plan'] == [NOTHING_TO_PLAN]
     assert not (tmp_path / 'plan.csv').exists()
 
 
@@ -114,7 +111,7 @@ def predictions(rng):
     rows = (design[:, :, :3], design[:, :, 1:])
     spreads = (np.diag([0.3, 0.2, 0.4]), np.diag([0.2, 0.3, 0.3]))
     means = np.array([rows[0] @ [0.5, 0.2, 0.1], rows[1] @ [0.2, 0.1, 0.4]])
-    return _Predictions(means, rows, spreads, np.array([0.7, 0.3]))
+    return Predictions(means, rows, spreads, np.array([0.7, 0.3]))
 
 
 def test_the_expected_probability_is_the_mean_of_simulated_ones():

@@ -9,14 +9,21 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, NOT_LOCATED, outlook, UNCHECKED
 from accel_calib.effects import effect_named, EFFECTS, empirical_name, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.estimate.equations import variance_factor
-from accel_calib.model import correct, Model, predict
+from accel_calib.estimate import variance_factor
 from accel_calib.rating import rate
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import OVER_THE_SPHERE, random_directions, spread_directions
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
+from inside import (
+    correct,
+    Model,
+    model_with,
+    OVER_THE_SPHERE,
+    predict,
+    random_directions,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 
@@ -258,7 +265,7 @@ def error_of(calibration: Calibration, sensor: Model) -> float:
 
 @pytest.mark.parametrize('bad', BAD)
 @pytest.mark.parametrize('model', ['10', '12'])
-@tried(10)
+@tried(5)
 @given(errors=ERRORS, count=COUNTS, seed=SEEDS, angles=ANGLES, place=st.floats(0.0, 0.99))
 def test_a_bad_row_does_not_move_the_result_silently(
         model, bad, errors, count, seed, angles, place):
@@ -280,10 +287,6 @@ def is_warned(calibration):
 
 KNOCKED = {**BAD, 'knocked by 1.5 %': lambda reading: 1.015 * reading,
            'knocked by -10 %': lambda reading: 0.9 * reading}
-
-MISSED = 0.02
-"""Share of sets with a bad row among few poses whose error is stated too small without a warning.
-With few poses and a model that the poses choose, no test finds every one."""
 
 
 def is_silent(model, bad, seed):
@@ -307,9 +310,8 @@ def is_silent(model, bad, seed):
 
 @pytest.mark.parametrize('model', ['auto', '7', '9', '10', '12'])
 def test_a_bad_row_among_few_poses_is_located_or_the_fit_warns(model):
-    silent = [(bad, seed) for seed, bad in enumerate(list(KNOCKED) * 6)
-              if is_silent(model, bad, seed)]
-    assert len(silent) <= MISSED * 6 * len(KNOCKED), silent
+    assert not [(bad, seed) for seed, bad in enumerate(list(KNOCKED) * 2)
+                if is_silent(model, bad, seed)]
 
 
 @pytest.mark.parametrize('model', ['4', '7', '10'])

@@ -11,11 +11,10 @@ from typing import Any
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.files import write_calibration
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
 from conftest import EFFECTS, GRAVITY
 from diagnostic_msgs.msg import DiagnosticArray
+from inside import model_with, simulate_poses, spread_directions
 import numpy as np
 from sensor_msgs.msg import Temperature
 

@@ -49,7 +49,8 @@ def test_a_node_is_calibrated_through_its_page(
         bench: Any, browser: Browser, tmp_path: Path) -> None:
     from sensor_msgs.msg import Imu
     file = tmp_path / 'imu.yaml'
-    calibrator = bench.start('calibrator', calibration_file=str(file), web_port=free_port())
+    calibrator = bench.start('calibrator', calibration_file=str(file), web_port=free_port(),
+                             **bench.deep)
     viewers = Viewers(browser)
     page = viewers.visit(link_of(calibrator), (360, 740))
     expect(page.locator('#ring')).to_have_attribute('data-kind', 'silent')

@@ -34,8 +34,8 @@ ones take no more.
 
 
 @pytest.fixture(scope='module')
-def run() -> Any:
-    return long_run(ROUNDS, ROUND, INTERVAL, RATE)
+def run(domain_of_module: int) -> Any:
+    return long_run(ROUNDS, ROUND, INTERVAL, RATE, domain=domain_of_module)
 
 
 def test_no_message_is_lost_while_services_are_called(run: Any) -> None:

@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from accel_calib.files import read_calibration
-from accel_calib.sphere import spread_directions
+from inside import spread_directions
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
@@ -32,7 +32,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def printed_until(node: subprocess.Popen[str], words: str, seconds: float = 15.0) -> str:
+def printed_until(node: subprocess.Popen[str], words: str, seconds: float = 60.0) -> str:
     """Return the first line of a node that contains some words."""
     ends, text = time.monotonic() + seconds, ''
     while time.monotonic() < ends:

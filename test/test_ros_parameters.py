@@ -11,14 +11,9 @@ from typing import Any
 
 from accel_calib.capture import CaptureSettings
 from accel_calib.errors import InputError
-from accel_calib.ros.simulator_node import SimulatorSettings
-from accel_calib.session.settings import (
-    CalibratorSettings,
-    capture_settings,
-    changed,
-    default_of,
-    yaml_lines,
-)
+from accel_calib.session import CalibratorSettings
+from inside import capture_settings, changed, default_of, yaml_lines
+from inside_ros import SimulatorSettings
 import pytest
 import yaml
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from accel_calib.files import read_poses
 from diagnostic_msgs.msg import DiagnosticArray
+from inside import CALIBRATOR
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -110,7 +111,7 @@ def test_a_sensor_with_another_frame_id_takes_over_with_files_of_its_own(
         return raw[-1]
 
     bench.came_out.clear()
-    bench.spin(lambda: bench.send(other()) or len(bench.came_out) > 100, 30.0)
+    bench.spin(lambda: bench.send(other()) or len(bench.came_out) > 100)
     assert {each.header.frame_id for each in bench.came_out} == {'other'}
     assert all(each in raw for each in bench.came_out)  # not corrected by the stored calibration
     printed = output_of(bench, node)
@@ -163,8 +164,8 @@ def test_a_rest_is_not_used_while_the_stamps_stand(bench: Any, readings: Reading
         return message
 
     ends = time.monotonic() + 3.5
-    bench.spin(lambda: [bench.send(standing()) for _ in range(8)] and time.monotonic() > ends)
-    assert not still[-1].data
+    bench.spin(lambda: [bench.send(standing()) for _ in range(8)] and time.monotonic() > ends
+               and not still[-1].data)
     answer = bench.call_while('set_level', standing)
     assert not answer.success
     assert 'the stamps have not changed for' in answer.message
@@ -189,7 +190,7 @@ def test_one_absurd_first_reading_does_not_spoil_the_capture(bench: Any, reading
 
 def test_an_incompatible_qos_is_named_with_both_nodes_and_what_to_do(bench: Any) -> None:
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    node = bench.run('-m', 'accel_calib.ros.calibrator', '--ros-args', '-p',
+    node = bench.run(*CALIBRATOR, '--ros-args', '-p',
                      'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
     bench.client('self_test')
     bench.spin(lambda: diagnostics)

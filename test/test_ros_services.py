@@ -11,14 +11,10 @@ import re
 from typing import Any
 
 from accel_calib.files import read_calibration, read_poses
-from accel_calib.model import Model
-from accel_calib.ros.display import pose_markers
-from accel_calib.session.guidance import next_action
-from accel_calib.session.work import plan_for
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
+from inside import Model, next_action, plan_for, simulate_poses, spread_directions
+from inside_ros import pose_markers
 import numpy as np
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool

@@ -12,7 +12,7 @@ import signal
 from typing import Any
 
 from accel_calib.files import read_calibration
-from accel_calib.sphere import spread_directions
+from inside import spread_directions
 import pytest
 
 

@@ -13,10 +13,10 @@ import struct
 from typing import Any
 
 from accel_calib.files import read_calibration, write_calibration
-from accel_calib.messages.layout import layout_of
-from accel_calib.model import Model
+from accel_calib.messages import layout_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
+from inside import Model
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message

@@ -10,15 +10,9 @@ import math
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.ros.transforms import (
-    MountingBroadcaster,
-    needs_tf2,
-    StaticTransforms,
-    TOPIC,
-    watch_static,
-)
-from accel_calib.rotations import quaternion_of, rotation_from_rpy
 from builtin_interfaces.msg import Time
+from inside import quaternion_of, rotation_from_rpy
+from inside_ros import MountingBroadcaster, needs_tf2, StaticTransforms, TF_TOPIC, watch_static
 import numpy as np
 import pytest
 
@@ -33,15 +27,16 @@ Link = tuple[str, str, tuple[float, ...]]
 PUBLISH = """
 import json
 import sys
-from accel_calib.ros import qos
 from geometry_msgs.msg import Quaternion, TransformStamped
 import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 rclpy.init()
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 publishers = []
 for k, links in enumerate(json.loads(sys.argv[1])):
     node = rclpy.create_node(f'links_{k}')
-    publishers.append(node.create_publisher(TFMessage, '/tf_static', qos.LATCHED))
+    publishers.append(node.create_publisher(TFMessage, '/tf_static', latched))
     message = TFMessage()
     for parent, child, quaternion in links:
         stamped = TransformStamped(child_frame_id=child)
@@ -54,10 +49,10 @@ rclpy.spin(node)
 """
 """Publishes each list of links as one latched message of a node of its own."""
 
-BROADCAST = """
+BROADCAST = f"""
 import sys
-from accel_calib.ros.transforms import MountingBroadcaster
-from accel_calib.rotations import rotation_from_rpy
+from {MountingBroadcaster.__module__} import MountingBroadcaster
+from {rotation_from_rpy.__module__} import rotation_from_rpy
 from builtin_interfaces.msg import Time
 import rclpy
 rclpy.init()
@@ -177,9 +172,9 @@ def test_without_tf2_msgs_its_parameters_are_refused(
     with pytest.raises(InputError) as refusal:
         needs_tf2(parameter)
     assert str(refusal.value) == words
-    process = bench.run('-c', 'from accel_calib.ros.transforms import needs_tf2\n'
+    process = bench.run('-c', f'from {needs_tf2.__module__} import needs_tf2\n'
                               f'needs_tf2({parameter!r})')
-    assert words in process.communicate(timeout=30)[0]
+    assert words in process.communicate(timeout=60)[0]
 
 
 def test_late_subscriber_receives_the_transforms_of_all_nodes(
@@ -211,7 +206,7 @@ def test_repeated_transform_is_no_change(tf_message: Any, bench: Any) -> None:
     changes: list[Any] = []
     tree = watch_static(bench.node, lambda: changes.append(tree.rotation('base', 'imu')))
     broadcaster = MountingBroadcaster(bench.node)
-    received = bench.listen(tf_message, TOPIC, latched=True)
+    received = bench.listen(tf_message, TF_TOPIC, latched=True)
     for rotation in (IMU, IMU, MAST):
         broadcaster.publish(Time(), 'base', 'imu', rotation)
     bench.spin(lambda: len(received) == 3 and len(changes) >= 2)
@@ -221,7 +216,7 @@ def test_repeated_transform_is_no_change(tf_message: Any, bench: Any) -> None:
 def test_late_subscriber_receives_the_last_published_mounting(
         tf_message: Any, bench: Any) -> None:
     published(bench, BROADCAST)
-    received = bench.listen(tf_message, TOPIC, latched=True)
+    received = bench.listen(tf_message, TF_TOPIC, latched=True)
     bench.spin(lambda: received)
     assert len(received) == 1
     stamped, = received[0].transforms

@@ -18,10 +18,11 @@ import termios
 import threading
 from typing import Any
 
+from inside import CALIBRATOR, COMMAND
 import pytest
 
 Readings = Callable[..., Any]
-COMMAND = ('-m', 'accel_calib.cli.main', 'watch')
+WATCH = (*COMMAND, 'watch')
 ATTITUDES = ([0, 0, 1], [1, 0, 0], [0, 1, 0])
 
 
@@ -50,14 +51,14 @@ def environment(bench: Any) -> dict[str, str]:
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_pipe_gets_a_line_for_each_pose(bench: Any, readings: Readings, number: int) -> None:
     bench.calibrator(sensor='arm', passthrough=True)
-    process = bench.run(*COMMAND)
+    process = bench.run(*WATCH)
     lines, thread = lines_of(process)
     bench.spin(lambda: any(line.startswith('poses: 0 of about 12; ') for line in lines))
     turn(bench, readings, lambda count: any(f'captured pose {count} of' in x for x in lines))
     assert all(character.isprintable() for line in lines for character in line.rstrip('\n'))
     assert {'moving\n', 'still: hold it for 1 s\n'} <= set(lines)
     process.send_signal(number)
-    assert process.wait(10) == 0
+    assert process.wait(60) == 0
     thread.join()
     assert not any('Traceback' in line for line in lines)
 
@@ -66,7 +67,7 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
     bench.calibrator(sensor='arm', passthrough=True)
     reader, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
-    process = subprocess.Popen([sys.executable, *COMMAND], stdin=terminal, stdout=terminal,
+    process = subprocess.Popen([sys.executable, *WATCH], stdin=terminal, stdout=terminal,
                                stderr=terminal, env=environment(bench), start_new_session=True)
     os.close(terminal)
     shown = bytearray()
@@ -84,7 +85,7 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
         bench.spin(lambda: b'0 of about 12' in shown)
         turn(bench, readings, lambda count: f' {count} of about'.encode() in shown)
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
     finally:
         process.kill()
         process.wait()
@@ -98,22 +99,22 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
 
 def test_once_prints_the_progress_and_ends(bench: Any, readings: Readings) -> None:
     bench.calibrator(sensor='arm', passthrough=True)
-    watching = bench.run(*COMMAND)
+    watching = bench.run(*WATCH)
     lines, thread = lines_of(watching)
     bench.spin(lambda: lines)
     turn(bench, readings, lambda count: any(f'captured pose {count} of' in x for x in lines))
     watching.terminate()
     thread.join()
-    process = bench.run(*COMMAND, '--once')
-    printed = process.communicate(timeout=20)[0]
+    process = bench.run(*WATCH, '--once')
+    printed = process.communicate(timeout=60)[0]
     assert process.returncode == 0
     assert re.search('^poses: 3 of about 1[0-9]$', printed, re.MULTILINE)
     assert re.search('^next: turn the sensor so that the .* points up', printed, re.MULTILINE)
 
 
 def test_once_without_a_node_is_one_line(bench: Any) -> None:
-    process = bench.run(*COMMAND, '--once')
-    printed = process.communicate(timeout=20)[0]
+    process = bench.run(*WATCH, '--once')
+    printed = process.communicate(timeout=60)[0]
     assert process.returncode == 2
     assert printed == (
         'accel-calib watch: found no calibrator /calibrator, expected a message on '
@@ -122,22 +123,22 @@ def test_once_without_a_node_is_one_line(bench: Any) -> None:
 
 
 def test_node_in_a_namespace_is_found_by_its_name(bench: Any) -> None:
-    bench.run('-m', 'accel_calib.ros.calibrator', '--ros-args', '-r', '__ns:=/left')
+    bench.run(*CALIBRATOR, '--ros-args', '-r', '__ns:=/left')
     bench.spin(lambda: bench.node.count_publishers('/left/calibrator/progress'))
     for arguments, status, words in (
             (['--node', 'left/calibrator'], 0, 'poses: 0 of about 12'),
             (['--ros-args', '-r', '__ns:=/left'], 0, 'poses: 0 of about 12'),
             ([], 2, 'set --node left/calibrator\n'),
             (['--node', 'left calibrator'], 2, 'expected the name of a node')):
-        process = bench.run(*COMMAND, '--once', *arguments)
-        printed = process.communicate(timeout=20)[0]
+        process = bench.run(*WATCH, '--once', *arguments)
+        printed = process.communicate(timeout=60)[0]
         assert process.returncode == status, printed
         assert words in printed
 
 
 def test_silence_of_the_node_is_reported(bench: Any) -> None:
     node = bench.calibrator()
-    process = bench.run(*COMMAND)
+    process = bench.run(*WATCH)
     lines, thread = lines_of(process)
     bench.spin(lambda: lines)
     bench.end(node, signal.SIGINT)
@@ -145,18 +146,18 @@ def test_silence_of_the_node_is_reported(bench: Any) -> None:
     bench.calibrator()
     bench.spin(lambda: any(line.endswith('arrive again\n') for line in lines))
     process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 0
+    assert process.wait(60) == 0
     thread.join()
 
 
 def test_reader_of_the_pipe_may_end(bench: Any) -> None:
     node = bench.calibrator()
-    with subprocess.Popen([sys.executable, *COMMAND], env=environment(bench), text=True,
+    with subprocess.Popen([sys.executable, *WATCH], env=environment(bench), text=True,
                           stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         assert process.stdout.readline()
         process.stdout.close()
         bench.end(node, signal.SIGINT)  # so that there is another line to write
-        assert process.wait(15) == 0
+        assert process.wait(60) == 0
         assert process.stderr.read() == ''

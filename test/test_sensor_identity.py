@@ -15,11 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accel_calib.cli.main import main
 from accel_calib.errors import AccelCalibError
 from accel_calib.files import read_calibration
 from accel_calib.session import Job, Mounting
-from accel_calib.sphere import spread_directions
+from inside import main, spread_directions
 import pytest
 from test_session import Driver
 

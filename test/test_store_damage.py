@@ -17,22 +17,29 @@ import tempfile
 from typing import Any
 
 from accel_calib.calibrate import fit_poses
-from accel_calib.crash import crash_words
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.files import read_calibration, read_poses, write_calibration
-from accel_calib.files.plain_yaml import MOST_BYTES
-from accel_calib.session.sensor_files import Lock
-from accel_calib.session.store import aside, Identity, load, Store, store_of, writing_advice
-from accel_calib.simulate import model_with, simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.units import units_of
+from faults.sample import sample
+from inside import (
+    aside,
+    Identity,
+    load_store,
+    Lock,
+    model_with,
+    MOST_BYTES,
+    SensorStore,
+    simulate_poses,
+    spread_directions,
+    store_of,
+    writing_advice,
+)
 import numpy as np
 import pytest
 from test_session import Driver
 
-SECONDS = 30
+HANG_S = 60
 NOBODY = 65534
-FORMAT = b'format: accel_calib calibration\n'
 EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]),
            'axis_gain': np.array([0.012, -0.015, 0.008])}
 IDENTITY = Identity('imu_link', '/imu/data_raw')
@@ -44,10 +51,10 @@ Readings = Callable[..., Any]
 def in_time() -> Iterator[None]:
     """End a test that hangs, such as one that reads a pipe."""
     def end(*_: object) -> None:
-        raise AssertionError(f'not ready within {SECONDS} s')
+        raise AssertionError(f'not ready within {HANG_S} s')
 
     before = signal.signal(signal.SIGALRM, end)
-    signal.alarm(SECONDS)
+    signal.alarm(HANG_S)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
@@ -75,29 +82,6 @@ def folder() -> Iterator[Path]:
     shutil.rmtree(made)
 
 
-@pytest.fixture(autouse=True)
-def expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Raise the errors that nobody expected, instead of a line about them."""
-    def fail(error: BaseException) -> str:
-        raise AssertionError('the last resort was reached') from error
-
-    monkeypatch.setattr('accel_calib.session.store.crash_words', fail)
-
-
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:len(path.read_bytes()) // 2])
-
-
-def spoil_a_byte(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] = 0xff
-    path.write_bytes(bytes(data))
-
-
-def append(text: bytes) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(path.read_bytes() + text)
-
-
 def replace_by(make: Callable[[Path], object]) -> Callable[[Path], object]:
     """Return a function that removes a file and makes something else in its place."""
     def replaced(path: Path) -> None:
@@ -112,41 +96,23 @@ def fill_folder(path: Path) -> None:
     (path / 'mine').write_text('kept')
 
 
-def lengthen(path: Path) -> None:
-    with path.open('r+b') as file:
-        file.truncate(MOST_BYTES + 1)
-
-
 DAMAGE: dict[str, Callable[[Path], object]] = {
-    'empty': lambda path: path.write_bytes(b''),
-    'zeros': lambda path: path.write_bytes(bytes(4096)),
-    'cut': cut,
-    'byte': spoil_a_byte,
-    'too_long': lengthen,
-    'folder': replace_by(Path.mkdir),
-    'full_folder': replace_by(fill_folder),
+    'bytes': lambda path: path.write_bytes(np.random.default_rng(1).bytes(4096)),
+    'folder': replace_by(fill_folder),
     'pipe': replace_by(os.mkfifo),
-    'socket': replace_by(lambda path: os.mknod(path, stat.S_IFSOCK | 0o600)),
     'link_to_nothing': replace_by(lambda path: path.symlink_to('nothing')),
-    'link_to_itself': replace_by(lambda path: path.symlink_to(path.name)),
-    'link_to_folder': replace_by(lambda path: path.symlink_to('.')),
-    'link_to_device': replace_by(lambda path: path.symlink_to('/dev/null')),
 }
 OF_CALIBRATION: dict[str, Callable[[Path], object]] = {
     **DAMAGE,
-    'nested': append(b'x: ' + b'[' * 100_000 + b'\n'),
-    'aliases': append(b''.join(b'x%d: &x%d [%s]\n' % (k, k, b'1' if not k else b', '.join(
-        [b'*x%d' % (k - 1)] * 9)) for k in range(9))),
-    'other_text': lambda path: path.write_bytes(b'alias ll="ls -l"\n'),
-    'newer': lambda path: path.write_bytes(FORMAT + b'version: 99\n'),
+    'link_to_itself': replace_by(lambda path: path.symlink_to(path.name)),
+    'link_to_device': replace_by(lambda path: path.symlink_to('/dev/null')),
+    'cut': lambda path: os.truncate(path, path.stat().st_size // 2),
+    'newer': lambda path: path.write_text('format: accel_calib calibration\nversion: 99\n'),
 }
 OF_POSES: dict[str, Callable[[Path], object]] = {
-    **{name: make for name, make in DAMAGE.items() if name not in ('cut', 'byte')},
-    'header_alone': lambda path: path.write_text('ax,ay,az\n'),
-    'words': lambda path: path.write_text('ax,ay,az\n1,2,words\n'),
-    'short_row': lambda path: path.write_text('ax,ay,az\n0.1,0.2,9.8\n1,2\n'),
+    **DAMAGE,
     'not_finite': lambda path: path.write_text('ax,ay,az\n1,2,nan\n'),
-    'binary': lambda path: path.write_bytes(np.random.default_rng(1).bytes(4096)),
+    'too_long': lambda path: os.truncate(path, MOST_BYTES + 1),
 }
 
 
@@ -157,7 +123,7 @@ def files() -> dict[str, bytes]:
     poses = simulate_poses(model, spread_directions(12), rng, noise_g=0.0005)
     poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
     with tempfile.TemporaryDirectory() as folder:
-        store = Store(Path(folder) / 'known.yaml', IDENTITY, 'm/s2')
+        store = SensorStore(Path(folder) / 'known.yaml', IDENTITY, 'm/s2')
         store.save_poses(poses)
         write_calibration(store.calibration, fit_poses(poses, units, sensor='imu_link',
                                                        date='2026-01-01T00:00:00+00:00'))
@@ -165,11 +131,11 @@ def files() -> dict[str, bytes]:
 
 
 @pytest.fixture
-def store(tmp_path: Path, files: dict[str, bytes]) -> Store:
+def store(tmp_path: Path, files: dict[str, bytes]) -> SensorStore:
     """Return a store with a calibration and 12 poses."""
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-    return Store(tmp_path / 'known.yaml', IDENTITY, 'm/s2')
+    return SensorStore(tmp_path / 'known.yaml', IDENTITY, 'm/s2')
 
 
 def kept(path: Path) -> str:
@@ -200,7 +166,7 @@ def works(path: Path, readings: Readings) -> None:
 
 @pytest.mark.parametrize('damage', OF_CALIBRATION)
 def test_whatever_is_in_place_of_the_calibration_is_kept_and_replaced(
-        damage: str, store: Store, readings: Readings) -> None:
+        damage: str, store: SensorStore, readings: Readings) -> None:
     OF_CALIBRATION[damage](store.calibration)
     found = kept(store.calibration)
     driver = Driver(calibration_file=str(store.calibration))
@@ -215,7 +181,7 @@ def test_whatever_is_in_place_of_the_calibration_is_kept_and_replaced(
 
 @pytest.mark.parametrize('damage', OF_POSES)
 def test_whatever_is_in_place_of_the_poses_is_kept_and_replaced(
-        damage: str, store: Store, readings: Readings) -> None:
+        damage: str, store: SensorStore, readings: Readings) -> None:
     OF_POSES[damage](store.poses)
     found = kept(store.poses)
     driver = Driver(calibration_file=str(store.calibration))
@@ -228,9 +194,9 @@ def test_whatever_is_in_place_of_the_poses_is_kept_and_replaced(
     assert found in [kept(each) for each in store.calibration.parent.iterdir()]
 
 
-@pytest.mark.parametrize('seed', range(40))
+@pytest.mark.parametrize('seed', sample(range(40), 4))
 def test_the_calibrator_starts_with_files_of_which_bytes_were_changed(
-        seed: int, store: Store) -> None:
+        seed: int, store: SensorStore) -> None:
     rng = np.random.default_rng(seed)
     for path in (store.calibration, store.poses):
         data = bytearray(path.read_bytes())
@@ -251,11 +217,11 @@ LARGE = ['1e29,0,0', '0,-9e29,0', '1e-320,0,0', '0,0,0', '0,0,9e15']
 
 @pytest.mark.parametrize(('largest', 'most'), [(HUGE, 1e300), (LARGE, 1e29)])
 def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
-        largest: list[str], most: float, store: Store, readings: Readings) -> None:
+        largest: list[str], most: float, store: SensorStore, readings: Readings) -> None:
     rows = [f'{reading},{std},{std},{std},{count}\n' for reading in largest
             for std, count in ((0, 1), (most, 1.0 / most), (1.0 / most, most))]
     store.poses.write_text('ax,ay,az,std_x,std_y,std_z,count\n' + ''.join(rows))
-    assert bool(load(store).notes) is (most > 1e30)
+    assert bool(load_store(store).notes) is (most > 1e30)
     works(store.calibration, readings)
 
 
@@ -293,7 +259,7 @@ def refuses(path: Path, kind: str, readings: Readings) -> None:
 
 def test_files_that_nobody_may_read_are_kept_and_replaced(folder: Path, readings: Readings
                                                           ) -> None:
-    store = Store(folder / 'imu.yaml', IDENTITY, 'm/s2')
+    store = SensorStore(folder / 'imu.yaml', IDENTITY, 'm/s2')
     for path in (store.calibration, store.poses):
         path.write_text('secret')
         path.chmod(0)
@@ -325,7 +291,7 @@ def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
     assert (inner / 'imu_poses.csv').read_text() == 'ax,ay,az\n1,2,words\n'
 
 
-def test_a_full_disk_is_reported_and_leaves_the_files_as_they_are(store: Store,
+def test_a_full_disk_is_reported_and_leaves_the_files_as_they_are(store: SensorStore,
                                                                   readings: Readings) -> None:
     before = {path: path.read_bytes() for path in (store.calibration, store.poses)}
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -370,18 +336,18 @@ def test_advice_about_a_path_that_no_file_can_have_is_another_path() -> None:
     assert 'another calibration_file' in writing_advice(OSError(errno.ENAMETOOLONG, 'long'))
 
 
-def test_leftovers_are_removed_and_one_that_cannot_be_does_not_matter(store: Store) -> None:
+def test_leftovers_are_removed_and_one_that_cannot_be_does_not_matter(store: SensorStore) -> None:
     left = [store.calibration.with_name(f'.{path.name}.{number}.tmp') for number in (1, 2)
             for path in (store.calibration, store.poses)]
     for path in left:
         path.write_text('half')
-    assert load(store).notes == ()
+    assert load_store(store).notes == ()
     assert not any(path.exists() for path in left)
     left[0].mkdir()
     left[2].mkdir()
     for path in left[1::2]:
         path.write_text('half')
-    loaded = load(store)
+    loaded = load_store(store)
     assert loaded.calibration is not None
     assert len(loaded.poses) == 12
     assert [path.exists() for path in left] == [True, False, True, False]
@@ -397,7 +363,7 @@ def test_leftovers_are_removed_and_one_that_cannot_be_does_not_matter(store: Sto
     Path.mkdir, os.mkfifo, lambda path: path.symlink_to(path.with_name('precious')),
     lambda path: os.mknod(path, stat.S_IFSOCK | 0o600)])
 def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
-        make: Callable[[Path], object], store: Store) -> None:
+        make: Callable[[Path], object], store: SensorStore) -> None:
     precious = store.calibration.with_name('precious')
     precious.write_text('kept')
     lock = store.calibration.with_name('known.lock')
@@ -409,7 +375,7 @@ def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
     assert Driver(calibration_file=str(store.calibration)).session.active.calibration
 
 
-def test_undo_passes_over_what_is_not_a_step(store: Store) -> None:
+def test_undo_passes_over_what_is_not_a_step(store: SensorStore) -> None:
     text = store.calibration.read_text()
     step = store.calibration.with_name('known.yaml.before1')
     step.write_text(text.replace('date: ', 'date: 2025 # '))
@@ -428,17 +394,17 @@ def test_undo_passes_over_what_is_not_a_step(store: Store) -> None:
     assert store.steps() == [4]
 
 
-@pytest.mark.parametrize('name', ['read_calibration', 'read_poses'])
+@pytest.mark.parametrize(('broken', 'file_of'), [('yaml.parse', 'known.yaml'),
+                                                 ('numpy.loadtxt', 'known_poses.csv')])
 def test_an_error_that_nobody_expected_does_not_stop_the_calibrator(
-        name: str, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(path: Path) -> None:
-        raise ZeroDivisionError(path.name)
+        broken: str, file_of: str, store: SensorStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*given: Any, **options: Any) -> None:
+        raise ZeroDivisionError(broken)
 
-    monkeypatch.setattr(f'accel_calib.session.store.{name}', fail)
-    monkeypatch.setattr('accel_calib.session.store.crash_words', crash_words)
+    monkeypatch.setattr(broken, fail)
     driver = Driver(calibration_file=str(store.calibration))
-    assert 'internal error: ZeroDivisionError: known' in driver.logged()
-    assert 'kept as' in driver.logged()
+    assert f'internal error: ZeroDivisionError: {broken}' in driver.logged()
+    assert f'kept as {store.calibration.with_name(file_of)}.damaged1' in driver.logged()
     file = driver.logged().split('with the file ')[1].split(';')[0]
     assert 'Traceback' in Path(file).read_text()
     Path(file).unlink()
@@ -453,7 +419,7 @@ def test_things_are_renamed_without_replacing_others(tmp_path: Path) -> None:
         aside(tmp_path / 'a.yaml', 'damaged')
 
 
-def test_poses_are_read_from_a_store_whose_calibration_is_a_pipe(store: Store) -> None:
+def test_poses_are_read_from_a_store_whose_calibration_is_a_pipe(store: SensorStore) -> None:
     store.calibration.unlink()
     os.mkfifo(store.calibration)
-    assert len(load(store).poses) == len(read_poses(store.poses)) == 12
+    assert len(load_store(store).poses) == len(read_poses(store.poses)) == 12

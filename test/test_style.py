@@ -1,10 +1,11 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rules of the project that linters do not check: imports between parts."""
+"""Rules of the project that linters do not check: imports between parts, and those of tests."""
 
 import ast
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 import re
 
@@ -37,9 +38,16 @@ LAYERS = (
 RANKS = {part: rank for rank, layer in enumerate(LAYERS) for part in layer}
 ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|srvs|interfaces)')
 
+MODULES = sorted(PACKAGE.rglob('*.py'))
+BASE = {f'accel_calib.{name}' for name in ('errors', 'table', 'units')}
+"""Modules that tests import from directly."""
 
-def name_of(path: Path) -> str:
-    return str(path.relative_to(ROOT))
+FACES = {'accel_calib', *(f'accel_calib.{each.parent.name}'
+                          for each in PACKAGE.glob('*/__init__.py'))}
+"""The package and its folders; tests import what they export."""
+
+GATHERED = [ROOT / 'test' / name for name in ('inside.py', 'inside_ros.py')]
+TESTS = sorted({*(ROOT / 'test').rglob('*.py')} - {*GATHERED})
 
 
 def imports_of(path: Path) -> Iterator[str]:
@@ -58,25 +66,65 @@ def part_of(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix('').parts[0]
 
 
-MODULES = sorted(PACKAGE.rglob('*.py'))
+def test_imports_point_one_way() -> None:
+    for path in MODULES:
+        part = part_of(path)
+        if part == '__init__':
+            continue  # imports the public names only for types
+        assert part in RANKS, f'add {part} to LAYERS'
+        inside = [name for name in imports_of(path) if name.startswith('accel_calib.')]
+        others = {name.split('.')[1] for name in inside} - {part, '__version__'}
+        wrong = {other for other in others if RANKS.get(other, len(LAYERS)) >= RANKS[part]}
+        assert not wrong, f'{path} imports {wrong}, which is not below it'
 
 
-@pytest.mark.parametrize('path', MODULES, ids=name_of)
-def test_imports_point_one_way(path: Path) -> None:
-    part = part_of(path)
-    if part == '__init__':
-        return  # imports the public names only for types
-    assert part in RANKS, f'add {part} to LAYERS'
-    inside = [name for name in imports_of(path) if name.startswith('accel_calib.')]
-    others = {name.split('.')[1] for name in inside} - {part, '__version__'}
-    wrong = {other for other in others if RANKS.get(other, len(LAYERS)) >= RANKS[part]}
-    assert not wrong, f'{part} imports {wrong}, which is not below it'
+def test_only_the_nodes_import_ros() -> None:
+    for path in MODULES:
+        ros = {name for name in imports_of(path) if ROS.fullmatch(name.split('.')[0])}
+        assert part_of(path) == 'ros' or not ros, path
 
 
-@pytest.mark.parametrize('path', MODULES, ids=name_of)
-def test_only_the_nodes_import_ros(path: Path) -> None:
-    ros = {name for name in imports_of(path) if ROS.fullmatch(name.split('.')[0])}
-    assert part_of(path) == 'ros' or not ros
+def module_of(name: str) -> str:
+    """Return the module of a full name: its longest part that is a file or a folder."""
+    path = ROOT / name.replace('.', '/')
+    known = path.is_dir() or path.with_suffix('.py').is_file()
+    return name if known else module_of(name.rpartition('.')[0])
+
+
+def is_on_a_face(name: str) -> bool:
+    """Return whether a full name is a base module or a face, or is exported by one."""
+    module, _, what = name.rpartition('.')
+    return name in BASE | FACES or module in BASE or (
+        module in FACES and what in getattr(import_module(module), '__all__', ()))
+
+
+def strings_of(path: Path) -> Iterator[str]:
+    """Yield the full names of modules in the strings of a test."""
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = re.sub(r'from (accel_calib[\w.]*) import (\w+)', r'\1.\2', node.value)
+            yield from map(module_of, re.findall(r'accel_calib(?:\.\w+)*', text))
+
+
+def test_tests_name_no_file_of_the_package() -> None:
+    for path in TESTS:
+        imported = [name for name in imports_of(path) if name.split('.')[0] == 'accel_calib']
+        wrong = [name for name in (*imported, *strings_of(path)) if not is_on_a_face(name)]
+        assert not wrong, f'{path}: import {wrong} through a face or {GATHERED[0].name}'
+
+
+@pytest.mark.parametrize('path', GATHERED)
+def test_names_are_gathered_only_for_tests_that_use_them(path: Path) -> None:
+    nodes = [*ast.walk(ast.parse(path.read_text(encoding='utf-8')))]
+    imported = {each.asname or each.name for node in nodes if isinstance(node, ast.ImportFrom)
+                and node.module != '__future__' for each in node.names}
+    names = [node for node in nodes if isinstance(node, ast.Name)]
+    here = {node.id for node in names if isinstance(node.ctx, ast.Load)}
+    made = {node.id for node in names} - here
+    used = {name.removeprefix(f'{path.stem}.') for test in TESTS for name in imports_of(test)}
+    unused = (imported | made) - here - used
+    assert imported
+    assert not unused, f'remove {unused}'
 
 
 @pytest.mark.parametrize('linter', ['ament_flake8', 'ament_pep257'])

@@ -4,11 +4,12 @@
 """Files that are written: never onto an input or another kind of file, and never half."""
 
 import os
+import shutil
 import stat
 
-from accel_calib.cli.main import main
 from accel_calib.errors import InputError
-from accel_calib.files.atomic import previous, write_atomically
+from accel_calib.files import write_atomically
+from inside import main, previous
 import pytest
 
 
@@ -16,17 +17,24 @@ def run(*arguments):
     return main([str(argument) for argument in arguments])
 
 
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('made')
+    assert run('simulate', '-o', folder / 'rec.csv', '--recording', '--poses', 14, '--dwell', 2,
+               '--rate', 50) == 0
+    assert run('simulate', '-o', folder / 'poses.csv', '--poses', 14) == 0
+    assert run('fit', folder / 'poses.csv', '-o', folder / 'cal.yaml') == 0
+    (folder / 'notes.txt').write_text('my notes\n')
+    (folder / 'out').mkdir()
+    (folder / 'more').mkdir()
+    (folder / 'more' / 'poses.csv').write_bytes((folder / 'poses.csv').read_bytes())
+    return folder
+
+
 @pytest.fixture
-def here(tmp_path, monkeypatch, capsys):
+def here(made, tmp_path, monkeypatch):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    assert run('simulate', '-o', 'rec.csv', '--recording', '--poses', 14, '--dwell', 2) == 0
-    assert run('simulate', '-o', 'poses.csv', '--poses', 30) == 0
-    assert run('fit', 'poses.csv', '-o', 'cal.yaml') == 0
-    (tmp_path / 'notes.txt').write_text('my notes\n')
-    (tmp_path / 'out').mkdir()
-    (tmp_path / 'more').mkdir()
-    (tmp_path / 'more' / 'poses.csv').write_bytes((tmp_path / 'poses.csv').read_bytes())
-    capsys.readouterr()
     return tmp_path
 
 
@@ -119,7 +127,7 @@ def test_only_a_regular_writable_file_is_replaced(tmp_path):
 def test_a_link_at_a_temporary_name_is_not_followed(tmp_path, monkeypatch):
     victim = tmp_path / 'victim'
     victim.write_text('mine\n')
-    monkeypatch.setattr('accel_calib.files.atomic.secrets.token_hex', lambda size: 'known')
+    monkeypatch.setattr('secrets.token_hex', lambda size: 'known')
     (tmp_path / '.file.known.tmp').symlink_to(victim)
     with pytest.raises(FileExistsError):
         write(tmp_path / 'file')
@@ -162,9 +170,9 @@ def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
 
 
 def test_a_full_disk_has_its_own_advice(here, capsys, monkeypatch):
-    def full(path, write):
-        raise OSError(28, 'No space left on device', str(path))
+    def full(handle):
+        raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('accel_calib.files.tables.write_atomically', full)
+    monkeypatch.setattr(os, 'fsync', full)
     assert run('simulate', '-o', 'x.csv') == 2
     assert 'free space on the disk' in capsys.readouterr().err

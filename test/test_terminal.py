@@ -9,15 +9,11 @@ import pty
 import subprocess
 import sys
 
-from accel_calib.cli.characters import in_one_line, shown
-from accel_calib.cli.demo import _table as demo_table
-from accel_calib.cli.main import main
-from accel_calib.cli.terminal import Output
-from accel_calib.significant import with_sd
+from inside import COMMAND, in_one_line, main, Output, shown, with_sd
 import numpy as np
 import pytest
 
-COMMAND = [sys.executable, '-m', 'accel_calib.cli.main']
+RUN = [sys.executable, *COMMAND]
 
 
 @pytest.fixture
@@ -29,42 +25,40 @@ def poses(tmp_path, capsys):
     return path
 
 
-def printed(*arguments, encoding='utf-8', columns=80, status=0):
-    """Return the output of the real command, and check that its error output is empty."""
-    done = subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, timeout=120,
-                          check=False, env={**os.environ, 'COLUMNS': str(columns),
-                                            'PYTHONIOENCODING': encoding})
-    assert done.returncode == status, done.stderr.decode(encoding)
-    return done.stdout.decode(encoding)
+@pytest.fixture
+def printed(monkeypatch, capsys):
+    """Return a function that runs a command on a terminal of this width, and returns its text."""
+    def run(*arguments, columns=80):
+        monkeypatch.setenv('COLUMNS', str(columns))
+        assert main([str(argument) for argument in arguments]) == 0
+        return capsys.readouterr().out
+
+    return run
 
 
 @pytest.mark.parametrize('columns', [80, 60])
-def test_output_fits_the_width(columns, poses, tmp_path):
-    stored = tmp_path / 'c.yaml'
-    rest = tmp_path / 'rest.csv'
-    assert main(['simulate', '-o', str(rest), '--recording', '--poses', '1', '--dwell', '600',
-                 '--rate', '20']) == 0
-    text = ''.join([printed('fit', poses, '-o', stored, columns=columns),
-                    printed('calibrate', poses, '-o', tmp_path / 'd.yaml', columns=columns),
-                    printed('history', stored, tmp_path / 'd.yaml', columns=columns),
-                    printed('export', stored, '--to', 'px4', columns=columns),
-                    printed('noise', rest, columns=columns),
-                    printed('refine', poses, columns=columns),
-                    printed('verify', poses, '-c', stored, columns=columns),
-                    printed('compare', stored, stored, columns=columns),
-                    printed(columns=columns)])
+def test_output_fits_the_width(columns, poses, printed, tmp_path):
+    stored, other, rest = (tmp_path / name for name in ('c.yaml', 'd.yaml', 'rest.csv'))
+    printed('simulate', '-o', rest, '--recording', '--poses', '1', '--dwell', '600', '--rate',
+            '20')
+    text = ''.join(printed(*arguments, columns=columns) for arguments in (
+        ('fit', poses, '-o', stored), ('calibrate', poses, '-o', other),
+        ('history', stored, other), ('export', stored, '--to', 'px4'), ('noise', rest),
+        ('refine', poses), ('verify', poses, '-c', stored), ('compare', stored, stored), ()))
     wide = [line for line in text.splitlines() if len(line) > columns
             and str(tmp_path) not in line]
+    assert len(text.splitlines()) > 100
     assert not wide
 
 
-@pytest.mark.parametrize('encoding', ['ascii', 'cp1252', 'latin-1'])
+@pytest.mark.parametrize('encoding', ['ascii', 'cp1252'])
 def test_output_of_an_old_encoding_has_replacements(encoding, poses, tmp_path):
-    stored = tmp_path / 'c.yaml'
-    text = printed('fit', poses, '-o', stored, encoding=encoding)
+    done = subprocess.run([*RUN, 'fit', str(poses), '-o', str(tmp_path / 'c.yaml')],
+                          capture_output=True, check=True,
+                          env={**os.environ, 'PYTHONIOENCODING': encoding})
+    text = done.stdout.decode(encoding)
     assert ('+-' if encoding == 'ascii' else '±') in text
     assert '?' not in text
-    assert stored.exists()
 
 
 def test_a_long_line_breaks_at_words_and_a_path_stays_whole(monkeypatch):
@@ -86,32 +80,17 @@ def test_a_value_has_as_many_digits_as_its_deviation_has_meaning(value, sd, text
     assert with_sd(value, sd) == text
 
 
-def test_parameters_that_the_model_lacks_are_absent(poses):
+def test_parameters_that_the_model_lacks_are_absent(poses, printed):
     text = printed('fit', poses, '--model', '4')
     assert 'gain x ' in text
     assert 'gain xy' not in text
     assert 'gain xy' in printed('fit', poses, '--model', '10')
 
 
-def test_brackets_in_a_table_are_shown_as_they_are():
-    outcome = {f'{name}_{when}_{unit}': 1.0 for name, unit in (
-        ('rms', 'mg'), ('max', 'mg'), ('tilt', 'deg')) for when in ('before', 'after')}
-    output = Output()
-    output.file = io.StringIO()
-    output.print(demo_table({**outcome, 'rests': 5, 'seconds': 30.0}))
-    assert 'RMS [mg]' in output.file.getvalue()
-    assert '\\' not in output.file.getvalue()
-
-
 def test_control_characters_are_escaped():
     assert in_one_line('a\x1b[31m\nb') == 'a\\x1b[31m b'
     assert shown('\x1b[31m', 'utf-8') == '\\x1b[31m'
     assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
-
-
-def test_the_command_alone_shows_the_help(capsys):
-    assert main([]) == 0
-    assert 'calibrate' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(('arguments', 'meant'), [
@@ -127,16 +106,16 @@ def test_a_misspelt_name_gets_a_suggestion_in_one_line(arguments, meant, capsys)
 
 def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
     rng = np.random.default_rng(3)
-    path, count = tmp_path / 'rest.csv', 400_000
+    path, count = tmp_path / 'rest.csv', 50_000
     values = np.column_stack([np.arange(count) / 100.0, rng.normal((0.1, 0.2, 9.8), 0.02,
                                                                    (count, 3))])
     np.savetxt(path, values, fmt='%.4f', delimiter=',', header='time,ax,ay,az', comments='')
     ours, theirs = pty.openpty()
-    process = subprocess.Popen([*COMMAND, 'capture', str(path), '-o', str(tmp_path / 'p.csv')],
+    process = subprocess.Popen([*RUN, 'capture', str(path), '-o', str(tmp_path / 'p.csv')],
                                stdout=subprocess.PIPE, stderr=theirs,
                                env={**os.environ, 'TERM': 'xterm'})
     os.close(theirs)
-    process.communicate(timeout=120)
+    process.communicate()
     shown_text = os.read(ours, 1 << 16).decode()
     os.close(ours)
     assert 'samples' in shown_text
@@ -146,8 +125,8 @@ def test_the_shell_completes_options(tmp_path):
     pytest.importorskip('argcomplete')
     out = tmp_path / 'completions'
     line = 'accel-calib fit --mod'
-    subprocess.run(COMMAND, env={**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line,
-                                 'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
-                                 '_ARGCOMPLETE_STDOUT_FILENAME': str(out)},
-                   timeout=60, check=False)
+    subprocess.run(RUN, env={**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line,
+                             'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
+                             '_ARGCOMPLETE_STDOUT_FILENAME': str(out)},
+                   check=False)
     assert '--model' in out.read_text(encoding='utf-8')

@@ -3,13 +3,20 @@
 
 """Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
 
-from accel_calib.calibrate.quality import with_history
+from accel_calib.calibrate import with_history
 from accel_calib.errors import InputError
-from accel_calib.estimate.fit import estimate
-from accel_calib.model import Model, predict
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions
-from accel_calib.thermal import acting_temperature, Lag, low_passed, rate_of, ThermalStream
+from accel_calib.estimate import estimate
+from inside import (
+    acting_temperature,
+    Lag,
+    low_passed,
+    Model,
+    predict,
+    random_directions,
+    rate_of,
+    simulate_poses,
+    ThermalStream,
+)
 import numpy as np
 import pytest
 

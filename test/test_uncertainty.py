@@ -3,7 +3,7 @@
 
 """Intervals by the stated variance contain 95 %, also if the stated noise is wrong."""
 
-from accel_calib.estimate.equations import variance_factor
+from accel_calib.estimate import variance_factor
 import numpy as np
 import pytest
 

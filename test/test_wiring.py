@@ -7,15 +7,19 @@ from itertools import permutations, product
 import json
 
 from accel_calib.calibrate import ARBITRARY_HEADING, fit_poses, level, with_given_mounting
-from accel_calib.calibrate.checks import axes_of, fault_of
-from accel_calib.cli.main import main
 from accel_calib.errors import InputError
 from accel_calib.files import write_table
-from accel_calib.rotations import rotation_from_rpy
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import random_directions, spread_directions
 from accel_calib.table import Poses
 from accel_calib.units import Units, units_of
+from inside import (
+    axes_of,
+    fault_of,
+    main,
+    random_directions,
+    rotation_from_rpy,
+    simulate_poses,
+    spread_directions,
+)
 import numpy as np
 import pytest
 from shared import sensor

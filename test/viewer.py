@@ -56,7 +56,7 @@ class Viewer:
 
     def send(self, text: str) -> None:
         """Send a text."""
-        asyncio.run_coroutine_threadsafe(self._socket.send_str(text), self._loop).result(5.0)
+        asyncio.run_coroutine_threadsafe(self._socket.send_str(text), self._loop).result(120.0)
 
     def begin(self, command: str) -> int:
         """Ask for a command, and return the number of its answer."""
@@ -80,7 +80,8 @@ class Viewer:
 
     @property
     def state(self) -> dict[str, Any]:
-        """Return the newest state."""
+        """Return the newest state; wait for the first one."""
+        wait(lambda: self.of('state'))
         return self.of('state')[-1]
 
     def close(self) -> None:
@@ -100,7 +101,7 @@ def fetch(url: str, method: str = 'GET', **headers: str) -> tuple[int, dict[str,
     return asyncio.run(run())
 
 
-def wait(until: Callable[[], Any], seconds: float = 20.0) -> None:
+def wait(until: Callable[[], Any], seconds: float = 120.0) -> None:
     """Wait until a condition holds."""
     ends = time.monotonic() + seconds
     while not until():

@@ -27,11 +27,11 @@ from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .fleet_prior import fit_with_fleet, FleetPrior
 from .gate import gated
 from .levelling import ARBITRARY_HEADING, level, set_heading, with_given_mounting
-from .mounting import FrameName, FRAMES
+from .mounting import flat_direction, FrameName, FRAMES
 from .outside import joined_ranges, Outside, outside, USES_LIMIT
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
-from .quality import in_g, NOT_LOCATED, UNCHECKED, Verification, verify
+from .quality import in_g, NOT_LOCATED, UNCHECKED, Verification, verify, with_history
 from .rest_noise import (
     gyro_bias_of,
     GyroBias,
@@ -46,7 +46,7 @@ __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NA
            'FleetPrior', 'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside',
            'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
            'check_units', 'converted', 'directions_of', 'fit_partial', 'fit_poses',
-           'fit_with_fleet', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
-           'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples', 'outlook',
-           'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
-           'with_given_mounting', 'with_rest_noise']
+           'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges',
+           'level', 'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples',
+           'outlook', 'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
+           'with_given_mounting', 'with_history', 'with_rest_noise']

@@ -10,3 +10,20 @@ that would distort a fit. `closed_form` computes start values. `geometry` comput
 determine before any fit.
 
 """
+
+from .closed_form import closed_form, faces, fit_12, lower_triangular, sensing_axes
+from .equations import variance_factor
+from .fit import estimate, Fit, judge, Prior
+from .geometry import (
+    coverage,
+    dilution,
+    error_left_in,
+    identifiability,
+    pose_noise,
+    poses_needed,
+    rows_of,
+)
+
+__all__ = ['Fit', 'Prior', 'closed_form', 'coverage', 'dilution', 'error_left_in', 'estimate',
+           'faces', 'fit_12', 'identifiability', 'judge', 'lower_triangular', 'pose_noise',
+           'poses_needed', 'rows_of', 'sensing_axes', 'variance_factor']

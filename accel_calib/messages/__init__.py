@@ -8,3 +8,28 @@ Serialized sensor_msgs/Imu messages, from bags and from topics.
 `correction` corrects many messages or single ones.
 
 """
+
+from .correction import corrected, motion_of, output_frame, Rewriter
+from .layout import (
+    ACCELERATION,
+    ACCELERATION_COVARIANCE,
+    ANGULAR_VELOCITY,
+    ANGULAR_VELOCITY_COVARIANCE,
+    doubles_at,
+    frame_ids,
+    IMU_DOUBLES,
+    joined,
+    Layout,
+    layout_of,
+    Messages,
+    ORIENTATION,
+    ORIENTATION_COVARIANCE,
+    renamed,
+    samples_of,
+    stamps_of,
+)
+
+__all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
+           'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
+           'Layout', 'Messages', 'Rewriter', 'corrected', 'doubles_at', 'frame_ids', 'joined',
+           'layout_of', 'motion_of', 'output_frame', 'renamed', 'samples_of', 'stamps_of']

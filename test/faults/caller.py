@@ -28,7 +28,7 @@ SHARES = {'capture_pose': 18, 'undo_pose': 3, 'fit': 12, 'refine': 3, 'set_level
           'enable': 8, 'self_test': 10}
 """How often each service is called, relative to the others."""
 
-_LIMIT = 10.0
+_LIMIT = 60.0
 """Time after which a call counts as not answered [s]."""
 
 _PAUSE = 0.05

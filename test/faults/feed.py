@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from accel_calib.files import write_table
-from accel_calib.model import Model
-from accel_calib.simulate import simulate_poses
-from accel_calib.sphere import spread_directions
 from accel_calib.units import STANDARD_GRAVITY
+from inside import Model, simulate_poses, spread_directions
 import numpy as np
 
 _AT_ONCE = 5
@@ -29,7 +27,7 @@ def start_poses(path: Path, count: int) -> None:
                                          std=poses['std'] * STANDARD_GRAVITY))
 
 
-def send_until(bench: Any, turned: Any, over: Callable[[], Any], seconds: float = 30.0) -> None:
+def send_until(bench: Any, turned: Any, over: Callable[[], Any], seconds: float = 60.0) -> None:
     """Publish readings until a condition holds; they go on where the last call ended."""
     def sent() -> Any:
         for _ in range(_AT_ONCE):

@@ -7,9 +7,10 @@ Seeded damage to files of every kind that is read, and random files.
 Most cases change a sound file: bytes flipped, removed, repeated or inserted, numbers replaced by
 others, the file cut or joined with another one. Others are made at random: tables (``table``),
 calibrations with values of wrong types (``tree``), bags of damaged messages (``messages``). The
-reader must end with a result or with an error of this package, print nothing, and keep within a
-time limit. ``command`` runs the command line on files of all kinds. It must end with exit status 0
-or 1, or with 2 and one line.
+reader must end with a result or with an error of this package in one line, print nothing, and keep
+within a time limit. Bags are also corrected, and calibrations that are read are used. ``command``
+runs the command line on files of all kinds. It must end with exit status 0 or 1, or with 2 and one
+line.
 
 Run many cases by hand: ``python test/faults/fuzz.py --count 100000 --seed 7 csv yaml``.
 
@@ -21,6 +22,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from functools import cache
 import io
 import os
 from pathlib import Path
@@ -36,12 +38,19 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 import accel_calib as ac  # noqa: E402
-from accel_calib.cli.main import main as command_line  # noqa: E402
-from accel_calib.errors import AccelCalibError, InputError  # noqa: E402
-from accel_calib.files import LogOptions, read_calibration, read_log, write_table  # noqa: E402
-from accel_calib.intake import poses_of  # noqa: E402
+from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError  # noqa: E402
+from accel_calib.files import (  # noqa: E402
+    correct_bag,
+    LogOptions,
+    read_calibration,
+    read_log,
+    write_table,
+)
+from bag_files import a_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
 from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
+from inside import format_calibration, parse_calibration, poses_of  # noqa: E402
+from inside import main as command_line  # noqa: E402
 import numpy as np  # noqa: E402
 
 Rng = np.random.Generator
@@ -52,7 +61,10 @@ _NUMBER = re.compile(rb'-?\d+\.?\d*')
 _REFUSAL = re.compile(r'(note: [^\n]*\n(  [^\n]*\n)*)*accel-calib [^\n]*\n')
 """What a refused command prints: one line, after notes about a calibration edited by hand."""
 
-_LIMIT_S = 20
+LONGEST_LINE = 700
+"""Longest error message about a calibration [characters]."""
+
+_LIMIT_S = 60
 _SHOWN_EVERY = 10_000
 _SHOWN = 500
 _MEMORY = Path('/dev/shm')
@@ -72,9 +84,9 @@ class NotAllowedError(Exception):
 
 def damaged(data: bytes, rng: Rng) -> bytes:
     """Return data with one to four changes."""
-    for _ in range(int(rng.integers(1, 5))):
+    for _ in range(int(rng.choice([1, 1, 2, 4]))):
         at, length = (int(rng.integers(0, max(len(data), 1))) for _ in range(2))
-        span = slice(at, min(len(data), at + 1 + length % 64))
+        span = slice(at, min(len(data), at + 1 + length % int(rng.choice([1, 8, 64]))))
         how = int(rng.integers(0, 9))
         extreme = EXTREME[int(rng.integers(0, len(EXTREME)))]
         number = _NUMBER.search(data, at)
@@ -82,7 +94,8 @@ def damaged(data: bytes, rng: Rng) -> bytes:
             other = b'%.9g' % (rng.normal() * 10.0 ** int(rng.integers(-3, 5)))
             span, piece = slice(*number.span()), (other, extreme)[how - 7]
         else:
-            piece = (rng.bytes(1 + length % 8), extreme, b'', data[span] * 3, extreme,
+            flipped = bytes(each ^ 1 << length % 8 for each in data[span])
+            piece = (rng.bytes(1 + length % 8), extreme, b'', data[span] * 3, flipped,
                      data[span][::-1], data[at:])[how % 7]
         data = data[:at] if how == 6 and length % 2 else (
             data[:span.start] + piece + data[span.stop:])
@@ -111,6 +124,54 @@ def _log(path: Path, rng: Rng) -> object:
                                      rate=(None, 50.0)[int(rng.integers(2))]))
 
 
+def read_bag(path: Path, rng: Rng) -> object:
+    """Correct a bag, and read it; each error names the bag, and leaves no copy."""
+    out = path.parents[1] / ('copy.bag' if path.suffix == '.bag' else 'copy')
+    _remove(out)
+    refused = None
+    try:
+        correct_bag(path, _of_bags(), out)
+    except InputError as err:
+        refused = err
+    if out.exists() is (refused is not None) or list(out.parent.glob('.*')):
+        raise NotAllowedError(f'after {refused}, there are {sorted(out.parent.iterdir())}')
+    try:
+        read = _log(path, rng)
+    except InputError as err:
+        refused = err
+    if refused is None:
+        return read
+    if str(path) not in str(refused):
+        raise NotAllowedError(f'the bag is not named: {refused}')
+    raise refused
+
+
+_of_bags = cache(a_calibration)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or folder, if it exists."""
+    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _used(path: Path, rng: Rng) -> object:
+    """Read a calibration, correct a reading with it, and store it again."""
+    try:
+        found = read_calibration(path)
+    except StoredCalibrationError as err:
+        if not str(err).isprintable() or len(str(err)) > LONGEST_LINE:
+            raise NotAllowedError(f'not one short line: {str(err)!r}') from err
+        raise
+    context = {key: np.ones((1, 3) if key in ('std', 'rate', 'previous') else 1)
+               for key in found.model.needs}
+    force = found.correct(np.array([[0.3, -0.4, 0.8]]) * found.units.per_g, context)
+    for values in (force, found.offset, found.offset_sd, found.gain, found.gain_sd):
+        np.testing.assert_array_equal(np.isfinite(values), True)
+    again = parse_calibration(format_calibration(found), 'again.yaml')
+    np.testing.assert_array_equal(again.model.vector, found.model.vector)
+    return found
+
+
 def _fitted(path: Path, rng: Rng) -> object:
     """Fit the poses of a table, as captured if it holds samples."""
     return ac.fit(poses_of(path).poses)
@@ -133,7 +194,7 @@ def _run(path: Path, rng: Rng) -> object:
 def checked(arguments: list[str], out: Path) -> int:
     """Run a command, and check its exit status, what it prints and what it leaves."""
     for each in (out, out.with_suffix('.html')):
-        shutil.rmtree(each) if each.is_dir() else each.unlink(missing_ok=True)
+        _remove(each)
     before = set(out.parent.iterdir())
     with redirect_stderr(io.StringIO()) as errors, redirect_stdout(io.StringIO()) as printed:
         status = command_line(arguments)
@@ -158,13 +219,13 @@ def _of_all() -> Make:
 
 
 KINDS: dict[str, tuple[Callable[[], Make], Read]] = {
-    'yaml': (lambda: damage('yaml'), lambda path, rng: read_calibration(path)),
+    'yaml': (lambda: damage('yaml'), _used),
     'poses': (lambda: damage('poses'), _fitted),
-    **{kind: (lambda kind=kind: damage(kind), _log)  # type: ignore[misc]
+    **{kind: (lambda kind=kind: damage(kind), read_bag if kind in BAGS else _log)  # type: ignore
        for kind in ('csv', 'ulg', 'bin', *BAGS)},
     'table': (lambda: inputs.random_table, _log),
-    'tree': (inputs.random_trees, lambda path, rng: read_calibration(path)),
-    'messages': (inputs.random_messages, _log),
+    'tree': (inputs.random_trees, _used),
+    'messages': (inputs.random_messages, read_bag),
     'command': (_of_all, _run)}
 """Maker and reader of each kind."""
 

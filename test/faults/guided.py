@@ -41,7 +41,8 @@ def main() -> None:
         (corpus / f'sound_{number}').write_bytes(each.content[each.name])
     name, read = files[0].name, KINDS[kind][1]
     with TemporaryDirectory() as folder:
-        path = Path(folder) / name
+        path = Path(folder) / 'case' / name
+        path.parent.mkdir()
 
         def one(data: bytes) -> None:
             path.write_bytes(data)

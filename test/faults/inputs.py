@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import copy
 from dataclasses import dataclass
+import datetime
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -15,22 +17,27 @@ from typing import Any, TypeVar
 import accel_calib as ac
 from accel_calib.errors import AccelCalibError
 from accel_calib.files import read_log, write_calibration, write_table
+import bag_files as bags
+from inside import format_calibration, parse_calibration
 from mcap_file import McapFile, STORE
 import numpy as np
-import test_bag_damage as bags
-from test_yaml_damage import intact, STORED, VALUES
 import yaml
 
+STORED = Path(__file__).parents[1] / 'data'
 LOGS = STORED / 'logs'
 BAGS = {'mcap': ('mcap', 'mcap without chunks', 'mcap without summary', 'mcap folder'),
         'sqlite3': ('sqlite3',),
         'compressed': ('mcap lz4', 'mcap zstd', 'sqlite3 messages', 'mcap file'),
         'ros1': ('ros1', 'ros1 bz2', 'ros1 lz4')}
-"""Kinds of bags, and their names in test_bag_damage.py."""
+"""Kinds of bags, and their names in bag_files.py."""
 
 EXTREME = (b'1e300', b'-1e308', b'1e29', b'-2e-29', b'nan', b'inf', b'9' * 400, b'0x_', b'', b'"',
            b"'", b'\x00', b'\x1b[31m', b',', b';', b'\n', b'&a', b'*a', b'1:30', b'2026-01-01',
-           b'\xff\xfe')
+           b'\xff\xfe', b'[', b'- ', b'{', b'!!x', b'---')
+
+VALUES = (None, 1, -1, 0, 10**400, -10**30, 1.5, float('nan'), float('inf'), 1e300, 1e-300, 1e29,
+          True, '', 'x', 3000 * 'x', [], {}, [[]], [1], {'a': 1}, datetime.date(2001, 1, 1), b'ab',
+          'm/s2', 'g', 'native', '12', 'ideal', 'algebraic')
 
 Rng = np.random.Generator
 T = TypeVar('T')
@@ -192,6 +199,13 @@ def _wild(rng: Rng) -> str:
     if kind == 2:
         return str(int(rng.integers(-10**6, 10**6)))
     return rng.bytes(int(rng.integers(1, 6))).decode('latin-1')
+
+
+@cache
+def intact() -> tuple[str, ...]:
+    """Return texts of stored calibrations, of both versions."""
+    old = [path.read_text() for path in sorted(STORED.glob('calibration_1*.yaml'))]
+    return (*old, *(format_calibration(parse_calibration(text, 'x.yaml')) for text in old))
 
 
 def random_trees() -> Callable[[Rng], Files]:

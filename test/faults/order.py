@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import re
 
-from accel_calib.session.store import MOST_STEPS
+from inside import MOST_STEPS
 
 _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
 _FEWEST = 4

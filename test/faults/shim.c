@@ -13,6 +13,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/sendfile.h>
 #include <sys/stat.h>
 #include <sys/types.h>
 #include <unistd.h>
@@ -94,8 +95,8 @@ ssize_t write(int file, const void *data, size_t size)
     return REAL(write)(file, data, size);
 }
 
-#define OF_FILE(name, arguments, values)                                  \
-    int name arguments                                                    \
+#define OF_FILE(type, name, arguments, values)                            \
+    type name arguments                                                   \
     {                                                                     \
         if (inside_file(file) && fails())                                 \
             return -1;                                                    \
@@ -110,10 +111,14 @@ ssize_t write(int file, const void *data, size_t size)
         return REAL(name) values;                                         \
     }
 
-OF_FILE(fsync, (int file), (file))
-OF_FILE(fchmod, (int file, mode_t mode), (file, mode))
-OF_FILE(fchown, (int file, uid_t user, gid_t group), (file, user, group))
-OF_FILE(ftruncate, (int file, off_t size), (file, size))
+OF_FILE(int, fsync, (int file), (file))
+OF_FILE(int, fchmod, (int file, mode_t mode), (file, mode))
+OF_FILE(int, fchown, (int file, uid_t user, gid_t group), (file, user, group))
+OF_FILE(int, ftruncate, (int file, off_t size), (file, size))
+OF_FILE(int, ftruncate64, (int file, off64_t size), (file, size))
+OF_FILE(ssize_t, sendfile, (int file, int from, off_t *at, size_t size), (file, from, at, size))
+OF_FILE(ssize_t, sendfile64, (int file, int from, off64_t *at, size_t size),
+        (file, from, at, size))
 OF_PATH(rename, (const char *path, const char *target), (path, target))
 OF_PATH(unlink, (const char *path), (path))
 OF_PATH(mkdir, (const char *path, mode_t mode), (path, mode))

@@ -15,10 +15,10 @@ import sys
 from typing import Any
 
 from accel_calib.files import read_calibration
-from accel_calib.sphere import spread_directions
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import Call, explained, State
+from inside import spread_directions
 import numpy as np
 import pytest
 
@@ -68,7 +68,7 @@ def test_each_call_is_answered_and_all_agree_with_some_order(
     turned = readings(spread_directions(14), dwell=4.0)
     callers = [bench.run(str(CALLER), str(seed), str(CALLS)) for seed in range(CLIENTS)]
     send_until(bench, turned, lambda: all(each.poll() is not None for each in callers),
-               30.0 + 0.5 * CALLS)
+               60.0 + 2.0 * CALLS)
     clients = [calls_of(each.communicate()[0]) for each in callers]
     assert bench.call('enable', data=True).success
     force = answer_to(bench, bench.imu(READING))

@@ -16,11 +16,10 @@ import time
 from typing import Any
 
 from accel_calib.files import read_calibration, read_poses
-from accel_calib.session.work import is_partial
-from accel_calib.sphere import spread_directions
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import AFTER, Call, State
+from inside import CALIBRATOR, is_partial, spread_directions
 import numpy as np
 import pytest
 
@@ -108,6 +107,7 @@ def test_a_killed_node_has_stored_all_that_it_answered(
     folder = bench.home / 'accel_calib'
     start_poses(folder / 'arm_poses.csv', _POSES)
     log_to_files(bench, tmp_path)
+    bench.without_shared_memory()
     turned = readings(spread_directions(14), dwell=4.0)
     rng = np.random.default_rng(FACTOR)
     states = [State(_POSES)]
@@ -131,6 +131,7 @@ def test_a_node_that_fits_by_itself_is_killed_without_damage(
         bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
     folder = bench.home / 'accel_calib'
     log_to_files(bench, tmp_path)
+    bench.without_shared_memory()
     turned = readings(spread_directions(12))
     rng = np.random.default_rng(FACTOR)
     poses = 0
@@ -152,7 +153,7 @@ def test_a_node_that_fits_by_itself_is_killed_without_damage(
 
 def second(bench: Any) -> Any:
     """Start a second calibrator for the same sensor."""
-    return bench.run('-m', 'accel_calib.ros.calibrator', '--ros-args', '-r', '__node:=second',
+    return bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second',
                      '-p', 'sensor:=arm', '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
 
 
@@ -162,6 +163,7 @@ def test_of_two_nodes_one_stores_and_the_other_says_so(
     folder = bench.home / 'accel_calib'
     start_poses(folder / 'arm_poses.csv', _POSES)
     log_to_files(bench, tmp_path)
+    bench.without_shared_memory()
     first = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
     other, reader = second(bench), bench.run(str(READER), str(folder / 'arm.yaml'))
     turned = readings(spread_directions(14), dwell=4.0)

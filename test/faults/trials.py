@@ -4,37 +4,50 @@
 """
 Trials of a task in which one change of a file fails.
 
-The main function runs with ``LD_PRELOAD`` set to the compiled shim.c. Each trial is a fork of this
-process, so that a trial takes milliseconds. It prints one line of JSON per trial.
+``python test/faults/trials.py START WORK TASK...`` runs with ``LD_PRELOAD`` set to the compiled
+shim.c. Each trial is a fork of this process, so that a trial takes milliseconds. It prints one
+line of JSON per trial.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 import ctypes
 import errno
 import io
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import sys
+from typing import Any
 
-from accel_calib.cli.main import main as command
-from accel_calib.files import read_calibration, read_poses
-from accel_calib.session.store import Identity, Store
+from accel_calib.files import read_calibration
+from faults.sample import sample
+from inside import Identity, SensorStore
+from inside import main as command
 
 KINDS = {'kill': (1, 0), 'torn': (2, 0), 'eio': (3, errno.EIO), 'enospc': (3, errno.ENOSPC)}
-_MOST = 10_000
+ERRORS = ('eio', 'enospc')
+FEW = 1
+"""Trials per task in `make test`."""
+
+WHOLE = 'export'
+"""A quick task with all its trials in `make test`; it writes one file, as all tasks write."""
+
+_NEVER = -1
+_DATE = re.compile(rb'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d')
 
 
 def _command(*arguments: str) -> Callable[[Path], int]:
     return lambda folder: command([each.replace('{}', str(folder)) for each in arguments])
 
 
-def _store(folder: Path) -> Store:
-    return Store(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
+def _store(folder: Path) -> SensorStore:
+    return SensorStore(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
 
 
 def _save(folder: Path) -> int:
@@ -52,17 +65,20 @@ def _step_back(folder: Path) -> int:
     return 0
 
 
-TASKS: dict[str, Callable[[Path], int]] = {
+COMMANDS: dict[str, Callable[[Path], int]] = {
     'fit': _command('fit', '{}/poses.csv', '-o', '{}/imu.yaml', '--json', '{}/fit.json'),
     'capture': _command('capture', '{}/recording.csv', '-o', '{}/captured.csv'),
     'apply': _command('apply', '{}/recording.csv', '-c', '{}/imu.yaml', '-o', '{}/out.csv'),
     'export': _command('export', '{}/imu.yaml', '--to', 'c', '-o', '{}/imu.h'),
-    'save': _save, 'step_back': _step_back}
-"""Tasks by name. Each changes files in a folder and returns an exit status."""
+    'calibrate': _command('calibrate', '{}/recording.csv', '-o', '{}/new.yaml', '--no-refine')}
+"""Commands by name. Each writes files in a folder and returns an exit status."""
+
+TASKS = {**COMMANDS, 'save': _save, 'step_back': _step_back}
+"""The commands, and what the node does to its own files."""
 
 
-def trial(task: str, start: Path, work: Path, kind: str, at: int) -> dict[str, object]:
-    """Run a task in a copy of a folder; change number `at` fails. Return what is then there."""
+def trial(task: str, start: Path, work: Path, kind: str, at: int) -> dict[str, Any]:
+    """Run a task in a copy of a folder; change number `at` fails. Return how the task ended."""
     shutil.rmtree(work, ignore_errors=True)
     shutil.copytree(start, work)
     reader, writer = os.pipe()
@@ -95,48 +111,51 @@ def _child(task: str, work: Path, kind: str, at: int, writer: int) -> None:
     os._exit(status)
 
 
-def sound(folder: Path) -> list[str]:
-    """Return the names of the files of a folder that cannot be read; leftovers are not read."""
-    readers = {'.yaml': read_calibration, '.csv': read_poses, '.json': _json, '.h': _header}
-    bad = []
-    for path in sorted(folder.iterdir()):
-        reader = readers.get(path.suffix)
-        if reader is not None and path.stat().st_size and not path.name.startswith('.'):
-            try:
-                reader(path)
-            except Exception as err:  # any: the test shows it
-                bad.append(f'{path.name}: {err}')
-        elif reader is not None and not path.name.startswith('.'):
-            bad.append(f'{path.name} is empty')
-    return bad
+def contents(folder: Path) -> dict[str, object]:
+    """Return what must be equal in complete files; temporary files are left out."""
+    return {path.name: _content(path) for path in folder.iterdir()
+            if not path.name.startswith('.')}
 
 
-def _json(path: Path) -> object:
-    return json.loads(path.read_text(encoding='utf-8'))
-
-
-def _header(path: Path) -> None:
-    if not path.read_text(encoding='utf-8').rstrip().endswith('*/'):
-        raise ValueError('cut')
+def _content(path: Path) -> object:
+    """Return all but the date of a file; of a calibration its values and warnings of damage."""
+    if '.yaml' not in path.name:
+        return _DATE.sub(b'', path.read_bytes())
+    try:
+        found = read_calibration(path)
+    except Exception as err:  # any: the test shows it
+        return str(err)
+    return found.model.vector.tolist(), found.warnings
 
 
 def main() -> None:
-    """Run all trials: START and WORK folder, then TASK:KIND pairs."""
+    """Run the trials of each task."""
     start, work = Path(sys.argv[1]), Path(sys.argv[2])
-    before = {path.name: path.read_bytes() for path in start.iterdir()}
-    for pair in sys.argv[3:]:
-        task, _, kind = pair.partition(':')
-        for at in range(_MOST):
+    before = contents(start)
+    for seed, task in enumerate(sys.argv[3:]):
+        _load_modules(task, start, work)
+        changes = trial(task, start, work, 'kill', _NEVER)['changes']
+        complete = contents(work)
+        cases = [(kind, at) for kind in KINDS for at in range(changes)]
+        for kind, at in cases if task == WHOLE else sample(cases, FEW, seed):
             found = trial(task, start, work, kind, at)
-            found['bad'] = sound(work)
-            found['left'] = [path.name for path in work.iterdir() if path.name.startswith('.')]
-            found['lost'] = [name for name in before if not (work / name).exists()]
-            found['changed'] = [name for name in before if (work / name).exists()
-                                and (work / name).read_bytes() != before[name]]
+            after = contents(work)
+            found['torn'] = [name for name in {*before, *after} if after.get(name) not in (
+                before.get(name), complete.get(name))]
+            found['left'] = [path.name for path in work.iterdir() if path.name[0] == '.']
             found['again'] = trial_again(task, work)
+            after = contents(work)
+            found['undone'] = [name for name in complete if task in COMMANDS
+                               and not name.endswith('.before') and after[name] != complete[name]]
             sys.__stdout__.write(f'{json.dumps(found)}\n')  # type: ignore[union-attr]
-            if found['status'] >= 0 and found['changes'] <= at:  # type: ignore[operator]
-                break
+
+
+def _load_modules(task: str, start: Path, work: Path) -> None:
+    """Run a task once in this process, so that the forks need not import what it uses."""
+    shutil.rmtree(work, ignore_errors=True)
+    shutil.copytree(start, work)
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        TASKS[task](work)
 
 
 def trial_again(task: str, work: Path) -> int:

@@ -4,7 +4,7 @@
 """
 Write the samples of logs: one simulated sensor, in the layout that each maker documents.
 
-Run ``PYTHONPATH=. python test/data/logs/make.py`` in the root of the project. The samples are
+Run ``PYTHONPATH=.:test python test/data/logs/make.py`` in the root of the project. The samples are
 simulated, not recorded: offset, gain and cross-axis of the sensor are known (`OFFSET_G`, `GAIN`),
 so that a test can compare a fit with them. The source of each layout is at its function.
 
@@ -19,9 +19,8 @@ from pathlib import Path
 import struct
 from typing import Any
 
-from accel_calib.simulate import model_with, simulate_recording
-from accel_calib.sphere import spread_directions
 from accel_calib.table import Floats, Recording
+from inside import model_with, simulate_recording, spread_directions
 import numpy as np
 
 HERE = Path(__file__).parent

@@ -1,0 +1,120 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Small sound bags of every kind, for the tests that damage them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import shutil
+import sqlite3
+from typing import Any
+
+from accel_calib.calibrate import Calibration, fit_poses
+from accel_calib.units import units_of
+from inside import simulate_poses, spread_directions
+from mcap_file import McapFile, STORE
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import get_typestore, Stores
+from shared import sensor
+
+IMU, TEMPERATURE, STRING = ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature',
+                            'std_msgs/msg/String')
+TOPICS = [('/imu', IMU), ('/temperature', TEMPERATURE), ('/words', STRING)]
+COUNT = 60
+START = 1_700_000_000 * 10 ** 9
+RATE_NS = 10 ** 7
+
+Write = Callable[[Path], Path]
+
+
+def messages(store: Any = STORE) -> list[tuple[int, int, Any]]:
+    """Return (number of the topic, time of receipt [ns], message)."""
+    types, rng = store.types, np.random.default_rng(1)
+    header = types['std_msgs/msg/Header']
+    extra = {'seq': 0} if 'seq' in header.__annotations__ else {}
+    vector, found = types['geometry_msgs/msg/Vector3'], []
+    for k in range(COUNT):
+        stamp = START + RATE_NS * k
+        about = header(frame_id='imu', stamp=types['builtin_interfaces/msg/Time'](
+            sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9), **extra)
+        reading = rng.normal([0.1, -0.2, 9.8], 0.01).tolist()
+        found.append((0, stamp, types[IMU](
+            about, types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), np.zeros(9),
+            vector(0.0, 0.0, 0.0), np.zeros(9), vector(*reading), np.zeros(9))))
+        if k % 5 == 0:
+            found.append((1, stamp + 1, types[TEMPERATURE](about, 20.0 + 0.1 * k, 0.0)))
+            found.append((2, stamp + 2, types[STRING](f'word {k}')))
+    return found
+
+
+def by_hand(compression: str = '', **how: bool) -> Write:
+    def write(folder: Path) -> Path:
+        made = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
+                for topic, stamp, each in messages()]
+        return McapFile(TOPICS, compression, **how).write(folder / 'bag.mcap', made)
+    return write
+
+
+def rosbag2(plugin: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Write:
+    def write(folder: Path) -> Path:
+        writer = Writer2(folder / 'bag', version=9, storage_plugin=plugin)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            known = [writer.add_connection(*topic, typestore=STORE) for topic in TOPICS]
+            for topic, stamp, each in messages():
+                writer.write(known[topic], stamp, STORE.serialize_cdr(each, TOPICS[topic][1]))
+        return folder / 'bag'
+    return write
+
+
+def ros1(compression: Any = None) -> Write:
+    def write(folder: Path) -> Path:
+        store, writer = get_typestore(Stores.ROS1_NOETIC), Writer1(folder / 'bag.bag')
+        if compression is not None:
+            writer.set_compression(compression)
+        with writer:
+            known = [writer.add_connection(*topic, typestore=store) for topic in TOPICS]
+            for topic, stamp, each in messages(store):
+                writer.write(known[topic], stamp, store.serialize_ros1(each, TOPICS[topic][1]))
+        return folder / 'bag.bag'
+    return write
+
+
+MAKES: dict[str, Write] = {
+    'mcap': by_hand(), 'mcap lz4': by_hand('lz4'), 'mcap zstd': by_hand('zstd'),
+    'mcap without chunks': by_hand(in_chunks=False),
+    'mcap without summary': by_hand(summary=False),
+    'sqlite3': rosbag2(StoragePlugin.SQLITE3), 'mcap folder': rosbag2(StoragePlugin.MCAP),
+    'sqlite3 messages': rosbag2(StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+    'mcap file': rosbag2(StoragePlugin.MCAP, CompressionMode.FILE),
+    'ros1': ros1(), 'ros1 bz2': ros1(Writer1.CompressionFormat.BZ2),
+    'ros1 lz4': ros1(Writer1.CompressionFormat.LZ4)}
+
+
+def a_calibration() -> Calibration:
+    """Return a calibration for the readings of the bags."""
+    rng, units = np.random.default_rng(3), units_of('m/s2')
+    poses = simulate_poses(sensor(rng), spread_directions(16), rng)
+    return fit_poses(poses.with_columns(reading=units.from_g(poses.reading),
+                                        std=units.from_g(poses['std'])), units)
+
+
+def copied(path: Path, folder: Path) -> Path:
+    """Copy a bag, and return its new path."""
+    folder.mkdir(exist_ok=True)
+    target = folder / path.name
+    return Path(shutil.copytree(path, target) if path.is_dir() else shutil.copy(path, target))
+
+
+def execute(file: Path, statement: str, *values: Any) -> None:
+    """Execute a statement of SQL on a db3 file."""
+    database = sqlite3.connect(file)
+    database.execute('PRAGMA synchronous = OFF')
+    database.execute(statement, values)
+    database.commit()
+    database.close()

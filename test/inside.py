@@ -1,0 +1,211 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
+
+"""
+What tests use of the package beyond the faces of its folders.
+
+Tests import what `accel_calib`, its folders and its base modules export. This module gathers all
+other names. A change of the files of the package therefore changes this module, and no test. A
+name that is not clear without its file has another one here.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from accel_calib.allan.components import COMPONENTS as ALLAN_COMPONENTS
+from accel_calib.allan.components import fit_components
+from accel_calib.allan.curve import allan_variances, octaves, shares, spread_of
+from accel_calib.allan.rest import longest_rest
+from accel_calib.calibrate.checks import axes_of, fault_of, flat_warnings
+from accel_calib.calibrate.fleet_prior import posterior
+from accel_calib.calibrate.gate import sound_rows
+from accel_calib.calibrate.mounting import (
+    mounting,
+    mounting_figures,
+    with_heading,
+    with_heading_of,
+)
+from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
+from accel_calib.calibrate.pose_planning import (
+    determines,
+    missing_poses,
+    refuse_if_unfit,
+    shape_words,
+    unseen,
+    words_of,
+)
+from accel_calib.capture.trend import oscillation
+from accel_calib.capture.window import rounding_left
+from accel_calib.cli.characters import in_one_line, shown
+from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
+from accel_calib.cli.main import COMMANDS, main, parser
+from accel_calib.cli.options import plain as plain_json
+from accel_calib.cli.terminal import Output
+from accel_calib.cli.watch import _Lines as WatchLines
+from accel_calib.cli.watch import _Screen as WatchScreen
+from accel_calib.cli.watch_view import changes, screen, state
+from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES
+from accel_calib.compare.parameters import (
+    on_one_scale,
+    outlier,
+    p_values,
+    rotation_free,
+    Runs,
+    Scatter,
+    scatter_of,
+)
+from accel_calib.effects.terms import terms_of
+from accel_calib.estimate.closed_form import along_quadrics
+from accel_calib.estimate.equations import equations, kinds, noise_of
+from accel_calib.estimate.geometry import distinct
+from accel_calib.estimate.mistakes import unseen_mistakes
+from accel_calib.estimate.outliers import originals
+from accel_calib.files import bag, bounded_bags, calibration_yaml, plain_yaml
+from accel_calib.files.atomic import previous
+from accel_calib.files.bag import open_samples, together
+from accel_calib.files.bag_reader import open_bag
+from accel_calib.files.bounded_bags import decompressed, largest
+from accel_calib.files.calibration_yaml import _values_in as values_in
+from accel_calib.files.calibration_yaml import (
+    format_calibration,
+    OTHER_CORRECTION,
+    parse_calibration,
+)
+from accel_calib.files.exports import export, identifier
+from accel_calib.files.exports import FORMATS as EXPORT_FORMATS
+from accel_calib.files.exports import Options as ExportOptions
+from accel_calib.files.logs import are_samples, text
+from accel_calib.files.logs.ardupilot import is_dataflash, read_dataflash
+from accel_calib.files.logs.formats import named as format_named
+from accel_calib.files.logs.formats import recognise, record_instead
+from accel_calib.files.logs.names import meaning, unit_of
+from accel_calib.files.logs.names import UNITS as LOG_UNITS
+from accel_calib.files.logs.names import WORDS as LOG_WORDS
+from accel_calib.files.logs.px4 import is_ulg, read_ulg
+from accel_calib.files.logs.px4 import MAGIC as ULG_MAGIC
+from accel_calib.files.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
+from accel_calib.files.plan_table import read_plan, write_plan
+from accel_calib.files.regular import check_regular
+from accel_calib.fleet.alike import alike
+from accel_calib.fleet.identity import as_folder, date_of, sensor_of
+from accel_calib.fleet.inputs import content_hash, on_disk
+from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects
+from accel_calib.fleet.page import write_fleet_page
+from accel_calib.fleet.prior import estimated, priors_of
+from accel_calib.fleet.run import mapped
+from accel_calib.fleet.sensors import drift_of, merge_sensor
+from accel_calib.fleet.store import schema, write_parquet
+from accel_calib.intake import poses_of
+from accel_calib.live import server, sources, viewer
+from accel_calib.live.host import Host
+from accel_calib.live.link import qr_code, reachable
+from accel_calib.live.messages import CALIBRATION_ALONE
+from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
+from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
+from accel_calib.live.messages import log as live_log
+from accel_calib.live.messages import PERIOD as LIVE_PERIOD
+from accel_calib.live.messages import progress as live_progress
+from accel_calib.live.messages import text_of as live_text_of
+from accel_calib.live.server import PageServer, policy_hash
+from accel_calib.live.sources import is_port, open_source
+from accel_calib.messages.layout import layout_with
+from accel_calib.model import (
+    correct,
+    force_slope,
+    Model,
+    MODELS,
+    parameter_basis,
+    parameter_names,
+    predict,
+    reading_of,
+    sensor_force,
+    with_linear_part,
+    with_vector,
+)
+from accel_calib.monitor.change_detection import change, is_over
+from accel_calib.monitor.change_detection import MEMORY as DRIFT_MEMORY
+from accel_calib.one_reading import OneReading
+from accel_calib.refine import sample
+from accel_calib.refine.curves import best_curve, is_curve
+from accel_calib.refine.findings import advice_for
+from accel_calib.refine.linear import _MOST_UNUSUAL as MOST_UNUSUAL
+from accel_calib.refine.linear import _RARE as RARE
+from accel_calib.refine.linear import _USUAL as USUAL
+from accel_calib.refine.linear import Block, Linear, linearised, WORTH
+from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
+from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
+from accel_calib.refine.plan import _Predictions as Predictions
+from accel_calib.refine.plan_words import attitude_words, percent
+from accel_calib.refine.plan_words import NOTHING as NOTHING_TO_PLAN
+from accel_calib.refine.rivals import probabilities
+from accel_calib.refine.sample import MOST as MOST_SAMPLED_POSES
+from accel_calib.refine.sample import sampled
+from accel_calib.refine.search import search as search_effects
+from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
+from accel_calib.refine.state import beginning, fitted_state
+from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from accel_calib.report.calibration_sections import linear_figures
+from accel_calib.report.charts import equal_area
+from accel_calib.report.curve import curve_parts
+from accel_calib.report.drawings import all_drawings, recorded, variables_of
+from accel_calib.report.page import calibration_page
+from accel_calib.report.page import page as refinement_page
+from accel_calib.report.repeat_pages import comparison_page
+from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
+from accel_calib.report.sheet import STYLE as PAGE_STYLE
+from accel_calib.report.snippets import snippets
+from accel_calib.rotations import quaternion_of, rotation_from_rpy
+from accel_calib.session import store as session_store
+from accel_calib.session import worker_process
+from accel_calib.session.active_calibration import ActiveCalibration, rest_after
+from accel_calib.session.guidance import Guide, next_action, Plan
+from accel_calib.session.health import figures
+from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
+from accel_calib.session.sensor_files import Lock, StoreInUseError
+from accel_calib.session.settings import capture_settings, changed, default_of, yaml_lines
+from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
+from accel_calib.session.store import load as load_store
+from accel_calib.session.store import Store as SensorStore
+from accel_calib.session.stream_statistics import StreamStatistics
+from accel_calib.session.temperature_history import TemperatureHistory
+from accel_calib.session.work import fitted, is_partial, plan_for
+from accel_calib.session.worker import Worker
+from accel_calib.session.worker_process import WorkerProcess
+from accel_calib.significant import with_sd
+from accel_calib.simulate import model_with, parse_effect, simulate_poses, simulate_recording
+from accel_calib.sphere import OVER_THE_SPHERE, random_directions, spread_directions, unit
+from accel_calib.thermal import acting_temperature, Lag, low_passed, rate_of, ThermalStream
+from accel_calib.words import chance, values_of, verdict_words
+
+COMMAND = ('-m', 'accel_calib.cli.main')
+"""Arguments of Python that run the command line."""
+
+NODES = {
+    name: ('-m', f'accel_calib.ros.{name}')
+    for name in ('calibrator', 'calibrator_lifecycle', 'simulator')}
+"""Arguments of Python that run a node, by its name."""
+
+CALIBRATOR = NODES['calibrator']
+
+PAGE_FOLDER = Path(server.__file__).parent / 'page'
+"""Files of the live page."""
+
+# Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
+ROWS_OF_A_TEXT = text, 'ROWS'
+ROWS_OF_A_BAG = bag, '_ROWS'
+BLOCK_OF_A_BAG = bag, 'BLOCK'
+MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
+MOST_VALUES_WRITTEN = calibration_yaml, 'MOST_VALUES'
+MOST_BYTES_WRITTEN = calibration_yaml, 'MOST_BYTES'
+PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
+HEAD_OF_A_PORT = sources, '_HEAD_S'
+CLOCK_OF_A_SOURCE = sources, 'time'
+PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
+PATIENCE_OF_A_WORKER = worker_process, '_PATIENCE'
+LARGEST_SAMPLE = sample, 'MOST'
+LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
+DECOMPRESSED = bounded_bags, 'decompressed'
+STUCK = viewer, 'STUCK_S'
