@@ -53,8 +53,10 @@ def test_functions_stay_when_a_folder_of_their_name_is_imported():
         assert callable(getattr(ac, name))
 
 
-def test_import_of_the_package_imports_no_numpy():
-    code = 'import accel_calib, sys; print("numpy" in sys.modules)'
+@pytest.mark.parametrize(('imported', 'without'), [
+    ('accel_calib', 'numpy'), ('accel_calib.session', 'scipy')])
+def test_what_is_slow_to_import_is_imported_when_it_is_used(imported, without):
+    code = f'import {imported}, sys; print("{without}" in sys.modules)'
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           check=True, timeout=60)
     assert done.stdout.strip() == 'False'

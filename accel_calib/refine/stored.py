@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from ..calibrate import Calibration, EDITED, in_g
 from ..effects import CHANGES, effect_named
@@ -103,6 +102,8 @@ def _shares(poses_g: Poses, stored: Poses) -> bool:
 
 def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
     """Return whether a fit to the poses is no better than the calibration as stored."""
+    from scipy.special import chdtri
+
     model = Model(calibration.model.values)
     fit = estimate(model, poses_g)
     excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
