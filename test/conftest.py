@@ -13,19 +13,17 @@ condition and a time limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from importlib.util import find_spec
-import itertools
 import os
 from pathlib import Path
 import shutil
-from socket import AF_INET, SOCK_DGRAM, socket
 import subprocess
 import sys
 import tempfile
 import time
 from typing import Any
 
+from inside import own_domain
 import numpy as np
 import pytest
 
@@ -45,37 +43,9 @@ start of a node and the answer of DDS take much longer than on an idle one.
 
 """
 
-_DOMAINS = itertools.cycle(range(1, 102))
-for _ in range(37 * os.getpid() % 101):
-    next(_DOMAINS)  # test runs at the same time begin far from each other
-
 GRAVITY = 9.80665
 RATE = 50.0
 _BATCH = 20
-
-
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """
-    Yield a DDS domain that no other test on this machine has.
-
-    Of the UDP ports of a domain, DDS does not use the third one. This process holds it, so that
-    processes that run tests at the same time have different domains. A domain in which somebody
-    else has a first participant is left out, too.
-
-    """
-    for domain in itertools.islice(_DOMAINS, 101):
-        ports = 7400 + 250 * domain
-        with socket(AF_INET, SOCK_DGRAM) as held, socket(AF_INET, SOCK_DGRAM) as participant:
-            try:
-                held.bind(('127.0.0.1', ports + 2))
-                participant.bind(('', ports + 10))
-            except OSError:
-                continue
-            participant.close()
-            yield domain
-            return
-    raise RuntimeError('all of the domains 1 to 101 are in use')
 
 
 class Bench:

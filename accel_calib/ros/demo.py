@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from functools import partial
 import os
 from pathlib import Path
-import random
 import signal
 import subprocess
 import sys
@@ -41,6 +40,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from . import qos
+from .domain import own_domain
 from ..errors import AccelCalibError, counted
 from ..files import read_calibration
 from ..simulate import parse_effect
@@ -68,7 +68,7 @@ _SAME_POSE = np.cos(np.radians(10.0))
 _EFFECTS = ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
             'cross_axis=0.006,-0.004,0.003']
 _SENSOR = {'mounting': [8.0, -5.0, 0.0], 'noise': 0.01, 'loop': True, 'wait': 10.0}
-_HELD = {**_SENSOR, 'poses': 48, 'mixed': True, 'dwell': 0.0, 'turn': 0.3, 'flat_last': False,
+_HELD = {**_SENSOR, 'poses': 48, 'mixed': True, 'dwell': 0.0, 'turn': 0.2, 'flat_last': False,
          'temperature': [17.0, 33.0], 'temperature_period': 40.0}
 _TIMED = {**_SENSOR, 'poses': _POSES, 'dwell': 1.5, 'turn': 0.5, 'effects': _EFFECTS}
 """Parameters of the simulator: of a person who waits in each pose, and of one with a clock."""
@@ -333,7 +333,7 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder))
+        set_environment(Path(folder), stack.enter_context(own_domain()))
         report('starting the calibrator node and a simulated Imu, turned by hand'
                + (f', that hides {hidden}' if hidden else ''))
         simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
@@ -395,7 +395,7 @@ def demonstrate_page(port: int, report: Callable[[str], None],
 
     """
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder))
+        set_environment(Path(folder), stack.enter_context(own_domain()))
         report('a simulated Imu is turned by hand; open the link of the live page in a browser, '
                'wait for the poses, and press Fit. Ctrl-C ends it')
         processes = [
@@ -406,9 +406,9 @@ def demonstrate_page(port: int, report: Callable[[str], None],
             time.sleep(_LOOK_EVERY)
 
 
-def set_environment(folder: Path) -> None:
+def set_environment(folder: Path, domain: int) -> None:
     """Isolate the demonstration: own domain, local machine only, own files."""
-    os.environ.update(ROS_DOMAIN_ID=str(random.SystemRandom().randint(1, 101)),
+    os.environ.update(ROS_DOMAIN_ID=str(domain),
                       ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
                       ROS_LOG_DIR=str(folder / 'log'))
 
