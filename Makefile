@@ -53,8 +53,8 @@ docs: $(VENV)/extra-docs
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
 
 faults: $(VENV)/extra-test $(VENV)/package
-	@ACCEL_CALIB_TRIALS=5 $(BIN)/python -m pytest -s test/faults test/test_*damage*.py \
-		test/test_fleet.py
+	@ACCEL_CALIB_TRIALS=5 test/run $(BIN)/python -n 2 test/faults test/test_*damage*.py \
+		$$(grep -l '^from faults.sample' test/test_*.py)
 	@for seed in 1 2 3 4 5; do \
 		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 

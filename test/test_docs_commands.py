@@ -26,6 +26,7 @@ from tempfile import TemporaryDirectory
 
 import accel_calib as ac
 from accel_calib.files import write_table
+from faults.sample import sample
 from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
@@ -115,8 +116,8 @@ def text_of(page):
     return (ROOT / page).read_text(encoding='utf-8')
 
 
-@pytest.mark.parametrize('page', [page for page in PAGES if any(
-    block.commands for block in blocks_of(text_of(page))[1])])
+@pytest.mark.parametrize('page', sample([page for page in PAGES if any(
+    block.commands for block in blocks_of(text_of(page))[1])], 5))
 def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     files, blocks = blocks_of(text_of(page))

@@ -28,7 +28,7 @@ from typing import Any
 from accel_calib.errors import InputError
 from accel_calib.files import read_calibration
 from accel_calib.fleet import cluster, Input, run, Store
-from faults.sample import sample
+from faults.sample import FACTOR, sample
 from fleet_case import found_in, OFFSET, QUICK, rows_of, state_of, write_fleet, write_poses
 from inside import (
     alike,
@@ -516,6 +516,7 @@ def set_environment(values: dict[str, str]) -> None:
     os.environ.update(values)
 
 
+@pytest.mark.skipif(FACTOR == 1, reason='a store takes long to start: make faults')
 def test_recordings_are_read_from_a_store_of_s3(
         client: Any, recorded: Path, undisturbed: dict[str, Any], tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,7 +71,7 @@ def test_each_hidden_effect_is_named_with_its_values(effect, taken):
             assert abs(calibration.model.vector[k] - truth[part]) < 4.0 * deviation, name
 
 
-@pytest.mark.parametrize(('poses', 'sets'), [(24, 4), (60, 2), (200, 1)])
+@pytest.mark.parametrize(('poses', 'sets'), [(24, 2), (60, 1)])
 def test_nothing_is_named_where_nothing_is_hidden(poses, sets, taken):
     for seed in range(sets):  # benchmarks/refine.py counts how often in many sets
         found = refine(taken(seed, poses=poses)[0], MPS2)
@@ -208,14 +208,6 @@ def test_mpu9150_has_no_hidden_effect():
     assert sorted(step.effect for step in climbed.steps) == ['axis_gain', 'cross_axis', 'offset']
 
 
-def test_xsens_lacks_cross_axis_most():
-    poses = capture(read_recording(data('xsens_mti_counts.csv')), units_of('native')).poses
-    found = refine(poses, units_of('native'), base='7')
-    assert found.steps[0].effect == 'cross_axis'
-    assert found.steps[0].gap_before_mg > 2.5
-    assert found.steps[0].gap_after_mg < 0.12
-
-
 def test_report_data_show_a_quadratic_part_in_the_first_phone_alone():
     units = units_of('m/s2', 9.8061)
     found = refine(read_poses(data('esgi95_dataset1_huawei.csv')), units, base='10')
@@ -224,17 +216,6 @@ def test_report_data_show_a_quadratic_part_in_the_first_phone_alone():
     assert found.steps[-1].held_out_after_mg == pytest.approx(0.8, abs=0.1)
     for name in ('esgi95_dataset2.csv', 'esgi95_dataset3_gt.csv'):
         assert names(refine(read_poses(data(name)), units)) == []
-
-
-def test_sensehat_moves_with_temperature():
-    recording = read_recording(data('sensehat_lsm9ds1_temperature.csv'))
-    poses = capture(recording, G, CaptureSettings(max_dwell=10800.0)).poses
-    found = refine(poses, G)
-    step = next(step for step in found.steps if step.effect == 'offset_temperature')
-    moved = [step.parameters[axis] * 1e3 for axis in 'xyz']
-    # A plain regression gives these values; it leaves out a step in the middle of the recording.
-    np.testing.assert_allclose(moved, [0.57, 0.41, -0.41], rtol=0.5)
-    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
 
 
 def test_poses_are_left_as_they_were(taken):

@@ -18,6 +18,7 @@ import termios
 import threading
 from typing import Any
 
+from faults.sample import sample
 from inside import CALIBRATOR, COMMAND
 import pytest
 
@@ -48,7 +49,7 @@ def environment(bench: Any) -> dict[str, str]:
             'ROS_DOMAIN_ID': str(bench.node.context.get_domain_id())}
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', sample([signal.SIGINT, signal.SIGTERM], 1))
 def test_pipe_gets_a_line_for_each_pose(bench: Any, readings: Readings, number: int) -> None:
     bench.calibrator(sensor='arm', passthrough=True)
     process = bench.run(*WATCH)

@@ -17,6 +17,7 @@ from typing import Any
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.files import read_calibration, write_table
 from accel_calib.session import CalibratorSettings, Job, Log
+from faults.sample import sample
 from inside import fitted, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
 from inside_ros import in_executor, Services
 import numpy as np
@@ -175,7 +176,7 @@ def children(pid: int) -> list[int]:
     return [int(child) for task in tasks for child in task.read_text().split()]
 
 
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize('number', sample([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], 2))
 def test_no_process_outlives_the_node(bench: Any, stored: Callable[..., Path], number: int
                                       ) -> None:
     path = stored()

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import compress, product
 import json
 import os
 from pathlib import Path
@@ -70,14 +71,14 @@ class Stored:
 
 def after_kill(states: Iterable[State], name: str) -> list[State]:
     """Return the states that a call without a response may leave, if it was killed or done."""
-    words = 'mounting of the sensor changes offset {} poses no calibration any more'
+    parts = ('mounting of the sensor ', 'changes offset ', 'no calibration any more ')
     found = []
     for state in states:
         found.append(state)
         for count in {max(state.poses - 1, 0), state.poses, state.poses + 1}:
-            for text in (words, *(words.replace(part, '') for part in (
-                    'mounting of the sensor', 'changes offset', 'no calibration any more'))):
-                call = Call(name, 0.0, 0.0, text.format(count), good=True)
+            for said in product((True, False), repeat=len(parts)):
+                text = f'{"".join(compress(parts, said))}{count} poses'
+                call = Call(name, 0.0, 0.0, text, good=True)
                 found += AFTER[name](state, call, -1)
     return found
 

@@ -1,0 +1,201 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Do the tests fail where the code is wrong?
+
+A mutant is the package with one operator or comparison replaced, by the operators of cosmic-ray.
+One of each place is drawn at random, and of these a sample. A mutant runs with the tests that
+execute its statement in their own process, the quickest first; so commands and nodes in other
+processes are left out, and the share that is killed is a lower bound.
+
+    python test/mutants.py [--count 300] [--seed 1] [--markdown FILE]
+
+"""
+
+import argparse
+import ast
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
+import os
+from pathlib import Path
+from queue import SimpleQueue
+import random
+import re
+import shutil
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+from xml.etree import ElementTree
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+from cosmic_ray.plugins import get_operator, operator_names
+import coverage
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'messages', 'monitor',
+           'rating', 'refine')
+KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
+                   r'|OrWithAnd)')
+ELSEWHERE = re.compile(r'test_(ros|live|fleet|docs|launch|packaging|bombs)')
+LIMIT_S = 600.0
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One replaced operator: the statement's lines in a file of the package, before and after."""
+
+    file: str
+    line: int
+    lines: range
+    code: str
+    words: str
+
+
+def mutants(file: str, draw: random.Random) -> Iterator[Mutant]:
+    """Yield one mutant of each place in a file, drawn from those that are possible there."""
+    source = (ROOT / file).read_text()
+    tree, nodes = ast.parse(source), list(ast_nodes(get_ast(source)))
+    notes = [(note.lineno, note.end_lineno) for note in annotations(tree)]
+    places = defaultdict(list)
+    for name in operator_names():
+        if KINDS.match(name):
+            operator = get_operator(name)()
+            starts = [start for node in nodes for start, _ in operator.mutation_positions(node)]
+            for count, start in enumerate(starts):
+                places[start].append((operator, count))
+    for (line, _), found in sorted(places.items()):
+        if not any(first <= line <= last for first, last in notes):
+            operator, count = draw.choice(found)
+            yield mutant(file, source, tree, line, operator, count)
+
+
+def annotations(tree: ast.AST) -> Iterator[ast.expr]:
+    for node in ast.walk(tree):
+        for name in ('annotation', 'returns'):
+            if (note := getattr(node, name, None)) is not None:
+                yield note
+
+
+def mutant(file: str, source: str, tree: ast.Module, line: int, operator: Operator, count: int
+           ) -> Mutant:
+    code = mutate_code(source, operator, count)
+    pairs = zip(source.splitlines(), code.splitlines(), strict=True)
+    before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
+    around = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)
+              and node.lineno <= line <= (node.end_lineno or node.lineno)]
+    statement = max(around, key=lambda node: node.lineno)
+    lines = range(statement.lineno, (statement.end_lineno or line) + 1)
+    return Mutant(file, line, lines, code, f'`{before}` → `{after}`')
+
+
+def sample(count: int, seed: int) -> list[Mutant]:
+    """Draw mutants of the nine folders."""
+    draw = random.Random(seed)
+    files = sorted(str(path.relative_to(ROOT)) for folder in FOLDERS
+                   for path in (ROOT / 'accel_calib' / folder).rglob('*.py'))
+    return draw.sample([each for file in files for each in mutants(file, draw)], count)
+
+
+def copied(to: Path) -> Path:
+    """Copy what tests need."""
+    return Path(shutil.copytree(ROOT, to, symlinks=True, ignore=shutil.ignore_patterns(
+        '.git', '.venv', 'build', '__pycache__', '.*_cache')))
+
+
+def pytest(where: Path, *arguments: str, limit_s: float | None = None) -> int:
+    """Run tests in a copy, and return the exit status."""
+    environment = {**os.environ, 'PYTHONDONTWRITEBYTECODE': '1',
+                   'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}',
+                   'COVERAGE_FILE': str(where / '.coverage')}
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', *arguments]
+    return subprocess.run(command, cwd=where, env=environment, timeout=limit_s, check=False,
+                          stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode
+
+
+class Tests:
+    """Which tests execute which lines, and how long each takes."""
+
+    def __init__(self, where: Path) -> None:
+        files = [str(path.relative_to(where)) for path in sorted(where.glob('test/test_*.py'))
+                 if not ELSEWHERE.match(path.name)]
+        status = pytest(where, '-n', str(os.cpu_count()), '--dist', 'loadfile',
+                        '--cov=accel_calib', '--cov-context=test', '--cov-report=',
+                        '--junitxml=tests.xml', *files)
+        if status:
+            raise SystemExit(f'the tests fail without any mutant: pytest ended with {status}')
+        cases = ElementTree.parse(where / 'tests.xml').getroot().iter('testcase')
+        self.seconds = {f'{case.get("classname", "").replace(".", "/")}.py::{case.get("name")}':
+                        float(case.get('time', 0)) for case in cases}
+        self.of_file = {file: list(names) for file, names in groupby(
+            sorted(self.seconds), key=lambda name: name.split('::')[0])}
+        self.data = coverage.CoverageData(str(where / '.coverage'))
+        self.data.read()
+        self.measured = {str(Path(name).relative_to(where)): name
+                         for name in self.data.measured_files()}
+
+    def of(self, file: str, lines: Iterable[int]) -> list[str]:
+        """Return the tests of these lines; what a fixture executes is of all tests of its file."""
+        by_line = self.data.contexts_by_lineno(self.measured[file])
+        contexts = {each for line in lines for each in by_line.get(line, ())}
+        found = set()
+        for test, _, phase in (context.rpartition('|') for context in contexts if context):
+            found |= {test} if phase == 'run' else set(self.of_file[test.split('::')[0]])
+        return sorted(found, key=lambda name: self.seconds.get(name, 0.0))
+
+
+def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
+    """Return whether a test fails, or does not end, in a copy with the mutant."""
+    names = tests.of(given.file, given.lines) or sorted(tests.seconds, key=tests.seconds.__getitem__)
+    (where / 'tests.txt').write_text('\n'.join(names))
+    original = (where / given.file).read_text()
+    (where / given.file).write_text(given.code)
+    try:
+        return pytest(where, '-x', '@tests.txt', limit_s=LIMIT_S) != 0
+    except subprocess.TimeoutExpired:
+        return True
+    finally:
+        (where / given.file).write_text(original)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--count', type=int, default=300)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--markdown', type=Path)
+    options = parser.parse_args()
+    drawn = sample(options.count, options.seed)
+    with TemporaryDirectory() as folder:
+        tests = Tests(copied(Path(folder, 'covered')))
+        copies: SimpleQueue[Path] = SimpleQueue()
+        workers = os.cpu_count() or 1
+        for number in range(workers):
+            copies.put(copied(Path(folder, str(number))))
+
+        def tried(given: Mutant) -> bool:
+            where = copies.get()
+            try:
+                return is_killed(given, tests, where)
+            finally:
+                copies.put(where)
+
+        rows = ['| file | line | survives |', '|---|---|---|']
+        with ThreadPoolExecutor(workers) as pool:
+            for done, (given, killed) in enumerate(zip(drawn, pool.map(tried, drawn)), 1):
+                if not killed:
+                    rows.append(f'| {given.file} | {given.line} | {given.words} |')
+                    print(done, rows[-1], flush=True)
+    killed_share = 1.0 - (len(rows) - 2) / len(drawn)
+    words = (f'{len(drawn)} mutants, seed {options.seed}: {killed_share:.1%} killed')
+    print(words)
+    if options.markdown:
+        options.markdown.write_text('\n'.join((words, '', *rows, '')))
+
+
+if __name__ == '__main__':
+    main()
