@@ -75,7 +75,7 @@ $(VENV)/made:
 
 $(VENV)/extra-test: ALSO := ,test-fleet
 $(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev $(VENV)/extra-docs: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
-	@$(PIP) install --no-build-isolation '.[ros,$*$(ALSO)]'
+	@$(PIP) install '.[ros,$*$(ALSO)]'
 	@touch $@
 
 # Only for tests.

@@ -157,8 +157,8 @@ from accel_calib.report.repeat_pages import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import STYLE as PAGE_STYLE
 from accel_calib.report.snippets import snippets
-from accel_calib.rotations import quaternion_of, rotation_from_rpy
 from accel_calib.ros.domain import own_domain
+from accel_calib.rotations import quaternion_of, rotation_from_rpy
 from accel_calib.session import store as session_store
 from accel_calib.session import worker_process
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after

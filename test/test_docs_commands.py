@@ -121,10 +121,10 @@ def text_of(page):
 def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     files, blocks = blocks_of(text_of(page))
-    for name, sample in files.items():
-        if Path(sample).suffix in LIBRARIES:
-            pytest.importorskip(LIBRARIES[Path(sample).suffix])
-        shutil.copy(LOGS / sample, name)
+    for name, log in files.items():
+        if Path(log).suffix in LIBRARIES:
+            pytest.importorskip(LIBRARIES[Path(log).suffix])
+        shutil.copy(LOGS / log, name)
     if any(words[0] == 'fleet' for block in blocks for words in block.commands):
         pytest.importorskip('distributed')
     for block in blocks:

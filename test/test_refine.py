@@ -4,7 +4,7 @@
 """Hidden effects are named and no others, on data of an independent generator."""
 
 from accel_calib.calibrate import fit_poses
-from accel_calib.capture import capture, CaptureSettings
+from accel_calib.capture import capture
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.files import read_poses, read_recording
 from accel_calib.refine import refine

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Do the tests fail where the code is wrong?
+The share of wrong operators in the code that tests find.
 
 A mutant is the package with one operator or comparison replaced, by the operators of cosmic-ray.
 One of each place is drawn at random, and of these a sample. A mutant runs with the tests that
 execute its statement in their own process, the quickest first; so commands and nodes in other
 processes are left out, and the share that is killed is a lower bound.
 
-    python test/mutants.py [--count 300] [--seed 1] [--markdown FILE]
+    python benchmarks/mutants.py [--count 300] [--seed 1] [--markdown FILE]
 
 """
 
@@ -151,7 +151,7 @@ class Tests:
 
 def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
     """Return whether a test fails, or does not end, in a copy with the mutant."""
-    names = tests.of(given.file, given.lines) or sorted(tests.seconds, key=tests.seconds.__getitem__)
+    names = tests.of(given.file, given.lines) or [*tests.seconds]
     (where / 'tests.txt').write_text('\n'.join(names))
     original = (where / given.file).read_text()
     (where / given.file).write_text(given.code)
