@@ -326,8 +326,8 @@ def test_a_calibration_in_g_corrects_a_bag_in_m_s2_and_refuses_one_in_g(
     np.testing.assert_allclose(
         found.reading, calibration_in_g.correct(raw.reading / 9.80665) * 9.80665, rtol=1e-12)
     wrong = write(tmp_path / 'wrong', {}, force=(0.01, -0.02, 1.0))
-    with pytest.raises(InputError, match='the median length of the accelerations is 1, expected '
-                                         'about 9.8 at rest, because Imu messages are in m/s²'):
+    with pytest.raises(InputError, match='the length of the readings is about 1, expected about '
+                                         '9.807 at rest in m/s2'):
         correct_bag(wrong, calibration_in_g, tmp_path / 'out2')
     assert not (tmp_path / 'out2').exists()
 

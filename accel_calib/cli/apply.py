@@ -15,7 +15,6 @@ from .terminal import progress
 from ..calibrate import (
     Calibration,
     check_sensor,
-    check_units,
     joined_ranges,
     of_samples,
     Outside,
@@ -59,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
             count = correct_bag(args.recording, calibration, args.output, args.topic, moved,
                                 left.append, note=lambda line: lines.append(f'note: {line}'),
                                 temperature_topic=args.temperature_topic,
-                                supply_topic=args.supply_topic)
+                                supply_topic=args.supply_topic, units=args.units or 'm/s2',
+                                gravity=args.gravity)
     else:
         count = _correct_table(args, calibration, left.append, lines)
     console = options.console(args)
@@ -94,15 +94,11 @@ class _Correction:
     def __init__(self, calibration: Calibration) -> None:
         self._calibration = calibration
         self._thermal = thermal_stream(calibration.model)
-        self._started = False
         self.outside: dict[str, Outside] = {}
 
     def __call__(self, block: Poses | Recording) -> Poses | Recording:
-        """Return a corrected block; check the unit of the first one."""
+        """Return a corrected block."""
         calibration = self._calibration
-        if not self._started:
-            check_units(block, calibration.units)
-        self._started = True
         known = of_samples(block.columns, len(block), calibration.model, self._thermal)
         self.outside = joined_ranges(self.outside, outside(calibration, known))
         return _corrected(block, calibration, known)

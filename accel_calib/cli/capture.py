@@ -6,18 +6,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from . import options
 from .terminal import progress
-from ..calibrate import check_units
 from ..capture import capture, Captured, CaptureSettings, REPEATED, settings_from
 from ..errors import counted
-from ..files import open_log, OpenLog, Progress, write_table
+from ..files import open_log, write_table
 from ..intake import Intake, nothing_still
-from ..table import Recording
 from ..units import Units
 
 _EXAMPLE = 'accel-calib capture recording.mcap -o poses.csv'
@@ -56,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     """Capture and write the poses, and print their number."""
     with (open_log(args.recording, options.log_options(args)) as log,
           progress('samples') as moved):
-        captured = capture(_checked(log, moved), log.units, _settings(args, log.units))
+        captured = capture(log.watched(moved), log.units, _settings(args, log.units))
         lines = Intake(captured.poses, log.units, log.read_as, log.notes).lines
     if len(captured.poses) == 0:
         raise nothing_still(str(args.recording), captured.recorded)
@@ -83,14 +80,6 @@ def _show(args: argparse.Namespace, captured: Captured, lines: tuple[str, ...]) 
                 'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
                 'stopped': 'the stamps do not change'}[item.kind]
         console.print(f'note: after {item.time:.3f} s {what}')
-
-
-def _checked(log: OpenLog, moved: Progress) -> Iterator[Recording]:
-    """Yield the blocks, check the unit of the first block, and update the progress bar."""
-    for number, block in enumerate(log.watched(moved)):
-        if not number:
-            check_units(block, log.units)
-        yield block
 
 
 def _settings(args: argparse.Namespace, units: Units) -> CaptureSettings:

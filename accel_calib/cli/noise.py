@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from . import options
 from .terminal import progress, working
 from ..allan import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
-from ..calibrate import Calibration, check_sensor, check_units, of_samples
+from ..calibrate import Calibration, check_sensor, of_samples
 from ..errors import counted, InputError
 from ..files import open_log, OpenLog, Progress
 from ..report import check_matplotlib
@@ -94,7 +94,6 @@ def _corrected(recording: Recording, units: Units, calibration: Calibration
                ) -> tuple[Recording, Units]:
     """Return the corrected recording, in g if it was in native units."""
     own = calibration.in_units(units)
-    check_units(recording, own.units)
     check_sensor(own, recording.sensor)
     known = of_samples(recording.columns, len(recording), own.model)
     made = recording.with_columns(reading=own.correct(recording.reading, known))

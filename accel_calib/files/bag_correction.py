@@ -28,6 +28,7 @@ from .bag_reader import Bag, damage_as_input_error, open_bag
 from ..calibrate import (
     Calibration,
     check_sensor,
+    check_units,
     joined_ranges,
     of_samples,
     Outside,
@@ -35,7 +36,7 @@ from ..calibrate import (
     thermal_stream,
 )
 from ..errors import InputError
-from ..messages.correction import corrected, output_frame
+from ..messages.correction import corrected, output_frame, output_scale
 from ..messages.layout import (
     doubles_at,
     IMU_DOUBLES,
@@ -44,6 +45,8 @@ from ..messages.layout import (
     renamed,
     samples_of,
 )
+from ..table import Recording
+from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,9 +60,6 @@ Report = Callable[[Outside], object]
 Note = Callable[[str], object]
 """Function called with a note about the topics of a bag, or about lost messages."""
 
-LEAST_M_S2 = 3.0
-"""A recording with a smaller median length is not in m/s²; it is probably in g."""
-
 _PARTIAL = '.partial'
 _STALE_S = 86400.0
 """Age of an unfinished copy that no process writes any more [s]."""
@@ -71,7 +71,8 @@ _NO_HASH = 'RIHS01_' + 64 * '0'
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
                 progress: Progress = lambda done, count: None,
                 report: Report = lambda found: None, *, note: Note = lambda line: None,
-                temperature_topic: str = '', supply_topic: str = '') -> int:
+                temperature_topic: str = '', supply_topic: str = '', units: UnitName = 'm/s2',
+                gravity: float = STANDARD_GRAVITY) -> int:
     """
     Write a corrected copy of a bag.
 
@@ -80,7 +81,7 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     path : Path
         A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
     calibration : Calibration
-        The calibration. One in g is converted to m/s², the unit of Imu messages.
+        The calibration. One in g is converted to m/s², and one in m/s² to g.
     out : Path
         The copy; it must not exist. A copy of a rosbag2 is a folder, or a file if `out` has the
         suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
@@ -95,6 +96,11 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         Function that is called with each note about the topics and about lost messages.
     temperature_topic, supply_topic : str
         As in `accel_calib.files.bag_context.context_of`.
+    units : {'m/s2', 'g', 'native'}
+        Unit of the recorded accelerations. The corrected ones are in m/s², the unit of Imu
+        messages.
+    gravity : float
+        Local gravity [m/s²].
 
     Returns
     -------
@@ -105,7 +111,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     ------
     InputError
         If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
-        that the calibration needs, or if `out` exists or the calibration is in native units.
+        that the calibration needs, if the readings are clearly in another unit, if only one of
+        calibration and messages is in native units, or if `out` exists.
     StoredCalibrationError
         If the calibration belongs to another sensor.
     OSError
@@ -119,11 +126,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         name = imu_topic(bag, topic)
         sensor = first_frame_id(bag, name)
         check_sensor(calibration, sensor)
-        calibration = _in_units_of(bag, name, calibration)
+        calibration = calibration.in_units(units)
         context = _needed(bag, calibration, context_of(bag, name, sensor, temperature_topic,
                                                        supply_topic))
         with _new(out) as folder:
-            correction = _Correction(calibration, bag, name, sensor, context)
+            correction = _Correction(calibration, bag, name, sensor, context,
+                                     units_of(units, gravity), gravity)
             count = _copy(bag, folder, out, correction, progress)
         for each in correction.outside.values():
             if each.count:
@@ -140,20 +148,6 @@ def _check_kind(bag: Bag, out: Path) -> None:
                          'name of one', 'choose a name that ends in .mcap or .db3, or the '
                          'name of a folder' if bag.ros2 else
                          'choose a name that ends in .bag')
-
-
-def _in_units_of(bag: Bag, topic: str, calibration: Calibration) -> Calibration:
-    """Return a calibration in m/s²; refuse one in g if the messages are in g, too."""
-    found = calibration.in_units('m/s2')
-    if found is not calibration:
-        block = next(bag.blocks(bag.connections(topic)))
-        messages = bag.joined([raw for _, _, raw in block], topic, 0)
-        length = float(np.median(np.linalg.norm(samples_of(messages)['reading'], axis=1)))
-        if length < LEAST_M_S2:
-            raise InputError(f'{bag.path}, {topic}: the median length of the accelerations is '
-                             f'{length:.3g}, expected about 9.8 at rest, because Imu messages are '
-                             'in m/s²', 'correct the driver, and record again')
-    return found
 
 
 def _needed(bag: Bag, calibration: Calibration, context: Context) -> Context:
@@ -189,10 +183,11 @@ class _Correction:
     """The correction of the messages of one topic."""
 
     def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str,
-                 context: Context) -> None:
+                 context: Context, units: Units, gravity: float) -> None:
         self._calibration, self._bag, self._sensor = calibration, bag, sensor
         self._frame_id = output_frame(calibration, sensor)
-        self._tracks = context.tracks()
+        self._units, self._tracks = units, context.tracks()
+        self._scale = output_scale(calibration, gravity)
         self._thermal = thermal_stream(calibration.model)
         self.topic, self.done = topic, 0
         self.outside: dict[str, Outside] = {}
@@ -202,13 +197,16 @@ class _Correction:
         messages = self._bag.joined(raws, self.topic, self.done)
         of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
         context = plausible_samples(self._bag, messages, self.done)
+        if not self.done:
+            check_units(Recording(context, np.arange(len(messages))), self._units)
         for key, track in self._tracks.items():
             context[key] = track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
         self.outside = joined_ranges(self.outside, outside(self._calibration, known))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
-            put_doubles(messages, corrected(self._calibration, doubles, known))
+            put_doubles(messages, corrected(self._calibration, doubles, known,
+                                                scale=self._scale))
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 

@@ -9,7 +9,7 @@ Serialized sensor_msgs/Imu messages, from bags and from topics.
 
 """
 
-from .correction import corrected, motion_of, output_frame, Rewriter
+from .correction import corrected, motion_of, output_frame, output_scale, Rewriter
 from .layout import (
     ACCELERATION,
     ACCELERATION_COVARIANCE,
@@ -32,4 +32,5 @@ from .layout import (
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
            'Layout', 'Messages', 'Rewriter', 'corrected', 'doubles_at', 'frame_ids', 'joined',
-           'layout_of', 'motion_of', 'output_frame', 'renamed', 'samples_of', 'stamps_of']
+           'layout_of', 'motion_of', 'output_frame', 'output_scale', 'renamed', 'samples_of',
+           'stamps_of']

@@ -70,8 +70,13 @@ if TYPE_CHECKING:
     from ..calibrate import SampleNoise
 
 
+def output_scale(calibration: Calibration, gravity: float) -> float:
+    """Return m/s² per unit of corrected force; `gravity` is the local gravity [m/s²]."""
+    return 1.0 if calibration.units.name == 'm/s2' else gravity / calibration.force_per_g
+
+
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
-              stream: ThermalStream | None = None) -> Floats:
+              stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
     """
     Return the corrected doubles of Imu messages.
 
@@ -85,6 +90,8 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         Columns that the effects need, n rows each.
     stream : ThermalStream, optional
         Temperature before these messages; they are added to it.
+    scale : float
+        Factor on the corrected force.
 
     Returns
     -------
@@ -96,7 +103,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
     rotation = calibration.model.rotation
     result = doubles.copy()
     force = calibration.correct(doubles[:, ACCELERATION], known)
-    result[:, ACCELERATION] = force
+    result[:, ACCELERATION] = scale * force
     if calibration.is_levelled:
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
         _transform(result, ANGULAR_VELOCITY_COVARIANCE, rotation.T)
@@ -109,11 +116,11 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
             _transform(result, part, np.eye(3))
     stated = _transform(result, ACCELERATION_COVARIANCE,
-                        rotation.T @ np.linalg.inv(calibration.gain))
+                        scale * rotation.T @ np.linalg.inv(calibration.gain))
     if np.any(stated):
         rows = {key: values[stated] for key, values in known.items()}
         added = calibration.force_covariance(force[stated], rows)
-        result[stated, ACCELERATION_COVARIANCE] += added.reshape(-1, 9)
+        result[stated, ACCELERATION_COVARIANCE] += scale ** 2 * added.reshape(-1, 9)
     return result
 
 

@@ -25,7 +25,7 @@ from sensor_msgs.msg import Imu
 
 from ..calibrate import Calibration
 from ..errors import AccelCalibError
-from ..messages.correction import motion_of, output_frame, Rewriter
+from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
 from ..messages.layout import (
     ACCELERATION,
     IMU_DOUBLES,
@@ -39,7 +39,6 @@ from ..messages.layout import (
 )
 from ..one_reading import Triple
 from ..session import BATCH, CalibratorSettings, Session
-from ..session.active_calibration import output_scale
 
 _NO_LAYOUT = Layout(b'', 0, -1)
 _NO_BIAS = np.zeros(3)

@@ -26,6 +26,7 @@ from .temperature_history import TemperatureHistory
 from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
 from ..effects import Context
+from ..messages import output_scale
 from ..model import Model
 from ..monitor import compared, Drift, monitor, rests_of
 from ..table import Floats
@@ -226,11 +227,6 @@ def context_of_rest(rest: Dwell, units: Units) -> Context:
     known = {key: np.array([value]) for key, value in rest.context.items()}
     return {'previous': _NONE, 'rate': _NONE, **known, 'time': np.array([rest.time]),
             'std': units.to_g(rest.std)[np.newaxis]}
-
-
-def output_scale(calibration: Calibration, gravity: float) -> float:
-    """Return m/s² per unit of corrected force; `gravity` is the local gravity [m/s²]."""
-    return 1.0 if calibration.units.name == 'm/s2' else gravity / calibration.force_per_g
 
 
 def rest_after(part: Dwell, whole: Dwell) -> Dwell:

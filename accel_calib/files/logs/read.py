@@ -84,8 +84,10 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
         with open_samples(path, options.topic, options.sensor,
                           temperature_topic=options.temperature_topic,
                           supply_topic=options.supply_topic) as bag:
-            units = _units(path, 'm/s2', options)
-            yield OpenLog(bag.blocks, bag.samples, units, bag.sensor, noted=lambda: bag.notes)
+            # Drivers exist that publish g, although Imu messages are in m/s².
+            units = units_of(options.units or 'm/s2', options.gravity)
+            yield OpenLog(_checked(bag.blocks, units), bag.samples, units, bag.sensor,
+                          noted=lambda: bag.notes)
     elif is_ulg(path):
         yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
     elif is_dataflash(path):
@@ -103,11 +105,21 @@ def _units(path: Path, name: UnitName, options: LogOptions) -> Units:
     return units_of(name, options.gravity)
 
 
+def _checked(blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
+    """Yield the blocks, and check the unit of the first one."""
+    first = next(blocks, None)
+    if first is not None:
+        check_units(first, units)
+        yield first
+        yield from blocks
+
+
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
     """Return a flight log that is read."""
     recording = log.recording(str(path))
-    return OpenLog(iter((recording,)), len(recording), _units(path, log.units, options),
-                   log.sensor, log.read_as, noted=lambda: log.notes)
+    units = _units(path, log.units, options)
+    return OpenLog(_checked(iter((recording,)), units), len(recording), units, log.sensor,
+                   log.read_as, noted=lambda: log.notes)
 
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
@@ -124,8 +136,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         return (*text.notes, *quantities.all_notes)
 
     head, name = next(blocks), quantities.units.name
-    if options.units or text.layout.about.get('units'):
-        check_units(Poses(*head), quantities.units)
+    check_units(Poses(*head), quantities.units)
     if are_samples(head[0]):
         recordings = (Recording(*block, name, sensor) for block in chain((head,), blocks))
         return OpenLog(recordings, _samples(path, text, head), quantities.units, sensor,
