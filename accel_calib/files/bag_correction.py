@@ -43,7 +43,6 @@ from ..messages.layout import (
     Messages,
     put_doubles,
     renamed,
-    samples_of,
 )
 from ..table import Recording
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
@@ -205,8 +204,8 @@ class _Correction:
         known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
         self.outside = joined_ranges(self.outside, outside(self._calibration, known))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
-            put_doubles(messages, corrected(self._calibration, doubles, known,
-                                                scale=self._scale))
+            made = corrected(self._calibration, doubles, known, scale=self._scale)
+            put_doubles(messages, made)
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 
