@@ -45,9 +45,18 @@ _OTHERS = {'g': 1.0, 'm/s2': STANDARD_GRAVITY, 'ft/s2': 32.174, 'cm/s2': 100.0 *
 _SUPPORTED = ('g', 'm/s2')
 
 
-def check_units(poses: Table, units: Units) -> None:
+def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     Check that readings at rest and known forces have a length of about 1 g.
+
+    Parameters
+    ----------
+    poses : Poses or Recording
+        The readings.
+    units : Units
+        Their unit.
+    source : str
+        What they were read from, for the error.
 
     Raises
     ------
@@ -58,7 +67,7 @@ def check_units(poses: Table, units: Units) -> None:
     if len(poses) == 0:
         return
     if units.name != 'native':
-        _check_readings(_median_length(poses.reading), units)
+        _check_readings(_median_length(poses.reading), units, source and f'{source}: ')
     if 'reference' in poses:
         _check_reference(_median_length(poses['reference']), units)
 
@@ -68,7 +77,7 @@ def _median_length(vectors: Floats) -> float:
         return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
-def _check_readings(length: float, units: Units) -> None:
+def _check_readings(length: float, units: Units, where: str) -> None:
     if _is_likely(length, units.per_g):
         return
     likely = _likely(length)
@@ -78,7 +87,7 @@ def _check_readings(length: float, units: Units) -> None:
     else:
         look = f'they look like {" or ".join(likely)}: ' if likely else ''
         advice = f'{look}set the units of the readings to native; the fit estimates their scale'
-    raise InputError(f'the length of the readings is about {length:.4g}, expected about '
+    raise InputError(f'{where}the length of the readings is about {length:.4g}, expected about '
                      f'{units.per_g:.4g} at rest in {units.name}', advice)
 
 

@@ -197,7 +197,8 @@ class _Correction:
         of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
         context = plausible_samples(self._bag, messages, self.done)
         if not self.done:
-            check_units(Recording(context, np.arange(len(messages))), self._units)
+            check_units(Recording(context, np.arange(len(messages))), self._units,
+                        str(self._bag.path))
         for key, track in self._tracks.items():
             context[key] = track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))

@@ -86,7 +86,7 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
                           supply_topic=options.supply_topic) as bag:
             # Drivers exist that publish g, although Imu messages are in m/s².
             units = units_of(options.units or 'm/s2', options.gravity)
-            yield OpenLog(_checked(bag.blocks, units), bag.samples, units, bag.sensor,
+            yield OpenLog(_checked(path, bag.blocks, units), bag.samples, units, bag.sensor,
                           noted=lambda: bag.notes)
     elif is_ulg(path):
         yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
@@ -105,11 +105,11 @@ def _units(path: Path, name: UnitName, options: LogOptions) -> Units:
     return units_of(name, options.gravity)
 
 
-def _checked(blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
+def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
     """Yield the blocks, and check the unit of the first one."""
     first = next(blocks, None)
     if first is not None:
-        check_units(first, units)
+        check_units(first, units, str(path))
         yield first
         yield from blocks
 
@@ -118,7 +118,7 @@ def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
     """Return a flight log that is read."""
     recording = log.recording(str(path))
     units = _units(path, log.units, options)
-    return OpenLog(_checked(iter((recording,)), units), len(recording), units, log.sensor,
+    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units, log.sensor,
                    log.read_as, noted=lambda: log.notes)
 
 
@@ -136,7 +136,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         return (*text.notes, *quantities.all_notes)
 
     head, name = next(blocks), quantities.units.name
-    check_units(Poses(*head), quantities.units)
+    check_units(Poses(*head), quantities.units, str(path))
     if are_samples(head[0]):
         recordings = (Recording(*block, name, sensor) for block in chain((head,), blocks))
         return OpenLog(recordings, _samples(path, text, head), quantities.units, sensor,
