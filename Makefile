@@ -24,7 +24,7 @@ unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 endif
 
-.PHONY: help demo test lint docs faults bench clean
+.PHONY: help demo test lint docs faults mutants bench clean
 .NOTPARALLEL:
 
 help:
@@ -33,6 +33,7 @@ help:
 	@echo 'make lint   linter and type check'
 	@echo 'make docs   the documentation site, in build/docs'
 	@echo 'make faults the whole series of damaged files, failed writes and kills; half an hour'
+	@echo 'make mutants whether tests fail when an operator is wrong; an hour or more'
 	@echo 'make bench  measures speed, beside what it is compared to, and writes it to the docs'
 	@echo 'make clean  removes .venv and what was built'
 
@@ -58,6 +59,9 @@ faults: $(VENV)/extra-test $(VENV)/package
 	@for seed in 1 2 3 4 5; do \
 		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 
+mutants: $(VENV)/extra-test $(VENV)/extra-mutants $(VENV)/package
+	@$(BIN)/python benchmarks/mutants.py --markdown docs/figures/mutants.md
+
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
 	@for name in imu_path recordings stillness_speed fits memory live_page; do \
@@ -74,7 +78,8 @@ $(VENV)/made:
 	@touch $@
 
 $(VENV)/extra-test: ALSO := ,test-fleet
-$(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev $(VENV)/extra-docs: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
+$(VENV)/extra-ros $(VENV)/extra-test $(VENV)/extra-dev $(VENV)/extra-docs \
+	$(VENV)/extra-mutants: $(VENV)/extra-%: setup.py pyproject.toml | $(VENV)/made
 	@$(PIP) install '.[ros,$*$(ALSO)]'
 	@touch $@
 
