@@ -10,7 +10,7 @@ from pathlib import Path
 import accel_calib as ac
 from accel_calib.calibrate import EDITED, fit_partial, fit_poses, mounting_only, verify
 from accel_calib.capture import capture
-from accel_calib.files import read_calibration, read_poses, read_recording
+from accel_calib.logs import read_poses, read_recording
 from accel_calib.rating import (
     Expected,
     GOOD_MG,
@@ -20,6 +20,7 @@ from accel_calib.rating import (
     rate_verification,
     Rating,
 )
+from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import random_directions, spread_directions

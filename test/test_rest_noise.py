@@ -18,7 +18,7 @@ from accel_calib.calibrate import (
 )
 from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from, select
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import read_poses, read_recording, write_table
+from accel_calib.logs import read_poses, read_recording, write_table
 from accel_calib.refine import refine
 from accel_calib.table import numbered, Poses, Recording
 from accel_calib.units import units_of

@@ -8,7 +8,7 @@ import json
 
 from accel_calib.calibrate import ARBITRARY_HEADING, fit_poses, level, with_given_mounting
 from accel_calib.errors import InputError
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
 from accel_calib.table import Poses
 from accel_calib.units import Units, units_of
 from inside import (
