@@ -35,11 +35,10 @@ from accel_calib.calibrate.pose_planning import (
 )
 from accel_calib.capture.trend import oscillation
 from accel_calib.capture.window import rounding_left
-from accel_calib.cli.characters import in_one_line, shown
 from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
 from accel_calib.cli.main import COMMANDS, main, parser
 from accel_calib.cli.options import plain as plain_json
-from accel_calib.cli.terminal import Output
+from accel_calib.cli.terminal import in_one_line, Output, shown
 from accel_calib.cli.watch import _Lines as WatchLines
 from accel_calib.cli.watch import _Screen as WatchScreen
 from accel_calib.cli.watch_view import changes, screen, state
@@ -82,12 +81,10 @@ from accel_calib.estimate.equations import equations, kinds, noise_of
 from accel_calib.estimate.geometry import distinct
 from accel_calib.estimate.mistakes import unseen_mistakes
 from accel_calib.estimate.outliers import originals
-from accel_calib.fleet.alike import alike
-from accel_calib.fleet.identity import as_folder, date_of, sensor_of
-from accel_calib.fleet.inputs import content_hash, on_disk
+from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
+from accel_calib.fleet.models import alike, estimated, priors_of
 from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects
 from accel_calib.fleet.page import write_fleet_page
-from accel_calib.fleet.prior import estimated, priors_of
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import drift_of, merge_sensor
 from accel_calib.fleet.store import schema, write_parquet
@@ -129,9 +126,16 @@ from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
 from accel_calib.noise.components import fit_components
 from accel_calib.noise.curve import allan_variances, octaves, shares, spread_of
 from accel_calib.noise.rest import longest_rest
-from accel_calib.refine import sample
-from accel_calib.refine.curves import best_curve, is_curve
-from accel_calib.refine.findings import advice_for
+from accel_calib.refine import state as refine_state
+from accel_calib.refine.curves import (
+    best_curve,
+    is_curve,
+    Process,
+    process_of,
+    SIGNIFICANT,
+    Walk,
+    walk_beside,
+)
 from accel_calib.refine.linear import _MOST_UNUSUAL as MOST_UNUSUAL
 from accel_calib.refine.linear import _RARE as RARE
 from accel_calib.refine.linear import _USUAL as USUAL
@@ -139,29 +143,26 @@ from accel_calib.refine.linear import Block, Linear, linearised, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
 from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
 from accel_calib.refine.plan import _Predictions as Predictions
-from accel_calib.refine.plan_words import attitude_words, percent
-from accel_calib.refine.plan_words import NOTHING as NOTHING_TO_PLAN
+from accel_calib.refine.records import attitude_words, percent
+from accel_calib.refine.records import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.rivals import probabilities
-from accel_calib.refine.sample import MOST as MOST_SAMPLED_POSES
-from accel_calib.refine.sample import sampled
 from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
-from accel_calib.refine.state import beginning, fitted_state
-from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
-from accel_calib.refine.words import chance, values_of, verdict_words
-from accel_calib.report.calibration_sections import linear_figures
+from accel_calib.refine.state import beginning, fitted_state, sampled
+from accel_calib.refine.state import MOST as MOST_SAMPLED_POSES
+from accel_calib.refine.words import advice_for, chance, values_of, verdict_words
 from accel_calib.report.charts import equal_area
-from accel_calib.report.curve import curve_parts
-from accel_calib.report.drawings import all_drawings, recorded, variables_of
+from accel_calib.report.drawings import all_drawings, curve_parts, recorded, variables_of
 from accel_calib.report.page import calibration_page
 from accel_calib.report.page import page as refinement_page
-from accel_calib.report.repeat_pages import comparison_page
+from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
+from accel_calib.report.sections import linear_figures
+from accel_calib.report.sheet import snippets
 from accel_calib.report.sheet import STYLE as PAGE_STYLE
-from accel_calib.report.snippets import snippets
 from accel_calib.ros.domain import own_domain
 from accel_calib.session import store as session_store
-from accel_calib.session import worker_process
+from accel_calib.session import worker
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after
 from accel_calib.session.guidance import Guide, next_action, Plan
 from accel_calib.session.health import figures
@@ -171,11 +172,9 @@ from accel_calib.session.settings import capture_settings, changed, default_of, 
 from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
 from accel_calib.session.store import load as load_store
 from accel_calib.session.store import Store as SensorStore
-from accel_calib.session.stream_statistics import StreamStatistics
-from accel_calib.session.temperature_history import TemperatureHistory
+from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.work import fitted, is_partial, plan_for
-from accel_calib.session.worker import Worker
-from accel_calib.session.worker_process import WorkerProcess
+from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import _values_in as values_in
 from accel_calib.stored.calibration_yaml import (
@@ -214,8 +213,8 @@ PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'
 CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
-PATIENCE_OF_A_WORKER = worker_process, '_PATIENCE'
-LARGEST_SAMPLE = sample, 'MOST'
+PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
+LARGEST_SAMPLE = refine_state, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 DECOMPRESSED = bounded_bags, 'decompressed'
 STUCK = viewer, 'STUCK_S'

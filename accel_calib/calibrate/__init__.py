@@ -22,13 +22,19 @@ from .calibration import (
     Rejected,
 )
 from .checks import FLAT
-from .context import of_samples, thermal_stream
-from .fit import fit_poses, level_by_rows, MODEL_NAMES
+from .context import joined_ranges, of_samples, Outside, outside, thermal_stream, USES_LIMIT
+from .fit import (
+    ARBITRARY_HEADING,
+    fit_poses,
+    level,
+    level_by_rows,
+    MODEL_NAMES,
+    set_heading,
+    with_given_mounting,
+)
 from .fleet_prior import fit_with_fleet, FleetPrior
 from .gate import gated
-from .levelling import ARBITRARY_HEADING, level, set_heading, with_given_mounting
 from .mounting import flat_direction, FrameName, FRAMES
-from .outside import joined_ranges, Outside, outside, USES_LIMIT
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
 from .quality import in_g, NOT_LOCATED, UNCHECKED, Verification, verify, with_history

@@ -15,8 +15,7 @@ from .terminal import working
 from ..compare import History, history_of
 from ..rating import rate_comparison
 from ..report import check_matplotlib, write_history_page
-from ..report.repeat_charts import GAINS, in_words, OFFSETS
-from ..report.repeat_pages import change_in_words
+from ..report.repeats import change_in_words, GAINS, in_words, OFFSETS
 from ..stored import read_calibration
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ import sys
 from typing import NoReturn
 
 from . import targets
-from .characters import in_one_line, use_plain_characters
+from .terminal import in_one_line, use_plain_characters
 from .. import __version__
 from ..errors import AccelCalibError, crash_words, system_error
 

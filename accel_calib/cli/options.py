@@ -247,7 +247,7 @@ def in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
     from concurrent.futures import ThreadPoolExecutor
     from queue import SimpleQueue
 
-    from ..session.worker_process import WorkerProcess
+    from ..session.worker import WorkerProcess
 
     workers = [WorkerProcess(idle=False) for _ in range(min(jobs, len(items)))]
     free: SimpleQueue[WorkerProcess] = SimpleQueue()

@@ -2,16 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Output on a terminal: width, progress, and its end by the user.
+Output on a terminal: characters, width, progress, and its end by the user.
 
-Lines break at words, at the width of the terminal or of ``COLUMNS``. A word that is longer, such
-as the name of a file, stays whole. Progress is shown on standard error
-if it is a terminal.
+An output whose encoding lacks a character gets a plain replacement, such as ``+-`` for ±. Control
+characters from files never reach the terminal. Lines break at words, at the width of the terminal
+or of ``COLUMNS``. A word that is longer, such as the name of a file, stays whole. Progress is
+shown on standard error if it is a terminal.
 
 """
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import re
@@ -22,12 +24,62 @@ from typing import Any, TYPE_CHECKING
 
 from rich.console import Console
 
-from .characters import shown
-
 if TYPE_CHECKING:
     from rich.text import Text
 
     from ..logs import Progress
+
+_PLAIN = {'±': '+-', '°': ' deg', '²': '2', '³': '3', '⁻': '-', '¹': '1', '−': '-',
+          '–': '-', '·': '*', '×': 'x', '…': '...', '→': '->', '≤': '<=', '≥': '>=', '√': 'sqrt ',
+          'Δ': 'D', 'σ': 'sigma', 'τ': 'tau', 'ω': 'omega', 'µ': 'u', 'μ': 'u', '█': '#', '│': '|',
+          '─': '-', '✓': 'ok'}
+"""Replacements for an output that has not these characters."""
+
+_HANDLER = 'accel_calib.plain'
+
+
+def use_plain_characters() -> None:
+    """Let standard output and error replace the characters that their encoding lacks."""
+    codecs.register_error(_HANDLER, _replace)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, 'reconfigure'):
+            stream.reconfigure(errors=_HANDLER)
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    """Return the replacement for characters that the encoding lacks, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return ''.join(map(_plain, error.object[error.start:error.end])), error.end
+
+
+def shown(text: str, encoding: str) -> str:
+    """Return text in the characters of an encoding, without control characters."""
+    safe = ''.join(each if each.isprintable() or each == '\n' else _plain(each) for each in text)
+    try:
+        safe.encode(encoding)
+    except UnicodeEncodeError:
+        return ''.join(each if _has(encoding, each) else _plain(each) for each in safe)
+    return safe
+
+
+def _has(encoding: str, character: str) -> bool:
+    try:
+        character.encode(encoding)
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _plain(character: str) -> str:
+    """Return the replacement of a character: ASCII without control characters."""
+    return _PLAIN.get(character) or character.encode('unicode_escape').decode('ascii')
+
+
+def in_one_line(text: str) -> str:
+    """Return text as one line without control characters."""
+    return ''.join(each if each.isprintable() else _plain(each)
+                   for each in ' '.join(text.split()))
 
 
 _NO_BREAK = '\N{NO-BREAK SPACE}'

@@ -21,7 +21,7 @@ from .overview import OfModel, table_of
 from .store import Row
 from ..compare.parameters import NAMES
 from ..report.drawings import Drawing
-from ..report.repeat_charts import CROSS, GAINS, in_words, label_dates, OFFSETS, scale_of
+from ..report.repeats import CROSS, GAINS, in_words, label_dates, OFFSETS, scale_of
 from ..report.style import (
     ACCENT,
     AFTER,

@@ -29,12 +29,11 @@ from itertools import groupby
 
 import numpy as np
 
-from .alike import alike
-from .prior import FEWEST
+from .models import alike, FEWEST
 from .store import Row
 from ..compare.parameters import NAMES
 from ..effects import LADDER
-from ..report.repeat_charts import scale_of
+from ..report.repeats import scale_of
 from ..table import Floats
 from ..text import counted, short
 

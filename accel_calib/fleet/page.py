@@ -18,7 +18,6 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .alike import alike
 from .charts import (
     change_words,
     drift_words,
@@ -29,6 +28,7 @@ from .charts import (
     of_sensor,
     of_values,
 )
+from .models import alike
 from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
 from .store import Row, Store
 from .. import __version__
@@ -37,7 +37,7 @@ from ..compare.parameters import NAMES
 from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..report.drawings import Drawing
-from ..report.repeat_charts import scale_of
+from ..report.repeats import scale_of
 from ..report.sheet import (
     figures,
     heading,

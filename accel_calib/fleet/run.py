@@ -20,8 +20,8 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
+from .models import PRIOR_COLUMNS, PRIOR_FILE, priors_of
 from .page import write_fleet_page
-from .prior import PRIOR_COLUMNS, PRIOR_FILE, priors_of
 from .sensors import merge_sensor, read_sensors, write_sensors
 from .store import Row, Store
 from .task import calibrate_recording, Done, Options, unread_row

@@ -25,7 +25,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .alike import alike
+from .models import alike
 from .store import Row, Store, write_parquet
 from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL

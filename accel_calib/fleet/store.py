@@ -22,7 +22,7 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from .identity import as_folder
+from .inputs import as_folder
 from ..compare.parameters import NAMES
 from ..disk import write_atomically
 from ..errors import InputError

@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .identity import as_folder, date_of, matched, sensor_of, UNKNOWN
-from .inputs import content_hash, Input, on_disk
+from .inputs import as_folder, content_hash, date_of, Input, matched, on_disk, sensor_of, UNKNOWN
 from .store import Row, Store
 from .. import __version__
 from ..calibrate import Calibration, fit_poses

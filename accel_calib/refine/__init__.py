@@ -15,8 +15,7 @@ poses that separate effects from their rivals. `with_fleet` includes the typical
 
 """
 
-from .plan_words import PlannedPose, PosePlan
-from .records import Refinement, Stage, Step
+from .records import PlannedPose, PosePlan, Refinement, Stage, Step
 from .refinement import BASES, refine
 from .with_fleet import refine_with_fleet
 

@@ -33,15 +33,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .plan_words import (
-    attitude_words,
-    attitudes,
-    ENOUGH,
-    plan_lines,
-    PlannedPose,
-    PosePlan,
-    VARIED,
-)
+from .records import attitude_words, attitudes, ENOUGH, plan_lines, PlannedPose, PosePlan, VARIED
 from .rivals import LEAST, probabilities
 from .state import fitted_state
 from ..effects import effect_named, Model, WANDER

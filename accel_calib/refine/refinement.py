@@ -20,15 +20,14 @@ import math
 import numpy as np
 
 from .curves import is_curve
-from .findings import advice_for, change_words, curve_words, not_testable, where
 from .linear import linearised
 from .plan import plan_poses
 from .records import Refinement, Stage, Step, Verdict
 from .rivals import LEAST, probabilities
-from .sample import sample_words, sampled
 from .search import Found, search
-from .state import fitted_state, is_noise, State
+from .state import fitted_state, is_noise, sample_words, sampled, State
 from .stored import beside_stored, with_changes, with_stored
+from .words import advice_for, change_words, curve_words, not_testable, where
 from ..calibrate import (
     Calibration,
     check_sensor,

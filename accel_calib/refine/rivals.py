@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .curves import walk_beside
 from .search import Near
-from .wander import walk_beside
 from ..effects import LADDER, WANDER
 
 LEAST = 0.01

@@ -27,12 +27,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import best_curve, Curve
+from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, walk_beside
 from .linear import LEVEL, Linear, linearised, Set
 from .output import Clipped, off_grid, unclipped
 from .sets import accepted, explored, names_of, simpler
 from .state import beginning, changes_beside, fitted_state, is_noise, State
-from .wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
 from ..calibrate.quality import with_previous
 from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, Model, WANDER
 from ..estimate.equations import kinds

@@ -21,11 +21,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .findings import not_testable
-from .plan_words import PosePlan
-from .records import Refinement, Stage
+from .records import PosePlan, Refinement, Stage
 from .refinement import refine
 from .state import is_noise
+from .words import not_testable
 from ..calibrate import Calibration, fit_with_fleet, FleetPrior, gated, in_g, with_rest_noise
 from ..calibrate.fleet_prior import posterior
 from ..calibrate.quality import quality_of, with_history

@@ -15,7 +15,7 @@ several calibrations: of `compare` and `history`. `sheet` is the skeleton of all
 
 from .drawings import write_figures
 from .page import write_calibration_page, write_page
-from .repeat_pages import write_comparison_page, write_history_page
+from .repeats import write_comparison_page, write_history_page
 from .style import check_matplotlib, has_matplotlib
 
 __all__ = ['check_matplotlib', 'has_matplotlib', 'write_calibration_page',

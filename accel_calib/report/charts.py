@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from .residuals import Variable
 from .style import (
     ACCENT,
     AFTER,
@@ -40,7 +41,6 @@ from .style import (
     SEQUENTIAL,
     styled,
 )
-from .variables import Variable
 from ..estimate.geometry import uncovered
 from ..table import Floats
 

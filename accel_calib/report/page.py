@@ -5,7 +5,7 @@
 The pages of one calibration: of `fit`, `calibrate`, `verify` and `refine`.
 
 All begin with the verdict and the calibration. Sections about effects follow where some were
-found.
+sections.
 
 """
 
@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import calibration_sections as parts
-from . import refinement_sections as found
+from . import sections
 from .residuals import Residuals, residuals_of
 from .sheet import heading, listing, section, sheet
 from .. import __version__
@@ -133,7 +132,7 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
              f'fitted {calibration.date}' if calibration.date else '',
              f'accel_calib {__version__}']
     more = '' if used is None else verdict_words(used)
-    body = [heading(title, about), parts.verdict_box(rating, more),
+    body = [heading(title, about), sections.verdict_box(rating, more),
             *_body(calibration, residuals, refinement, verification, stored),
             section('How the log was read', listing(notes)),
             _how_to_read(steps=refinement is not None)]
@@ -155,21 +154,21 @@ def _body(calibration: Calibration, residuals: Residuals, refinement: Refinement
     checked = None if verification is None else verification[0]
     floor_mg = (calibration.quality if checked is None else checked).noise_floor_mg
     refined = _is_refined(calibration, refinement)
-    refusal = found.refusal(refinement) if refinement is not None and refined else ()
+    refusal = sections.refusal(refinement) if refinement is not None and refined else ()
     advice = refinement.advice if refinement is not None and refined else ()
-    yield parts.key_numbers(calibration, residuals, checked)
-    yield parts.values(calibration)
-    yield parts.covered(calibration, residuals, plan=refinement is None and checked is None)
-    yield parts.before_after(residuals, floor_mg)
-    yield parts.warnings((*refusal, *calibration.warnings), residuals, advice)
-    yield parts.remainder(residuals)
+    yield sections.key_numbers(calibration, residuals, checked)
+    yield sections.values(calibration)
+    yield sections.covered(calibration, residuals, plan=refinement is None and checked is None)
+    yield sections.before_after(residuals, floor_mg)
+    yield sections.warnings((*refusal, *calibration.warnings), residuals, advice)
+    yield sections.remainder(residuals)
     if refinement is not None:
-        yield from found.steps(refinement, used=refined)
-        yield found.remainder(refinement, residuals)
-        yield found.not_testable(refinement)
-    yield parts.poses(residuals, calibration)
+        yield from sections.steps(refinement, used=refined)
+        yield sections.refined_remainder(refinement, residuals)
+        yield sections.not_testable(refinement)
+    yield sections.poses(residuals, calibration)
     if not refusal:
-        yield parts.use(calibration, stored)
+        yield sections.use(calibration, stored)
 
 
 def _how_to_read(*, steps: bool) -> str:

@@ -25,7 +25,7 @@ from ..session.worker import CallSoon, Worker
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from ..live.exchange import Exchange
+    from ..live.host import Exchange
     from ..live.server import PageServer
 
 
@@ -62,7 +62,7 @@ class Page:
         settings = self._session.settings
         if not settings.web_port:
             return
-        from ..live.exchange import Exchange
+        from ..live.host import Exchange
         from ..live.link import qr_code
         from ..live.messages import PERIOD
         from ..live.server import PageServer

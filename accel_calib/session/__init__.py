@@ -12,11 +12,11 @@ and the state. `settings` defines the parameters.
 
 """
 
-from .events import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
 from .guidance import Progress
 from .health import Finding, findings, Health, Level, worst
 from .session import BATCH, Session
 from .settings import CalibratorSettings, WEB_PORT
+from .work import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
 
 __all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Event', 'Finding', 'Health', 'Job',
            'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses', 'Still',

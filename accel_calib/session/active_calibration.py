@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from .live_capture import LONG_REST, overlap
-from .temperature_history import TemperatureHistory
+from .stream import TemperatureHistory
 from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rests_of

@@ -19,15 +19,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from .events import Compute, Job
 from .guidance import next_action, Plan
 from .store import Store, writing_advice
 from .work import (
     at_rest,
     change_words,
+    Compute,
     fitted,
     has_changed,
     is_partial,
+    Job,
     plan_for,
     refined,
     story,

@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from .stream_statistics import SILENT, StreamStatistics
+from .stream import SILENT, StreamStatistics
 from ..calibrate import GyroBias, SampleNoise, USES_LIMIT
 from ..compare import Drift, status
 from ..table import Floats

@@ -23,16 +23,26 @@ import numpy as np
 
 from .active_calibration import ActiveCalibration
 from .commands import Commands
-from .events import Compute, Event, Job, Log, Mounting, Severity, ShowPoses, Still
 from .guidance import Guide, Plan, Progress
 from .health import Health, stream_fault
 from .live_capture import Change, LiveCapture
-from .newest_reading import Newest, NewestReading
 from .sensor_files import SensorFiles
 from .settings import CalibratorSettings, capture_settings
 from .store import load, Loaded, Store, writing_advice
-from .stream_statistics import SILENT, StreamStatistics
-from .work import is_partial, plan_for, title
+from .stream import Newest, NewestReading, SILENT, StreamStatistics
+from .work import (
+    Compute,
+    Event,
+    is_partial,
+    Job,
+    Log,
+    Mounting,
+    plan_for,
+    Severity,
+    ShowPoses,
+    Still,
+    title,
+)
 from ..calibrate import Calibration, Outside, outside, USES_LIMIT, with_given_mounting
 from ..calibrate.mounting import mounting_of, mounting_words
 from ..compare import status

@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Typical values and spreads of the sensors of a fleet, by model of sensor.
+What the sensors of a fleet have in common, by model of sensor.
 
-Each sensor has the values x of model 10 (the mean over its calibrations) with the covariance C.
-Over the fleet, x is distributed about m with P + C. `estimated` computes m and P by expectation
-maximisation. The distribution over sensors is Student's t, so that a few sensors unlike the others
-have little weight.
+**Calibrations that are compared.** A calibration is compared as if its effects were known to be
+right. A search in few poses sometimes names another effect than in the other recordings, and
+offset and gain then differ by much more than their uncertainty. Only calibrations with the same
+effects are therefore compared, those with the most frequent effects of the sensor.
+
+**Typical values.** Each sensor has the values x of model 10 (the mean over its calibrations) with
+the covariance C. Over the fleet, x is distributed about m with P + C. `estimated` computes m and P
+by expectation maximisation. The distribution over sensors is Student's t, so that a few sensors
+unlike the others have little weight.
 
 The correlations of few sensors are mostly chance, and would make some combinations of values seem
 certain. They are reduced by n / (n + `_CHANCE`). The mean of n sensors is uncertain itself, which
@@ -18,6 +23,7 @@ the sensors are within the distance that contains half of a normal distribution.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
@@ -25,9 +31,40 @@ import numpy as np
 
 from .store import Row
 from ..calibrate.fleet_prior import FleetPrior
-from ..effects import MODELS, parameter_names
+from ..effects import LADDER, MODELS, parameter_names
 from ..estimate.fit import Prior
 from ..table import Floats
+
+
+def alike(rows: Iterable[Row]) -> list[Row]:
+    """
+    Return the rows of a sensor whose values can be compared.
+
+    Left out are recordings without a calibration, those whose poses do not determine offset, gain
+    and cross-axis gain, and those without the most frequent effects. Models 4, 7 and 10 are alike,
+    because `accel_calib.compare` compares them with the uncertainty of the largest one.
+
+    Parameters
+    ----------
+    rows : iterable of dict
+        Rows with ``calibration``, ``determined`` and ``effects``.
+
+    Returns
+    -------
+    list of dict
+        The rows that are left, in the same order.
+
+    """
+    good = [row for row in rows if row['calibration'] and row['determined']]
+    most = next((kind for kind, _ in Counter(map(_kind, good)).most_common(1)), None)
+    return [row for row in good if _kind(row) == most]
+
+
+def _kind(row: Row) -> frozenset[str]:
+    """Return the effects of a calibration; none if it has only those of models 4, 7 and 10."""
+    effects = frozenset(row['effects'])
+    return effects if effects - {*LADDER} else frozenset()
+
 
 FEWEST = 5
 """Smallest number of sensors of a model whose typical values are computed."""
