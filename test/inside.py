@@ -42,10 +42,7 @@ from accel_calib.capture.window import rounding_left
 from accel_calib.cli.characters import in_one_line, shown
 from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
 from accel_calib.cli.main import COMMANDS, main, parser
-from accel_calib.cli.options import plain as plain_json
 from accel_calib.cli.terminal import Output
-from accel_calib.cli.watch import _Lines as WatchLines
-from accel_calib.cli.watch import _Screen as WatchScreen
 from accel_calib.cli.watch_view import changes, screen, state
 from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES
 from accel_calib.compare.parameters import (
@@ -148,14 +145,12 @@ from accel_calib.refine.sets import accepted, explored, is_significant, names_of
 from accel_calib.refine.state import beginning, fitted_state
 from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
 from accel_calib.report.calibration_sections import linear_figures
-from accel_calib.report.charts import equal_area
 from accel_calib.report.curve import curve_parts
-from accel_calib.report.drawings import all_drawings, recorded, variables_of
+from accel_calib.report.drawings import all_drawings
 from accel_calib.report.page import calibration_page
 from accel_calib.report.page import page as refinement_page
 from accel_calib.report.repeat_pages import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
-from accel_calib.report.sheet import STYLE as PAGE_STYLE
 from accel_calib.report.snippets import snippets
 from accel_calib.ros.domain import own_domain
 from accel_calib.rotations import quaternion_of, rotation_from_rpy
@@ -175,11 +170,10 @@ from accel_calib.session.temperature_history import TemperatureHistory
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker
 from accel_calib.session.worker_process import WorkerProcess
-from accel_calib.significant import with_sd
 from accel_calib.simulate import model_with, parse_effect, simulate_poses, simulate_recording
 from accel_calib.sphere import OVER_THE_SPHERE, random_directions, spread_directions, unit
 from accel_calib.thermal import acting_temperature, Lag, low_passed, rate_of, ThermalStream
-from accel_calib.words import chance, values_of, verdict_words
+from accel_calib.words import values_of, verdict_words
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""
