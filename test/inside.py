@@ -75,14 +75,12 @@ from accel_calib.files.exports import export, identifier
 from accel_calib.files.exports import FORMATS as EXPORT_FORMATS
 from accel_calib.files.exports import Options as ExportOptions
 from accel_calib.files.logs import are_samples, text
-from accel_calib.files.logs.ardupilot import is_dataflash, read_dataflash
+from accel_calib.files.logs.ardupilot import read_dataflash
 from accel_calib.files.logs.formats import named as format_named
 from accel_calib.files.logs.formats import recognise, record_instead
 from accel_calib.files.logs.names import meaning, unit_of
-from accel_calib.files.logs.names import UNITS as LOG_UNITS
-from accel_calib.files.logs.names import WORDS as LOG_WORDS
-from accel_calib.files.logs.px4 import is_ulg, read_ulg
 from accel_calib.files.logs.px4 import MAGIC as ULG_MAGIC
+from accel_calib.files.logs.px4 import read_ulg
 from accel_calib.files.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
 from accel_calib.files.plan_table import read_plan, write_plan
 from accel_calib.files.regular import check_regular
