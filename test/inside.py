@@ -102,8 +102,6 @@ from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
 from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
 from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
-from accel_calib.live.messages import progress as live_progress
-from accel_calib.live.messages import text_of as live_text_of
 from accel_calib.live.server import PageServer, policy_hash
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.messages.layout import layout_with
@@ -158,7 +156,7 @@ from accel_calib.session.active_calibration import ActiveCalibration, rest_after
 from accel_calib.session.guidance import Guide, next_action, Plan
 from accel_calib.session.health import figures
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
-from accel_calib.session.sensor_files import Lock, StoreInUseError
+from accel_calib.session.sensor_files import Lock
 from accel_calib.session.settings import capture_settings, changed, default_of, yaml_lines
 from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
 from accel_calib.session.store import load as load_store
