@@ -13,6 +13,7 @@ from accel_calib.files import read_poses
 from inside import main, parse_effect, parser, rotation_from_rpy
 import numpy as np
 import pytest
+from shared import run, run_json
 
 ROOT = Path(__file__).parents[1]
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
@@ -21,15 +22,6 @@ FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_s
             'poses_used', 'poses_rejected', 'rms_before_mg', 'rms_after_mg', 'max_after_percent',
             'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings',
             'uncertainty_mg', 'identifiability', 'next_pose'}
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def run_json(capsys, *arguments):
-    status = run(*arguments, '--json', '-')
-    return status, json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture

@@ -33,6 +33,8 @@ import pytest
 GRAVITY = 9.80665
 RATE = 50.0
 
+pytestmark = pytest.mark.usefixtures('home')
+
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
 
@@ -83,12 +85,6 @@ class Driver:
 
     def finding(self, name: str) -> Any:
         return next(each for each in findings(self.session.health()) if each.name == name)
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return tmp_path / 'home' / 'accel_calib'
 
 
 @pytest.mark.parametrize(('one', 'other'), [

@@ -10,7 +10,6 @@ import os
 from pathlib import Path
 import resource
 import shutil
-import signal
 import stat
 import tempfile
 from typing import Any
@@ -36,32 +35,14 @@ import numpy as np
 import pytest
 from test_session import Driver
 
-HANG_S = 60
+pytestmark = pytest.mark.usefixtures('home', 'in_time')
+
 NOBODY = 65534
 EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]),
            'axis_gain': np.array([0.012, -0.015, 0.008])}
 IDENTITY = Identity('imu_link', '/imu/data_raw')
 
 Readings = Callable[..., Any]
-
-
-@pytest.fixture(autouse=True)
-def in_time() -> Iterator[None]:
-    """End a test that hangs, such as one that reads a pipe."""
-    def end(*_: object) -> None:
-        raise AssertionError(f'not ready within {HANG_S} s')
-
-    before = signal.signal(signal.SIGALRM, end)
-    signal.alarm(HANG_S)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return tmp_path / 'home' / 'accel_calib'
 
 
 @pytest.fixture
