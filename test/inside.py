@@ -111,7 +111,6 @@ from accel_calib.model import (
     Model,
     MODELS,
     parameter_basis,
-    parameter_names,
     predict,
     reading_of,
     sensor_force,
