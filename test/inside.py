@@ -37,7 +37,6 @@ from accel_calib.calibrate.pose_planning import (
     unseen,
     words_of,
 )
-from accel_calib.capture.trend import oscillation
 from accel_calib.capture.window import rounding_left
 from accel_calib.cli.characters import in_one_line, shown
 from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
