@@ -54,7 +54,6 @@ from accel_calib.compare.parameters import (
     scatter_of,
 )
 from accel_calib.effects.terms import terms_of
-from accel_calib.estimate.closed_form import along_quadrics
 from accel_calib.estimate.equations import equations, kinds, noise_of
 from accel_calib.estimate.geometry import distinct
 from accel_calib.estimate.mistakes import unseen_mistakes
