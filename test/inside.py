@@ -121,17 +121,13 @@ from accel_calib.one_reading import OneReading
 from accel_calib.refine import sample
 from accel_calib.refine.curves import best_curve, is_curve
 from accel_calib.refine.findings import advice_for
-from accel_calib.refine.linear import _MOST_UNUSUAL as MOST_UNUSUAL
 from accel_calib.refine.linear import _RARE as RARE
-from accel_calib.refine.linear import _USUAL as USUAL
 from accel_calib.refine.linear import Block, Linear, linearised, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
 from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
-from accel_calib.refine.plan import _Predictions as Predictions
-from accel_calib.refine.plan_words import attitude_words, percent
+from accel_calib.refine.plan_words import attitude_words
 from accel_calib.refine.plan_words import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.rivals import probabilities
-from accel_calib.refine.sample import MOST as MOST_SAMPLED_POSES
 from accel_calib.refine.sample import sampled
 from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
