@@ -21,17 +21,18 @@ from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
 from .compare import Comparison
-from .errors import counted, InputError
-from .files import LogOptions, open_log, read_calibration, read_log, write_calibration
-from .files import read_recording as read_whole_recording
+from .effects import model_with, simulate_poses, simulate_recording
+from .errors import InputError
+from .geometry import spread_directions
 from .intake import nothing_still, poses_of
+from .logs import LogOptions, open_log, read_log
+from .logs import read_recording as read_whole_recording
 from .refine import refine as find_effects
 from .refine import Refinement
-from .simulate import model_with, simulate_poses, simulate_recording
-from .sphere import spread_directions
+from .stored import read_calibration, write_calibration
 from .table import columns_from, Floats, numbered, Poses, Recording, Table
+from .text import counted, now
 from .units import STANDARD_GRAVITY, UnitName, Units, units_of
-from .words import now
 
 __all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
            'read_poses', 'read_recording', 'refine', 'simulate', 'verify']

@@ -2,14 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors that a user can fix, and helpers for their messages.
+Errors that a user can fix, and the last resort for those that nobody expected.
 
 Each message has three parts: what was found, what was expected, and what to do.
 
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
 import errno
+import os
+import platform
+import sys
+import tempfile
+import traceback
+
+from . import __version__
 
 
 class AccelCalibError(Exception):
@@ -73,11 +81,29 @@ NEEDS_ROS = ("source /opt/ros/jazzy/setup.bash, or run pip install '.[ros]' in t
 """Advice if ROS 2 is not installed."""
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a count with its noun, such as ``1 pose`` or ``2 poses``."""
-    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+def crash_words(error: BaseException) -> str:
+    """
+    Write the traceback of an error to a temporary file, and return one line about it.
 
+    Parameters
+    ----------
+    error : BaseException
+        The error.
 
-def listed(noun: str, items: Sequence[object]) -> str:
-    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``."""
-    return f'{noun}{"" if len(items) == 1 else "s"} {", ".join(map(str, items))}'
+    Returns
+    -------
+    str
+        What happened, with the name of the file, which contains an id; without the file if it
+        cannot be written.
+
+    """
+    what = f'internal error: {type(error).__name__}: {error}'
+    try:
+        handle, name = tempfile.mkstemp(prefix='accel_calib-', suffix='.txt')
+        with os.fdopen(handle, 'w', encoding='utf-8', errors='backslashreplace') as file:
+            file.write(f'accel_calib {__version__}, Python {platform.python_version()}, '
+                       f'{platform.platform()}\n{" ".join(sys.argv)}\n\n')
+            file.write(''.join(traceback.format_exception(error)))
+    except OSError:
+        return f'{what}; please report it with what you did'
+    return f'{what}; please report it with the file {name}'

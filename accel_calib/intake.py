@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from .capture import capture, settings_from
-from .errors import counted, InputError
-from .files import LogOptions, open_log, Progress
+from .errors import InputError
+from .logs import LogOptions, open_log, Progress
 from .table import Poses
+from .text import counted
 from .units import Units
 
 
@@ -55,7 +56,7 @@ def poses_of(path: Path, options: LogOptions = LogOptions(),
     Parameters
     ----------
     path : Path
-        Pose table or recording, in any format that `accel_calib.files` reads.
+        Pose table or recording, in any format that `accel_calib.logs` reads.
     options : LogOptions
         How to read the log; by default it is recognised.
     settings : mapping

@@ -20,10 +20,9 @@ from .effects import PROCESSES
 from .errors import RefusedFitError
 from .rating import rate, Rating
 from .refine import refine, refine_with_fleet, Refinement
-from .significant import short
 from .table import Poses
+from .text import now, short
 from .units import Units
-from .words import now
 
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""

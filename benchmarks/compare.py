@@ -26,10 +26,8 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.compare import compare, Comparison  # noqa: E402
-from accel_calib.model import Model  # noqa: E402
-from accel_calib.rotations import rotation_from_rpy  # noqa: E402
-from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
-from accel_calib.sphere import spread_directions  # noqa: E402
+from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
+from accel_calib.geometry import rotation_from_rpy, spread_directions  # noqa: E402
 from accel_calib.table import Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, publish, table  # noqa: E402

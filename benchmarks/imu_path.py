@@ -30,10 +30,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 from accel_calib.calibrate import Calibration, fit_poses, level  # noqa: E402
-from accel_calib.files import write_calibration, write_table  # noqa: E402
-from accel_calib.model import Model  # noqa: E402
-from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
-from accel_calib.sphere import spread_directions  # noqa: E402
+from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
+from accel_calib.geometry import spread_directions  # noqa: E402
+from accel_calib.logs import write_table  # noqa: E402
+from accel_calib.stored import write_calibration  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 from imu_trial import node, relay, Trial, trial  # noqa: E402

@@ -43,7 +43,17 @@ FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'messages',
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
                    r'|OrWithAnd)')
 ELSEWHERE = re.compile(r'test_(ros|live|fleet|docs|launch|packaging|bombs)')
-LIMIT_S = 600.0
+SLOWER = 10.0
+"""How much longer than without a mutant tests may take until they count as failed."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an operator stands, and what can replace it, each with its number in the file."""
+
+    file: str
+    line: int
+    operators: list[tuple[Operator, int]]
 
 
 @dataclass(frozen=True)
@@ -57,22 +67,20 @@ class Mutant:
     words: str
 
 
-def mutants(file: str, draw: random.Random) -> Iterator[Mutant]:
-    """Yield one mutant of each place in a file, drawn from those that are possible there."""
+def places(file: str) -> list[Place]:
+    """Return the places of a file, in its order, with the operators that are possible there."""
     source = (ROOT / file).read_text()
-    tree, nodes = ast.parse(source), list(ast_nodes(get_ast(source)))
-    notes = [(note.lineno, note.end_lineno) for note in annotations(tree)]
-    places = defaultdict(list)
-    for name in operator_names():
-        if KINDS.match(name):
-            operator = get_operator(name)()
-            starts = [start for node in nodes for start, _ in operator.mutation_positions(node)]
-            for count, start in enumerate(starts):
-                places[start].append((operator, count))
-    for (line, _), found in sorted(places.items()):
-        if not any(first <= line <= last for first, last in notes):
-            operator, count = draw.choice(found)
-            yield mutant(file, source, tree, line, operator, count)
+    nodes = list(ast_nodes(get_ast(source)))
+    notes = [range(note.lineno, (note.end_lineno or note.lineno) + 1)
+             for note in annotations(ast.parse(source))]
+    at = defaultdict(list)
+    for name in filter(KINDS.match, operator_names()):
+        operator = get_operator(name)()
+        starts = [start for node in nodes for start, _ in operator.mutation_positions(node)]
+        for count, start in enumerate(starts):
+            if not any(start[0] in lines for lines in notes):
+                at[start].append((operator, count))
+    return [Place(file, line, possible) for (line, _), possible in sorted(at.items())]
 
 
 def annotations(tree: ast.AST) -> Iterator[ast.expr]:
@@ -82,16 +90,17 @@ def annotations(tree: ast.AST) -> Iterator[ast.expr]:
                 yield note
 
 
-def mutant(file: str, source: str, tree: ast.Module, line: int, operator: Operator, count: int
-           ) -> Mutant:
-    code = mutate_code(source, operator, count)
+def mutant(place: Place, draw: random.Random) -> Mutant:
+    """Return one of the mutants of a place."""
+    source = (ROOT / place.file).read_text()
+    code = mutate_code(source, *draw.choice(place.operators))
     pairs = zip(source.splitlines(), code.splitlines(), strict=True)
     before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
-    around = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)
-              and node.lineno <= line <= (node.end_lineno or node.lineno)]
+    around = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)
+              and node.lineno <= place.line <= (node.end_lineno or node.lineno)]
     statement = max(around, key=lambda node: node.lineno)
-    lines = range(statement.lineno, (statement.end_lineno or line) + 1)
-    return Mutant(file, line, lines, code, f'`{before}` → `{after}`')
+    lines = range(statement.lineno, (statement.end_lineno or place.line) + 1)
+    return Mutant(place.file, place.line, lines, code, f'`{before}` → `{after}`')
 
 
 def sample(count: int, seed: int) -> list[Mutant]:
@@ -99,7 +108,8 @@ def sample(count: int, seed: int) -> list[Mutant]:
     draw = random.Random(seed)
     files = sorted(str(path.relative_to(ROOT)) for folder in FOLDERS
                    for path in (ROOT / 'accel_calib' / folder).rglob('*.py'))
-    return draw.sample([each for file in files for each in mutants(file, draw)], count)
+    drawn = draw.sample([place for file in files for place in places(file)], count)
+    return [mutant(place, draw) for place in drawn]
 
 
 def copied(to: Path) -> Path:
@@ -140,23 +150,33 @@ class Tests:
                          for name in self.data.measured_files()}
 
     def of(self, file: str, lines: Iterable[int]) -> list[str]:
-        """Return the tests of these lines; what a fixture executes is of all tests of its file."""
+        """
+        Return the tests of these lines, or of the file if it is executed by its import.
+
+        What a fixture executes is of all tests of its file.
+
+        """
         by_line = self.data.contexts_by_lineno(self.measured[file])
-        contexts = {each for line in lines for each in by_line.get(line, ())}
+        if any('' in by_line.get(line, ()) for line in lines):
+            lines = by_line
+        contexts = {each for line in lines for each in by_line.get(line, ()) if each}
         found = set()
-        for test, _, phase in (context.rpartition('|') for context in contexts if context):
+        for test, _, phase in (context.rpartition('|') for context in contexts):
             found |= {test} if phase == 'run' else set(self.of_file[test.split('::')[0]])
-        return sorted(found, key=lambda name: self.seconds.get(name, 0.0))
+        return sorted(found, key=lambda name: self.seconds[name])
 
 
 def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
     """Return whether a test fails, or does not end, in a copy with the mutant."""
-    names = tests.of(given.file, given.lines) or [*tests.seconds]
+    names = tests.of(given.file, given.lines)
+    if not names:
+        return False
+    limit_s = 60.0 + SLOWER * sum(tests.seconds[name] for name in names)
     (where / 'tests.txt').write_text('\n'.join(names))
     original = (where / given.file).read_text()
     (where / given.file).write_text(given.code)
     try:
-        return pytest(where, '-x', '@tests.txt', limit_s=LIMIT_S) != 0
+        return pytest(where, '-x', '@tests.txt', limit_s=limit_s) != 0
     except subprocess.TimeoutExpired:
         return True
     finally:
@@ -171,6 +191,7 @@ def main() -> None:
     options = parser.parse_args()
     drawn = sample(options.count, options.seed)
     with TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)  # some tests run as another user
         tests = Tests(copied(Path(folder, 'covered')))
         copies: SimpleQueue[Path] = SimpleQueue()
         workers = os.cpu_count() or 1

@@ -35,8 +35,8 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', PYTHONPATH=str(ROOT))
 
 from accel_calib.cli.main import main as accel_calib  # noqa: E402
-from accel_calib.simulate import model_with, simulate_recording  # noqa: E402
-from accel_calib.sphere import spread_directions  # noqa: E402
+from accel_calib.effects import model_with, simulate_recording  # noqa: E402
+from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402

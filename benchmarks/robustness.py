@@ -31,9 +31,9 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
+from accel_calib.effects.simulate import path  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.simulate import path  # noqa: E402
-from accel_calib.sphere import random_directions  # noqa: E402
+from accel_calib.geometry import random_directions  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, publish, table  # noqa: E402

@@ -27,7 +27,7 @@ sys.path[:0] = [str(ROOT)]
 from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.capture import CaptureSettings, StillDetector  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.files import read_recording  # noqa: E402
+from accel_calib.logs import read_recording  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, publish, table  # noqa: E402

@@ -29,7 +29,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.capture import capture, CaptureSettings, StillDetector  # noqa: E402
-from accel_calib.files import read_recording  # noqa: E402
+from accel_calib.logs import read_recording  # noqa: E402
 from accel_calib.table import Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402

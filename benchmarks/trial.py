@@ -24,13 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
-from accel_calib.files import (  # noqa: E402
-    correct_bag,
-    open_log,
-    read_calibration,
-    read_poses,
-    read_recording,
-)
+from accel_calib.logs import open_log, read_poses, read_recording  # noqa: E402
+from accel_calib.messages import correct_bag  # noqa: E402
+from accel_calib.stored import read_calibration  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 
 DESERIALIZED = 400_000

@@ -25,10 +25,9 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.model import Model, predict  # noqa: E402
-from accel_calib.monitor import compared, monitor, rests_of  # noqa: E402
-from accel_calib.simulate import model_with, simulate_poses  # noqa: E402
-from accel_calib.sphere import random_directions, spread_directions  # noqa: E402
+from accel_calib.compare import compared, monitor, rests_of  # noqa: E402
+from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
+from accel_calib.geometry import random_directions, spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
 from figures import Line, publish, table  # noqa: E402

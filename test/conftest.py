@@ -391,7 +391,7 @@ def readings() -> Callable[..., Any]:
 def stored(tmp_path: Path) -> Callable[..., Path]:
     """Return a function that stores a calibration of known parameters."""
     from accel_calib.calibrate import fit_poses, level
-    from accel_calib.files import write_calibration
+    from accel_calib.stored import write_calibration
     from accel_calib.units import units_of
     from inside import model_with, simulate_poses, spread_directions
 

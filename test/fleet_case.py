@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from accel_calib import simulate
-from accel_calib.files import write_table
 from accel_calib.fleet import Input, Options, recordings
+from accel_calib.logs import write_table
 import numpy as np
 
 OFFSET = np.array([0.01, -0.02, 0.03])

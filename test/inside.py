@@ -15,10 +15,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from accel_calib.allan.components import COMPONENTS as ALLAN_COMPONENTS
-from accel_calib.allan.components import fit_components
-from accel_calib.allan.curve import allan_variances, octaves, shares, spread_of
-from accel_calib.allan.rest import longest_rest
 from accel_calib.calibrate.checks import axes_of, fault_of, flat_warnings
 from accel_calib.calibrate.fleet_prior import posterior
 from accel_calib.calibrate.gate import sound_rows
@@ -43,6 +39,8 @@ from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
 from accel_calib.cli.main import COMMANDS, main, parser
 from accel_calib.cli.terminal import Output
 from accel_calib.cli.watch_view import changes, screen, state
+from accel_calib.compare.drift import change, is_over
+from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
 from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES
 from accel_calib.compare.parameters import (
     on_one_scale,
@@ -53,35 +51,31 @@ from accel_calib.compare.parameters import (
     Scatter,
     scatter_of,
 )
+from accel_calib.disk import check_regular, previous
+from accel_calib.effects import (
+    acting_temperature,
+    correct,
+    force_slope,
+    Model,
+    model_with,
+    MODELS,
+    parameter_basis,
+    parse_effect,
+    predict,
+    reading_of,
+    sensor_force,
+    simulate_poses,
+    simulate_recording,
+    ThermalStream,
+    with_linear_part,
+    with_vector,
+)
 from accel_calib.effects.terms import terms_of
+from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate.equations import equations, kinds, noise_of
 from accel_calib.estimate.geometry import distinct
 from accel_calib.estimate.mistakes import unseen_mistakes
 from accel_calib.estimate.outliers import originals
-from accel_calib.files import bag, bounded_bags, calibration_yaml, plain_yaml
-from accel_calib.files.atomic import previous
-from accel_calib.files.bag import open_samples, together
-from accel_calib.files.bag_reader import open_bag
-from accel_calib.files.bounded_bags import decompressed, largest
-from accel_calib.files.calibration_yaml import _values_in as values_in
-from accel_calib.files.calibration_yaml import (
-    format_calibration,
-    OTHER_CORRECTION,
-    parse_calibration,
-)
-from accel_calib.files.exports import export, identifier
-from accel_calib.files.exports import FORMATS as EXPORT_FORMATS
-from accel_calib.files.exports import Options as ExportOptions
-from accel_calib.files.logs import are_samples, text
-from accel_calib.files.logs.ardupilot import read_dataflash
-from accel_calib.files.logs.formats import named as format_named
-from accel_calib.files.logs.formats import recognise, record_instead
-from accel_calib.files.logs.names import meaning, unit_of
-from accel_calib.files.logs.px4 import MAGIC as ULG_MAGIC
-from accel_calib.files.logs.px4 import read_ulg
-from accel_calib.files.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
-from accel_calib.files.plan_table import read_plan, write_plan
-from accel_calib.files.regular import check_regular
 from accel_calib.fleet.alike import alike
 from accel_calib.fleet.identity import as_folder, date_of, sensor_of
 from accel_calib.fleet.inputs import content_hash, on_disk
@@ -91,6 +85,14 @@ from accel_calib.fleet.prior import estimated, priors_of
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import drift_of, merge_sensor
 from accel_calib.fleet.store import schema, write_parquet
+from accel_calib.geometry import (
+    OVER_THE_SPHERE,
+    quaternion_of,
+    random_directions,
+    rotation_from_rpy,
+    spread_directions,
+    unit,
+)
 from accel_calib.intake import poses_of
 from accel_calib.live import server, sources, viewer
 from accel_calib.live.host import Host
@@ -102,22 +104,21 @@ from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
 from accel_calib.live.server import PageServer, policy_hash
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.messages.layout import layout_with
-from accel_calib.model import (
-    correct,
-    force_slope,
-    Model,
-    MODELS,
-    parameter_basis,
-    predict,
-    reading_of,
-    sensor_force,
-    with_linear_part,
-    with_vector,
-)
-from accel_calib.monitor.change_detection import change, is_over
-from accel_calib.monitor.change_detection import MEMORY as DRIFT_MEMORY
-from accel_calib.one_reading import OneReading
+from accel_calib.logs import are_samples, bag, bounded_bags, layout_with, open_bag, text
+from accel_calib.logs.ardupilot import read_dataflash
+from accel_calib.logs.bag import open_samples, together
+from accel_calib.logs.bounded_bags import decompressed, largest
+from accel_calib.logs.formats import named as format_named
+from accel_calib.logs.formats import recognise, record_instead
+from accel_calib.logs.names import meaning, unit_of
+from accel_calib.logs.px4 import MAGIC as ULG_MAGIC
+from accel_calib.logs.px4 import read_ulg
+from accel_calib.logs.serialized import frame_ids, stamps_of
+from accel_calib.messages.one_reading import OneReading
+from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
+from accel_calib.noise.components import fit_components
+from accel_calib.noise.curve import allan_variances, octaves, shares, spread_of
+from accel_calib.noise.rest import longest_rest
 from accel_calib.refine import sample
 from accel_calib.refine.curves import best_curve, is_curve
 from accel_calib.refine.findings import advice_for
@@ -133,6 +134,7 @@ from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
 from accel_calib.refine.state import beginning, fitted_state
 from accel_calib.refine.wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from accel_calib.refine.words import values_of, verdict_words
 from accel_calib.report.calibration_sections import linear_figures
 from accel_calib.report.curve import curve_parts
 from accel_calib.report.drawings import all_drawings
@@ -142,7 +144,6 @@ from accel_calib.report.repeat_pages import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
 from accel_calib.report.snippets import snippets
 from accel_calib.ros.domain import own_domain
-from accel_calib.rotations import quaternion_of, rotation_from_rpy
 from accel_calib.session import store as session_store
 from accel_calib.session import worker_process
 from accel_calib.session.active_calibration import ActiveCalibration, rest_after
@@ -159,10 +160,18 @@ from accel_calib.session.temperature_history import TemperatureHistory
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker
 from accel_calib.session.worker_process import WorkerProcess
-from accel_calib.simulate import model_with, parse_effect, simulate_poses, simulate_recording
-from accel_calib.sphere import OVER_THE_SPHERE, random_directions, spread_directions, unit
-from accel_calib.thermal import acting_temperature, Lag, low_passed, rate_of, ThermalStream
-from accel_calib.words import values_of, verdict_words
+from accel_calib.stored import calibration_yaml, plain_yaml
+from accel_calib.stored.calibration_yaml import _values_in as values_in
+from accel_calib.stored.calibration_yaml import (
+    format_calibration,
+    OTHER_CORRECTION,
+    parse_calibration,
+)
+from accel_calib.stored.exports import export, identifier
+from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
+from accel_calib.stored.exports import Options as ExportOptions
+from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
+from accel_calib.stored.plan_table import read_plan, write_plan
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""

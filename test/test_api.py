@@ -10,7 +10,7 @@ import sys
 
 import accel_calib as ac
 from accel_calib.errors import AccelCalibError, InputError, RefusedFitError
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
 import numpy as np
 import pytest
 

@@ -11,7 +11,8 @@ import tracemalloc
 from typing import Any
 
 from accel_calib.calibrate import of_samples
-from accel_calib.files import read_recording, write_blocks, write_calibration, write_table
+from accel_calib.logs import read_recording, write_blocks, write_table
+from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
 from inside import main, ROWS_OF_A_TEXT
 import numpy as np

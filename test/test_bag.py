@@ -6,7 +6,8 @@
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import correct_bag, read_recording
+from accel_calib.logs import read_recording
+from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
 from inside import simulate_recording, spread_directions
 import numpy as np

@@ -11,7 +11,8 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
-from accel_calib.files import correct_bag, write_calibration
+from accel_calib.messages import correct_bag
+from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 from inside import model_with, open_samples, simulate_poses, spread_directions, together

@@ -13,7 +13,8 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
-from accel_calib.files import correct_bag, read_recording
+from accel_calib.logs import read_recording
+from accel_calib.messages import correct_bag
 from bag_files import a_calibration, copied, COUNT, execute, MAKES, messages, TOPICS
 from faults.fuzz import ended, read_bag
 from faults.sample import sample

@@ -9,7 +9,8 @@ from functools import cache
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.files import correct_bag, LogOptions, open_log, read_recording
+from accel_calib.logs import LogOptions, open_log, read_recording
+from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
 from inside import (
     BLOCK_OF_A_BAG,

@@ -17,7 +17,9 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
-from accel_calib.files import correct_bag, read_recording, write_calibration
+from accel_calib.logs import read_recording
+from accel_calib.messages import correct_bag
+from accel_calib.stored import write_calibration
 from bag_files import a_calibration, copied, COUNT, execute, messages, TOPICS
 from bag_files import rosbag2 as folder_of
 from inside import check_regular, DECOMPRESSED, decompressed, largest, main, open_bag
@@ -39,6 +41,8 @@ BOMB_SIZE = 1 << 31
 ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 MOST_BYTES = 150e6
 """Largest memory, and largest size of all that is decompressed, until a file is refused."""
+
+HANG_S = 600
 
 RAWS = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
         for topic, stamp, each in messages()]

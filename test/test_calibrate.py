@@ -5,7 +5,7 @@
 
 import json
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from inside import are_samples
 import numpy as np
 import pytest

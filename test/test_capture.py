@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from accel_calib.capture import capture, CaptureSettings, StillDetector
 from accel_calib.errors import InputError
-from accel_calib.files import read_recording
+from accel_calib.logs import read_recording
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 import numpy as np

@@ -9,7 +9,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from accel_calib.files import read_poses
+from accel_calib.logs import read_poses
 from inside import main, parse_effect, parser, rotation_from_rpy
 import numpy as np
 import pytest

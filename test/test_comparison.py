@@ -10,7 +10,7 @@ from accel_calib.calibrate import fit_poses, level
 from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
-from accel_calib.files import write_calibration
+from accel_calib.stored import write_calibration
 from accel_calib.units import Units, units_of
 from inside import (
     main,

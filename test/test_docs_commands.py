@@ -25,7 +25,7 @@ import shutil
 from tempfile import TemporaryDirectory
 
 import accel_calib as ac
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
 from faults.sample import sample
 from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np

@@ -7,13 +7,8 @@ from dataclasses import replace
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import (
-    read_calibration,
-    read_poses,
-    read_recording,
-    write_calibration,
-    write_table,
-)
+from accel_calib.logs import read_poses, read_recording, write_table
+from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from accel_calib.units import units_of
 from inside import (

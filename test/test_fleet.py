@@ -26,8 +26,8 @@ import time
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.files import read_calibration
 from accel_calib.fleet import cluster, Input, run, Store
+from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
 from fleet_case import found_in, OFFSET, QUICK, rows_of, state_of, write_fleet, write_poses
 from inside import (

@@ -14,8 +14,8 @@ from accel_calib import simulate
 from accel_calib.calibrate import fit_poses, FleetPrior
 from accel_calib.compare import history_of
 from accel_calib.estimate import Prior
-from accel_calib.files import write_calibration
 from accel_calib.fleet import Store
+from accel_calib.stored import write_calibration
 from accel_calib.units import Units
 from inside import (
     as_folder,

@@ -11,14 +11,9 @@ from pathlib import Path
 
 from accel_calib.calibrate import Calibration, fit_poses, fit_with_fleet, FleetPrior
 from accel_calib.errors import InputError
-from accel_calib.files import (
-    read_calibration,
-    read_prior,
-    write_calibration,
-    write_priors,
-    write_table,
-)
+from accel_calib.logs import write_table
 from accel_calib.refine import refine, refine_with_fleet
+from accel_calib.stored import read_calibration, read_prior, write_calibration, write_priors
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from accel_calib.calibrate import EDITED, fit_poses, gated
 from accel_calib.errors import AccelCalibError, RefusedFitError
-from accel_calib.files import read_calibration, read_poses
+from accel_calib.logs import read_poses
+from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (

@@ -21,8 +21,9 @@ import struct
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
-from accel_calib.files import read_calibration
-from accel_calib.messages import corrected, joined, layout_of, output_frame, Rewriter
+from accel_calib.logs import joined, layout_of
+from accel_calib.messages import corrected, output_frame, Rewriter
+from accel_calib.stored import read_calibration
 from inside import Model, rotation_from_rpy
 import numpy as np
 import pytest

@@ -13,8 +13,8 @@ from typing import Any
 
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.capture import CaptureSettings, Dwell, poses_from
-from accel_calib.files import read_calibration
 from accel_calib.session import CalibratorSettings
+from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from inside import COMMAND, main
 from live_bench import TurnedSensor
 import numpy as np

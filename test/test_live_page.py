@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 import re
 
-from accel_calib.files import read_calibration, write_table
+from accel_calib.logs import write_table
+from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from inside import model_with, simulate_poses, spread_directions
 from live_bench import chromium, GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers

@@ -9,7 +9,7 @@ from pathlib import Path
 import time
 
 from accel_calib.errors import InputError
-from accel_calib.files import LogOptions, read_log
+from accel_calib.logs import LogOptions, read_log
 from accel_calib.table import Floats
 from inside import CLOCK_OF_A_SOURCE, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT
 import numpy as np

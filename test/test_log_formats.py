@@ -15,7 +15,7 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.files import LogOptions, read_log
+from accel_calib.logs import LogOptions, read_log
 from accel_calib.table import Recording
 from inside import format_named, read_dataflash, read_ulg, recognise, record_instead
 import numpy as np

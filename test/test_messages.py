@@ -8,33 +8,31 @@ import struct
 
 from accel_calib.calibrate import fit_poses, level, SampleNoise, thermal_stream
 from accel_calib.errors import InputError
-from accel_calib.messages import (
+from accel_calib.logs import (
     ACCELERATION,
     ACCELERATION_COVARIANCE,
     ANGULAR_VELOCITY,
     ANGULAR_VELOCITY_COVARIANCE,
-    corrected,
     doubles_at,
-    frame_ids,
     IMU_DOUBLES,
     joined,
     layout_of,
     ORIENTATION,
     ORIENTATION_COVARIANCE,
-    output_frame,
     renamed,
-    Rewriter,
     samples_of,
-    stamps_of,
 )
+from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
+    frame_ids,
     Model,
     predict,
     random_directions,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
+    stamps_of,
 )
 import numpy as np
 import pytest

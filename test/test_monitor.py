@@ -10,8 +10,8 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
-from accel_calib.files import read_recording
-from accel_calib.monitor import compared, Drift, monitor, rests_of, status
+from accel_calib.compare import compared, Drift, monitor, rests_of, status
+from accel_calib.logs import read_recording
 from accel_calib.units import units_of
 from inside import (
     DRIFT_MEMORY,

@@ -5,7 +5,8 @@
 
 import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
-from accel_calib.messages import layout_of, Rewriter
+from accel_calib.logs import layout_of
+from accel_calib.messages import Rewriter
 from inside import random_directions, refinement_page
 import numpy as np
 import pytest

@@ -11,9 +11,9 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from accel_calib.allan import noise_of, NoiseFigures, to_json
 from accel_calib.errors import InputError
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
+from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (

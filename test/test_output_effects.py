@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from accel_calib.calibrate import fit_poses, in_g
 from accel_calib.capture import capture, CaptureSettings, StillDetector
-from accel_calib.files import read_recording
+from accel_calib.logs import read_recording
 from accel_calib.table import Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, Units, units_of
 from inside import (

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from accel_calib.calibrate import fit_poses, joined_ranges, outside
 from accel_calib.effects import empirical_name
-from accel_calib.files import write_calibration, write_table
+from accel_calib.logs import write_table
 from accel_calib.session import CalibratorSettings, Log, Session
+from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
 from inside import main, Model, model_with, simulate_poses, simulate_recording, spread_directions
 import numpy as np

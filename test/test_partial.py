@@ -19,8 +19,8 @@ from accel_calib.calibrate import (
 )
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import estimate
-from accel_calib.files import read_calibration, write_calibration
 from accel_calib.refine import refine
+from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (

@@ -7,7 +7,7 @@ import json
 
 from accel_calib.calibrate import fit_poses, verify
 from accel_calib.estimate import sensing_axes
-from accel_calib.files import read_poses
+from accel_calib.logs import read_poses
 from accel_calib.units import units_of
 from inside import main
 import numpy as np

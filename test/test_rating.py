@@ -8,7 +8,7 @@ from dataclasses import replace
 import accel_calib as ac
 from accel_calib.calibrate import fit_partial, fit_poses, mounting_only, verify
 from accel_calib.capture import capture
-from accel_calib.files import read_poses, read_recording
+from accel_calib.logs import read_poses, read_recording
 from accel_calib.rating import (
     Expected,
     GOOD_MG,

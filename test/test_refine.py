@@ -6,7 +6,7 @@
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.files import read_poses, read_recording
+from accel_calib.logs import read_poses, read_recording
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of

@@ -6,7 +6,7 @@
 import json
 import sys
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 import pytest
 from shared import run, run_json
 

@@ -8,8 +8,9 @@ import json
 
 from accel_calib.calibrate import fit_poses, verify, with_history
 from accel_calib.errors import StoredCalibrationError
-from accel_calib.files import read_poses, write_calibration, write_table
+from accel_calib.logs import read_poses, write_table
 from accel_calib.refine import refine
+from accel_calib.stored import write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator

@@ -11,7 +11,7 @@ import json
 from accel_calib.calibrate import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of
 from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import read_poses, read_recording, write_table
+from accel_calib.logs import read_poses, read_recording, write_table
 from accel_calib.refine import refine
 from accel_calib.table import numbered, Poses, Recording
 from accel_calib.units import units_of

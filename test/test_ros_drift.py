@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from accel_calib.calibrate import fit_poses
-from accel_calib.files import write_calibration
+from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
 from conftest import EFFECTS, GRAVITY
 from diagnostic_msgs.msg import DiagnosticArray

@@ -12,7 +12,7 @@ import socket
 import subprocess
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from live_bench import chromium, GRAVITY, PATIENCE, TRUTH, Viewers
 import numpy as np
 from playwright.sync_api import Browser, expect, sync_playwright

@@ -15,7 +15,7 @@ import subprocess
 import time
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from inside import spread_directions
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState

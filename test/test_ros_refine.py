@@ -11,7 +11,7 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.effects import empirical_name
-from accel_calib.files import read_calibration, write_calibration
+from accel_calib.stored import read_calibration, write_calibration
 from inside import Model, spread_directions
 import numpy as np
 import pytest

@@ -15,7 +15,8 @@ import subprocess
 import sys
 from typing import Any
 
-from accel_calib.files import read_calibration, read_poses, write_table
+from accel_calib.logs import read_poses, write_table
+from accel_calib.stored import read_calibration
 from diagnostic_msgs.srv import SelfTest
 from faults.sample import FACTOR, sample
 from inside import CALIBRATOR, spread_directions

@@ -13,7 +13,7 @@ import signal
 import time
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults.sample import sample
 from geometry_msgs.msg import Vector3

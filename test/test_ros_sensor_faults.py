@@ -11,7 +11,7 @@ import signal
 import time
 from typing import Any
 
-from accel_calib.files import read_poses
+from accel_calib.logs import read_poses
 from diagnostic_msgs.msg import DiagnosticArray
 from faults.sample import sample
 from inside import CALIBRATOR

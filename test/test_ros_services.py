@@ -10,7 +10,8 @@ from pathlib import Path
 import re
 from typing import Any
 
-from accel_calib.files import read_calibration, read_poses
+from accel_calib.logs import read_poses
+from accel_calib.stored import read_calibration
 from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
 from inside import Model, next_action, plan_for, simulate_poses, spread_directions

@@ -11,7 +11,7 @@ from pathlib import Path
 import signal
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from inside import spread_directions
 import pytest
 

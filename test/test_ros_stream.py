@@ -11,8 +11,8 @@ from pathlib import Path
 import struct
 from typing import Any
 
-from accel_calib.files import read_calibration
-from accel_calib.messages import layout_of
+from accel_calib.logs import layout_of
+from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 import numpy as np

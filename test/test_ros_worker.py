@@ -15,8 +15,9 @@ import time
 from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.files import read_calibration, write_table
+from accel_calib.logs import write_table
 from accel_calib.session import CalibratorSettings, Job, Log
+from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import fitted, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
 from inside_ros import in_executor, Services

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
-from accel_calib.files import read_calibration
 from accel_calib.session import Job, Mounting
+from accel_calib.stored import read_calibration
 from inside import main, spread_directions
 import pytest
 from test_session import Driver

@@ -13,8 +13,9 @@ import shutil
 from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
-from accel_calib.files import read_calibration, read_poses, write_calibration, write_table
+from accel_calib.logs import read_poses, write_table
 from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from accel_calib.stored import read_calibration, write_calibration
 from inside import (
     Identity,
     LARGEST_NUMBER_OF_STEPS,

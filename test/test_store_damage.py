@@ -16,7 +16,7 @@ from typing import Any
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.files import read_calibration, write_calibration
+from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.units import units_of
 from faults.sample import sample
 from inside import (
@@ -35,8 +35,7 @@ import numpy as np
 import pytest
 from test_session import Driver
 
-pytestmark = pytest.mark.usefixtures('home', 'in_time')
-
+HANG_S = 600
 NOBODY = 65534
 EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]),
            'axis_gain': np.array([0.012, -0.015, 0.008])}

@@ -15,19 +15,20 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    ('crash', 'errors', 'html_table', 'significant', 'units'),
-    ('table',),
-    ('sphere', 'rotations', 'thermal'),
+    ('errors', 'text', 'units'),
+    ('disk', 'table'),
+    ('geometry',),
     ('effects',),
-    ('model',),
-    ('capture', 'estimate', 'simulate'),
-    ('allan', 'calibrate'),
-    ('one_reading', 'refine'),
-    ('compare', 'monitor'),
-    ('messages',),
-    ('files', 'words'),
+    ('logs',),
+    ('capture', 'estimate'),
+    ('calibrate',),
+    ('refine',),
+    ('compare', 'noise'),
     ('rating',),
-    ('intake', 'pipeline', 'report'),
+    ('stored',),
+    ('messages',),
+    ('intake', 'pipeline'),
+    ('report',),
     ('api', 'fleet', 'session'),
     ('live',),
     ('ros',),
@@ -39,7 +40,7 @@ RANKS = {part: rank for rank, layer in enumerate(LAYERS) for part in layer}
 ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|srvs|interfaces)')
 
 MODULES = sorted(PACKAGE.rglob('*.py'))
-BASE = {f'accel_calib.{name}' for name in ('errors', 'table', 'units')}
+BASE = {f'accel_calib.{name}' for name in ('disk', 'errors', 'geometry', 'table', 'text', 'units')}
 """Modules that tests import from directly."""
 
 FACES = {'accel_calib', *(f'accel_calib.{each.parent.name}'

@@ -7,8 +7,8 @@ import os
 import shutil
 import stat
 
+from accel_calib.disk import write_atomically
 from accel_calib.errors import InputError
-from accel_calib.files import write_atomically
 from inside import previous
 import pytest
 from shared import run

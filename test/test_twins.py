@@ -11,7 +11,8 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.errors import InputError
-from accel_calib.files import LogOptions, read_log, read_recording, write_calibration, write_table
+from accel_calib.logs import LogOptions, read_log, read_recording, write_table
+from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import STANDARD_GRAVITY
 from inside import main, model_with, simulate_recording, spread_directions

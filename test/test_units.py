@@ -11,7 +11,7 @@ from pathlib import Path
 import accel_calib as ac
 from accel_calib.calibrate import converted, fit_poses
 from accel_calib.errors import InputError
-from accel_calib.files import read_recording, write_table
+from accel_calib.logs import read_recording, write_table
 from accel_calib.table import Poses, Table
 from accel_calib.units import Units, units_of
 import numpy as np

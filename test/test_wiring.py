@@ -6,7 +6,7 @@
 import json
 
 from accel_calib.calibrate import ARBITRARY_HEADING, fit_poses, level
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (

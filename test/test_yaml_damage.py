@@ -11,7 +11,7 @@ from pathlib import Path
 
 from accel_calib.calibrate import Calibration, EDITED, Rejected
 from accel_calib.errors import DamagedCalibrationError, InputError, StoredCalibrationError
-from accel_calib.files import read_calibration, write_calibration
+from accel_calib.stored import read_calibration, write_calibration
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
 from inside import (

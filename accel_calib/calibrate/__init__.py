@@ -21,7 +21,7 @@ from .calibration import (
     Quality,
     Rejected,
 )
-from .checks import check_units, FLAT
+from .checks import FLAT
 from .context import of_samples, thermal_stream
 from .fit import fit_poses, level_by_rows, MODEL_NAMES
 from .fleet_prior import fit_with_fleet, FleetPrior
@@ -40,6 +40,7 @@ from .rest_noise import (
     with_rest_noise,
 )
 from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
+from ..table import check_units
 
 __all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES',
            'NOT_LOCATED', 'PRIOR', 'STORED_METHODS', 'UNCHECKED', 'USES_LIMIT', 'Calibration',

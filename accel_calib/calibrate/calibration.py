@@ -17,12 +17,10 @@ from numpy.typing import ArrayLike
 from .context import HELD, limited, of_samples, with_acting
 from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
-from ..effects import AXES, Context
+from ..effects import AXES, Context, correct, force_slope, Model, parameter_names, predict
 from ..errors import InputError, StoredCalibrationError
-from ..html_table import table
-from ..model import correct, force_slope, Model, parameter_names, predict
-from ..significant import with_sd
 from ..table import Floats, Poses, Table
+from ..text import table, with_sd
 from ..units import STANDARD_GRAVITY, UnitName, Units
 
 EDITED = 'the file was edited by hand since it was stored'

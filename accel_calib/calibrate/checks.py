@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Checks of the input: wrong units, and wiring faults.
+Checks of the input for wiring faults.
 
 |force| = 1 g does not reveal a wrong sign, swapped axes or a rotated sensor, because the sphere of
 poses is the same. Known orientations reveal them. A least squares fit reading = X force + y is
@@ -24,99 +24,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .mounting import flat_direction
-from ..errors import InputError, RefusedFitError
+from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_12
-from ..table import Floats, Table
-from ..units import STANDARD_GRAVITY, Units
+from ..table import Floats
 
 if TYPE_CHECKING:
     from .calibration import Calibration
-
-_LIKELY_G = (0.5, 2.0)
-"""Range of the median |reading| at rest [g]."""
-
-_ABOUT = 1.3
-"""Factor within which a unit is suggested."""
-
-_OTHERS = {'g': 1.0, 'm/s2': STANDARD_GRAVITY, 'ft/s2': 32.174, 'cm/s2': 100.0 * STANDARD_GRAVITY,
-           'mg': 1e3, 'µg': 1e6}
-"""1 g in common units of sensors."""
-
-_SUPPORTED = ('g', 'm/s2')
-
-
-def check_units(poses: Table, units: Units, source: str = '') -> None:
-    """
-    Check that readings at rest and known forces have a length of about 1 g.
-
-    Parameters
-    ----------
-    poses : Poses or Recording
-        The readings.
-    units : Units
-        Their unit.
-    source : str
-        What they were read from, for the error.
-
-    Raises
-    ------
-    InputError
-        If they have another length; the advice names the likely unit.
-
-    """
-    if len(poses) == 0:
-        return
-    if units.name != 'native':
-        _check_readings(_median_length(poses.reading), units, source and f'{source}: ')
-    if 'reference' in poses:
-        _check_reference(_median_length(poses['reference']), units)
-
-
-def _median_length(vectors: Floats) -> float:
-    with np.errstate(over='ignore'):
-        return float(np.median(np.linalg.norm(vectors, axis=1)))
-
-
-def _check_readings(length: float, units: Units, where: str) -> None:
-    if _is_likely(length, units.per_g):
-        return
-    likely = _likely(length)
-    supported = next((name for name in likely if name in _SUPPORTED), None)
-    if supported:
-        advice = f'set the units of the readings to {supported}'
-    else:
-        look = f'they look like {" or ".join(likely)}: ' if likely else ''
-        advice = f'{look}set the units of the readings to native; the fit estimates their scale'
-    raise InputError(f'{where}the length of the readings is about {length:.4g}, expected about '
-                     f'{units.per_g:.4g} at rest in {units.name}', advice)
-
-
-def _check_reference(length: float, units: Units) -> None:
-    per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
-                    if units.name == 'native' else
-                    (units.per_g, f'in {units.name}, the unit of the readings'))
-    if _is_likely(length, per_g):
-        return
-    likely = _likely(length)
-    look = f'they look like {" or ".join(likely)}: ' if likely else ''
-    raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about {length:.4g}, '
-                     f'expected about {per_g:.4g} {words}',
-                     f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
-                     if length > 0.0 else 'fill the columns, or remove them')
-
-
-def _is_likely(length: float, per_g: float) -> bool:
-    return _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]
-
-
-def _likely(length: float) -> list[str]:
-    """Return the units in which this length is about 1 g, or else the nearest unit."""
-    fits = {name: max(length / per_g, per_g / max(length, 1e-300))
-            for name, per_g in _OTHERS.items()}
-    well = [name for name, factor in fits.items() if factor <= _ABOUT]
-    nearest = min(fits, key=lambda name: fits[name])
-    return well or ([nearest] if fits[nearest] <= _LIKELY_G[1] else [])
-
 
 FLAT = 'the flat pose'
 """Start of the warning about a flat pose."""

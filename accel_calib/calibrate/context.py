@@ -9,10 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..effects import Context
-from ..model import Model
+from ..effects import acting_temperature, Context, Model, rate_at, ThermalStream
 from ..table import Floats
-from ..thermal import acting_temperature, rate_at, ThermalStream
 
 THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 """Context that is computed from time and temperature."""

@@ -8,15 +8,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 from .calibration import Calibration, Rejected
-from .checks import check_units, wiring_warnings
+from .checks import wiring_warnings
 from .gate import gated, sound_rows, sure_rows
 from .known_orientation import fit_known
 from .levelling import level, set_heading
 from .mounting import FrameName
 from .rest_noise import with_rest_noise
 from .unknown_orientation import fit_unknown, Method, METHODS
-from ..errors import InputError, listed, RefusedFitError
-from ..table import Floats, Poses
+from ..errors import InputError, RefusedFitError
+from ..table import check_units, Floats, Poses
+from ..text import listed
 from ..units import Units
 
 MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')

@@ -36,12 +36,13 @@ from .pose_planning import determines
 from .quality import in_g, quality_of
 from .rest_noise import with_rest_noise
 from .unknown_orientation import copy_warning, FLEET, only_norm, rejected_by
-from ..errors import counted, RefusedFitError
+from ..errors import RefusedFitError
 from ..estimate.fit import Prior
 from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Floats, Poses
+from ..text import counted
 from ..units import Units
 
 _LIKE = {1.0: 0.9, 2.0: 0.07, 4.0: 0.02}

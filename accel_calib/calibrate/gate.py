@@ -27,10 +27,9 @@ import numpy as np
 from .calibration import Calibration, Rejected
 from .quality import NOT_LOCATED
 from .unknown_orientation import PRIOR
-from ..effects import LADDER
+from ..effects import LADDER, Model, times
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..model import Model, times
-from ..sphere import OVER_THE_SPHERE, unit
+from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 

@@ -30,13 +30,13 @@ from .unknown_orientation import (
     own_scale,
     solve_unknown,
 )
+from ..effects import force_slope, MODELS, parameter_basis, sensor_force, with_vector
 from ..errors import RefusedFitError
 from ..estimate.closed_form import faces, fit_12
 from ..estimate.fit import estimate, Fit
 from ..estimate.mistakes import covariance_with, rivals
 from ..estimate.outliers import outliers
-from ..model import force_slope, MODELS, parameter_basis, sensor_force, with_vector
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 

@@ -23,8 +23,7 @@ from .mounting import (
     with_heading,
     with_heading_of,
 )
-from ..effects import Context
-from ..model import Model, sensor_force
+from ..effects import Context, Model, sensor_force
 from ..table import Floats
 
 _SAME_TILT = np.cos(np.radians(10.0))

@@ -38,7 +38,7 @@ from typing import Any, get_args, Literal
 import numpy as np
 
 from ..errors import InputError
-from ..rotations import quaternion_of, rotation_from_rpy, rpy_of
+from ..geometry import quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats
 
 FrameName = Literal['ros', 'ned', 'android', 'win8']

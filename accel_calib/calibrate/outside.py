@@ -19,8 +19,8 @@ import numpy as np
 
 from .calibration import Calibration
 from ..effects import Context, EMPIRICAL, empirical_parts
-from ..errors import counted
 from ..table import COLUMNS, Floats
+from ..text import counted
 from ..units import MG
 
 USES_LIMIT = 'the correction uses the limit of the range'

@@ -45,7 +45,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import Calibration, Rejected
-from .checks import check_units
 from .gate import deviations_g, gated, sound_rows, sure_rows, uncertainty_g
 from .pose_planning import (
     Cone,
@@ -58,15 +57,15 @@ from .pose_planning import (
 from .quality import fit_warnings, in_g, quality_of
 from .rest_noise import with_rest_noise
 from .unknown_orientation import copy_warning, only_norm, PRIOR, rejected_by
-from ..effects import EFFECTS
-from ..errors import counted, InputError, RefusedFitError
+from ..effects import EFFECTS, Model, MODELS, sensor_force, with_vector
+from ..errors import InputError, RefusedFitError
 from ..estimate.equations import variance_factor
 from ..estimate.fit import estimate, Fit, judge, Prior
 from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
-from ..model import Model, MODELS, sensor_force, with_vector
-from ..sphere import unit
-from ..table import Floats, Poses
+from ..geometry import unit
+from ..table import check_units, Floats, Poses
+from ..text import counted
 from ..units import MG, Units
 
 _NAME = '10'

@@ -32,7 +32,7 @@ from itertools import product
 import numpy as np
 
 from .calibration import Calibration
-from ..errors import counted, RefusedFitError
+from ..errors import RefusedFitError
 from ..estimate.geometry import (
     Combination,
     dilution,
@@ -51,8 +51,9 @@ from ..estimate.geometry import (
     rows_of,
     WEAK_DILUTION,
 )
-from ..sphere import OVER_THE_SPHERE, unit
+from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats
+from ..text import counted
 from ..units import MG
 
 _LEAST_GAIN = 0.03

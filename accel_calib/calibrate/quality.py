@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import Calibration, check_sensor, Quality
-from ..errors import listed
+from ..effects import correct, Model, rate_at, sensor_force
 from ..estimate.equations import noise_of
 from ..estimate.fit import Fit, judge
 from ..estimate.geometry import coverage, WEAK_DILUTION
 from ..estimate.mistakes import Rival, unseen_mistakes
-from ..model import correct, Model, sensor_force
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Floats, Poses
-from ..thermal import rate_at
+from ..text import listed
 from ..units import MG, Units
 
 _MOVED = np.radians(3.0)

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from .calibration import Calibration, Rejected
 from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_warnings, in_g, quality_of, rival_warnings
-from ..errors import listed, RefusedFitError, TAKE_ALL_SIDES
+from ..effects import Model, MODELS, sensor_force, with_linear_part, with_vector
+from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
 from ..estimate.fit import estimate, Fit, judge
 from ..estimate.geometry import (
@@ -41,9 +42,9 @@ from ..estimate.geometry import (
 from ..estimate.least_squares import NotConvergedError, Point, solve
 from ..estimate.mistakes import covariance_with, Rival, rivals
 from ..estimate.outliers import fit_norm, originals, start_of
-from ..model import Model, MODELS, sensor_force, with_linear_part, with_vector
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Floats, Poses
+from ..text import listed
 from ..units import MG, Units
 
 Method = Literal['ml', 'algebraic']

@@ -22,9 +22,10 @@ from ..calibrate import (
     thermal_stream,
 )
 from ..effects import Context
-from ..errors import counted
-from ..files import correct_bag, is_bag, open_log, write_blocks
+from ..logs import is_bag, open_log, write_blocks
+from ..messages import correct_bag
 from ..table import Poses, Recording
+from ..text import counted
 from ..units import UnitName
 
 _EXAMPLE = 'accel-calib apply recording.mcap -c calibration.yaml -o corrected'

@@ -12,10 +12,10 @@ from . import options
 from .results import calibration_result, refine_result, show_calibration
 from .terminal import working
 from ..calibrate import FRAMES
-from ..files import write_calibration
 from ..intake import Intake
 from ..pipeline import calibrated, Flat, Outcome
 from ..report import has_matplotlib, write_calibration_page
+from ..stored import write_calibration
 
 _EXAMPLE = 'accel-calib calibrate log.csv --flat last'
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from . import options
 from .terminal import progress
 from ..capture import capture, Captured, CaptureSettings, REPEATED, settings_from
-from ..errors import counted
-from ..files import open_log, write_table
 from ..intake import Intake, nothing_still
+from ..logs import open_log, write_table
+from ..text import counted
 from ..units import Units
 
 _EXAMPLE = 'accel-calib capture recording.mcap -o poses.csv'

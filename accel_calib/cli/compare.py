@@ -15,8 +15,8 @@ import numpy as np
 from . import options
 from .terminal import working
 from ..compare import compare, Comparison, LEVEL
-from ..files import read_calibration
 from ..rating import rate_comparison
+from ..stored import read_calibration
 from ..units import MG
 
 _EXAMPLE = ('accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'

@@ -14,9 +14,9 @@ from typing import Any
 from . import options
 from .targets import check_one, Target
 from .terminal import Output
+from ..disk import write_atomically
 from ..errors import InputError
-from ..files.atomic import write_atomically
-from ..files.exports import export, Exported, FORMATS, identifier, Options, read_noise
+from ..stored.exports import export, Exported, FORMATS, identifier, Options, read_noise
 
 _STANDARD_OUTPUT = '-'
 

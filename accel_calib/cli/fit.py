@@ -25,10 +25,10 @@ from ..calibrate import (
     outlook,
 )
 from ..errors import InputError
-from ..files import write_calibration
 from ..intake import Intake
 from ..rating import rate, Rating
-from ..words import now
+from ..stored import write_calibration
+from ..text import now
 
 _EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
 

@@ -11,10 +11,10 @@ import re
 
 from . import options
 from .terminal import progress, working
-from ..errors import counted
-from ..files.exports import CALIBRATION_ALONE
 from ..fleet import cluster, Options, recordings, STATUS, Store, Summary
 from ..fleet import run as run_fleet
+from ..stored.exports import CALIBRATION_ALONE
+from ..text import counted
 
 _EXAMPLE = ('accel-calib fleet recordings/ -o results/\n'
             "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786")

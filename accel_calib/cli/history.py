@@ -13,11 +13,11 @@ from typing import Any, TYPE_CHECKING
 from . import options
 from .terminal import working
 from ..compare import History, history_of
-from ..files import read_calibration
 from ..rating import rate_comparison
 from ..report import check_matplotlib, write_history_page
 from ..report.repeat_charts import GAINS, in_words, OFFSETS
 from ..report.repeat_pages import change_in_words
+from ..stored import read_calibration
 
 if TYPE_CHECKING:
     from rich.table import Table

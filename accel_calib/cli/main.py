@@ -23,8 +23,7 @@ from typing import NoReturn
 from . import targets
 from .characters import in_one_line, use_plain_characters
 from .. import __version__
-from ..crash import crash_words
-from ..errors import AccelCalibError, system_error
+from ..errors import AccelCalibError, crash_words, system_error
 
 BAD_INPUT = 2
 INTERRUPTED = 130

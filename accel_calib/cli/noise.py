@@ -12,19 +12,20 @@ from typing import TYPE_CHECKING
 
 from . import options
 from .terminal import progress, working
-from ..allan import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
 from ..calibrate import Calibration, check_sensor, of_samples
-from ..errors import counted, InputError
-from ..files import open_log, OpenLog, Progress
+from ..errors import InputError
+from ..logs import open_log, OpenLog, Progress
+from ..noise import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
 from ..report import check_matplotlib
 from ..report.noise_page import figure_rows, kalibr_lines, need_lines, write_noise_page
 from ..table import Recording
+from ..text import counted
 from ..units import Units, units_of
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..allan import AxisNoise
+    from ..noise import AxisNoise
 
 _EXAMPLE = 'accel-calib noise rest.mcap --json noise.json --report noise.html'
 

@@ -17,14 +17,14 @@ import numpy as np
 
 from .terminal import Output, progress
 from ..calibrate import Calibration, EDITED, FleetPrior
+from ..disk import write_atomically
 from ..errors import AccelCalibError, InputError, system_error
-from ..files import LogOptions, read_calibration
-from ..files.atomic import write_atomically
-from ..files.calibration_yaml import OTHER_CORRECTION
-from ..files.fleet_yaml import read_prior
-from ..files.logs.formats import NAMES
 from ..intake import Intake, poses_of
+from ..logs import LogOptions, NAMES
 from ..rating import Rating
+from ..stored import read_calibration
+from ..stored.calibration_yaml import OTHER_CORRECTION
+from ..stored.fleet_yaml import read_prior
 from ..table import COLUMNS, Poses
 from ..units import STANDARD_GRAVITY, UNIT_NAMES
 

@@ -14,13 +14,14 @@ from . import options
 from .results import in_a_line, refine_result, steps_table
 from .terminal import Output, working
 from ..calibrate import Calibration
-from ..errors import listed, RefusedFitError
-from ..files import write_calibration
-from ..files.plan_table import write_plan
+from ..errors import RefusedFitError
 from ..rating import rate_refinement
 from ..refine import BASES, refine, refine_with_fleet, Refinement
+from ..refine.words import residual_words, verdict_words
 from ..report import check_matplotlib, write_page
-from ..words import now, residual_words, verdict_words
+from ..stored import write_calibration
+from ..stored.plan_table import write_plan
+from ..text import listed, now
 
 _EXAMPLE = 'accel-calib refine poses.csv -o refined.yaml --report report.html'
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from . import options
 from .refine import add_inputs, refine_file
 from .terminal import working
-from ..errors import counted
 from ..report import check_matplotlib, write_figures, write_page
+from ..text import counted
 
 _EXAMPLE = 'accel-calib report poses.csv -o report.html --figures figures'
 

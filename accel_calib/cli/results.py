@@ -13,12 +13,11 @@ import numpy as np
 
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
 from ..effects import effect_named, LADDER
-from ..errors import counted
 from ..estimate.closed_form import sensing_axes
-from ..significant import short, with_sd
+from ..refine.words import base_words, chance, value_unit
 from ..table import Floats
+from ..text import counted, short, with_sd
 from ..units import MG
-from ..words import base_words, chance, value_unit
 
 if TYPE_CHECKING:
     from rich.table import Table

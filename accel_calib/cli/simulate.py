@@ -10,9 +10,10 @@ from pathlib import Path
 
 from . import options
 from ..api import simulate
-from ..errors import counted, InputError
-from ..files import write_table
-from ..simulate import parse_effect
+from ..effects import parse_effect
+from ..errors import InputError
+from ..logs import write_table
+from ..text import counted
 
 _EXAMPLE = ('accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
             '--effect axis_gain=0.01')

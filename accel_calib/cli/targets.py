@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 import re
 
-from ..errors import counted, InputError
+from ..errors import InputError
+from ..text import counted
 
 _INPUTS = ('poses', 'recording', 'log', 'calibration', 'calibrations', 'noise')
 _OUTPUTS = {'json': 'result', 'report': 'page', 'plan': 'table', 'figures': ''}

@@ -27,7 +27,7 @@ from .characters import shown
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from ..files import Progress
+    from ..logs import Progress
 
 
 _NO_BREAK = '\N{NO-BREAK SPACE}'

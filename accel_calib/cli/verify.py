@@ -13,9 +13,10 @@ from typing import Any
 
 from . import options
 from .terminal import working
-from ..calibrate import check_units, verify
+from ..calibrate import verify
 from ..rating import rate_verification
-from ..significant import short
+from ..table import check_units
+from ..text import short
 
 _EXAMPLE = ('accel-calib verify other_log.csv -c calibration.yaml --max 5\n'
             'exit status:\n'

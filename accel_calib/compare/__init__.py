@@ -2,17 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Comparison of repeated calibrations of one sensor, given their uncertainties.
+Whether a sensor has changed: comparison of repeated calibrations, and of rests with a calibration.
 
-`comparison` is the entry point; it first checks that the calibrations can be compared.
-`parameters` computes parameters that do not depend on the axes, converts their covariances to one
-scale, and contains the test. A run is one of the calibrations. `history` sorts calibrations by
-date and compares each with the one before.
+`comparison` compares calibrations, given their uncertainties; it first checks that they can be
+compared. `parameters` computes parameters that do not depend on the axes, converts their
+covariances to one scale, and contains the test. A run is one of the calibrations. `history` sorts
+calibrations by date and compares each with the one before. `drift` compares every rest with the
+calibration in use.
 
 """
 
 from .comparison import compare, Comparison
+from .drift import compared, Drift, monitor, rests_of, status
 from .history import Change, History, history_of, Moment
 from .parameters import LEVEL
 
-__all__ = ['LEVEL', 'Change', 'Comparison', 'History', 'Moment', 'compare', 'history_of']
+__all__ = ['LEVEL', 'Change', 'Comparison', 'Drift', 'History', 'Moment', 'compare', 'compared',
+           'history_of', 'monitor', 'rests_of', 'status']

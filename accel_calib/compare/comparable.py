@@ -19,8 +19,9 @@ import numpy as np
 from .parameters import Scatter, scatter_of
 from ..calibrate import Calibration
 from ..calibrate.unknown_orientation import fit_unknown
-from ..errors import counted, InputError, RefusedFitError
-from ..model import MODELS
+from ..effects import MODELS
+from ..errors import InputError, RefusedFitError
+from ..text import counted
 
 _LARGER = {'4': ('7', '10'), '7': ('10',)}
 """Models that include a smaller model; for |a|, models 9 and 12 are equivalent to 10."""

@@ -29,11 +29,10 @@ from .parameters import (
     SAME_G,
 )
 from ..calibrate import Calibration
-from ..effects import Context
-from ..errors import counted, listed
-from ..model import length_rows, sensor_force
-from ..sphere import OVER_THE_SPHERE
+from ..effects import Context, length_rows, sensor_force
+from ..geometry import OVER_THE_SPHERE
 from ..table import Floats
+from ..text import counted, listed
 from ..units import MG
 
 _COMMON = ('temperature', 'supply_voltage')

@@ -54,9 +54,8 @@ import numpy as np
 
 from ..calibrate import Calibration, in_g
 from ..calibrate.quality import with_history
-from ..effects import Context, effect_named
+from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
 from ..estimate.fit import Fit, judge
-from ..model import force_slope, Model, parameter_basis, reading_of
 from ..table import Floats, Poses
 from ..units import STANDARD_GRAVITY
 

@@ -21,7 +21,7 @@ as a time constant, are its shape.
 
 A temperature effect can have a lag [s]. With ``of_sensor`` 0 the die lags: the temperature that
 acts is a low pass of the recorded one. With ``of_sensor`` 1 the temperature sensor lags: the
-recorded temperature is a low pass of the one that acts (`accel_calib.thermal`).
+recorded temperature is a low pass of the one that acts (`accel_calib.effects.thermal`).
 
 Force, readings and standard deviations are in g, temperatures in °C, times in s. Names and terms
 are those of IEEE 1293 (model equation of a linear accelerometer) and of data sheets.
@@ -29,15 +29,21 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 """
 
 from .catalogue import (
+    CARRIERS,
     CHANGES,
+    effect_named,
     EFFECTS,
+    EMPIRICAL,
+    empirical_name,
+    empirical_parts,
+    is_effect,
     LADDER,
     NOMINAL_SUPPLY,
     PROCESSES,
     REFERENCE_TEMPERATURE,
+    VARIABLES,
     WANDER,
 )
-from .curves import CARRIERS, EMPIRICAL, empirical, empirical_name, empirical_parts, VARIABLES
 from .form import (
     AFFINE,
     AXES,
@@ -56,24 +62,40 @@ from .form import (
     TO_SEPARATE,
     WAVE,
 )
+from .model import (
+    AtContext,
+    check_context,
+    CONVERGED_G,
+    correct,
+    difference,
+    fitted_places,
+    force_slope,
+    LARGEST_FORCE_G,
+    LARGEST_ITERATIONS,
+    length_rows,
+    Model,
+    MODELS,
+    parameter_basis,
+    parameter_names,
+    predict,
+    reading_of,
+    sensor_force,
+    times,
+    too_large,
+    with_linear_part,
+    with_vector,
+)
+from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
+from .thermal import acting_temperature, rate_at, ThermalStream
 
-__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CUBE', 'EFFECTS', 'EMPIRICAL', 'FORCE',
-           'LADDER', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'ONE', 'PROCESSES',
-           'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES',
-           'WANDER', 'WAVE', 'Context', 'Effect', 'by_axis', 'effect_named', 'empirical_name',
-           'empirical_parts', 'is_effect']
-
-
-def is_effect(name: str) -> bool:
-    """Return whether an effect has this name."""
-    try:
-        effect_named(name)
-    except KeyError:
-        return False
-    return True
-
-
-def effect_named(name: str) -> Effect:
-    """Return the effect with this name: from the catalogue, or an empirical curve."""
-    found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
-    return found or empirical(name)
+__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'CUBE', 'EFFECTS', 'EMPIRICAL',
+           'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS', 'MODES',
+           'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'ONE', 'PROCESSES', 'PRODUCT',
+           'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER',
+           'WAVE', 'AtContext', 'Context', 'Effect', 'Model', 'ThermalStream',
+           'acting_temperature', 'by_axis', 'check_context', 'correct', 'difference',
+           'effect_named', 'empirical_name', 'empirical_parts', 'fitted_places', 'force_slope',
+           'is_effect', 'length_rows', 'model_with', 'parameter_basis', 'parameter_names',
+           'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force', 'simulate_poses',
+           'simulate_recording', 'times', 'too_large', 'turn_between', 'with_linear_part',
+           'with_vector']

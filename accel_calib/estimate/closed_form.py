@@ -61,9 +61,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import counted, RefusedFitError
-from ..model import MODELS, parameter_names, with_linear_part, with_vector
+from ..effects import MODELS, parameter_names, with_linear_part, with_vector
+from ..errors import RefusedFitError
 from ..table import Floats
+from ..text import counted
 
 _RIDGE = 1e-12
 """Keeps the solution finite for poses in a plane; the centre is then in the plane."""

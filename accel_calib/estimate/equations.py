@@ -53,9 +53,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context
-from ..model import AtContext, Model, times
-from ..sphere import unit
+from ..effects import AtContext, Context, Model, times
+from ..geometry import unit
 from ..table import Floats, Poses
 
 USUAL_NOISE_G = 5e-4

@@ -34,9 +34,16 @@ from numpy.typing import NDArray
 from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, noise_of, variance_factor
 from .least_squares import NOWHERE, Point, solve
-from ..effects import CHANGES, effect_named, LADDER
-from ..model import fitted_places, Model, parameter_names, with_vector
-from ..sphere import unit
+from ..effects import (
+    CHANGES,
+    effect_named,
+    fitted_places,
+    LADDER,
+    Model,
+    parameter_names,
+    with_vector,
+)
+from ..geometry import unit
 from ..table import Floats, Poses
 
 _SINGULAR_WITH_PRIOR = 1e-12

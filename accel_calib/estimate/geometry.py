@@ -37,9 +37,8 @@ from functools import cache, lru_cache
 import numpy as np
 
 from .equations import believable, LEAST_NOISE
-from ..effects import EFFECTS
-from ..model import Model, MODELS, parameter_names, with_vector
-from ..sphere import OVER_THE_SPHERE, spread_directions
+from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
+from ..geometry import OVER_THE_SPHERE, spread_directions
 from ..table import Floats
 
 LARGEST_DILUTION = 25.0

@@ -43,7 +43,7 @@ from .closed_form import closed_form
 from .equations import belief_in, noise_of
 from .fit import ByPose, estimate, Fit, judge
 from .least_squares import NotConvergedError
-from ..model import Model, MODELS, parameter_names, with_linear_part
+from ..effects import Model, MODELS, parameter_names, with_linear_part
 from ..table import Floats, Poses
 
 LEVEL = 0.007

@@ -15,4 +15,4 @@ from .run import cluster, run, Summary
 from .store import Store
 from .task import Options, STATUS
 
-__all__ = ['Input', 'Options', 'STATUS', 'Store', 'Summary', 'cluster', 'recordings', 'run']
+__all__ = ['STATUS', 'Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings', 'run']

@@ -35,8 +35,8 @@ from ..report.style import (
     styled,
     THIRD,
 )
-from ..significant import short, with_sd
 from ..table import Floats
+from ..text import short, with_sd
 
 Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""

@@ -34,10 +34,9 @@ from .prior import FEWEST
 from .store import Row
 from ..compare.parameters import NAMES
 from ..effects import LADDER
-from ..errors import counted
 from ..report.repeat_charts import scale_of
-from ..significant import short
 from ..table import Floats
+from ..text import counted, short
 
 MOST_ERRORS = 200
 """Largest number of errors that are kept."""

@@ -34,9 +34,8 @@ from .store import Row, Store
 from .. import __version__
 from ..calibrate.fleet_prior import FleetPrior
 from ..compare.parameters import NAMES
-from ..errors import counted
-from ..files.atomic import write_atomically
-from ..model import MODELS, parameter_names
+from ..disk import write_atomically
+from ..effects import MODELS, parameter_names
 from ..report.drawings import Drawing
 from ..report.repeat_charts import scale_of
 from ..report.sheet import (
@@ -49,7 +48,7 @@ from ..report.sheet import (
     sheet,
 )
 from ..report.style import has_matplotlib
-from ..significant import short
+from ..text import counted, short
 
 PAGE = 'fleet.html'
 

@@ -25,8 +25,8 @@ import numpy as np
 
 from .store import Row
 from ..calibrate.fleet_prior import FleetPrior
+from ..effects import MODELS, parameter_names
 from ..estimate.fit import Prior
-from ..model import MODELS, parameter_names
 from ..table import Floats
 
 FEWEST = 5

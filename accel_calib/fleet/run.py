@@ -27,8 +27,8 @@ from .store import Row, Store
 from .task import calibrate_recording, Done, Options, unread_row
 from ..calibrate.fleet_prior import FleetPrior
 from ..errors import InputError
-from ..files import Progress
-from ..files.fleet_yaml import write_priors
+from ..logs import Progress
+from ..stored.fleet_yaml import write_priors
 
 if TYPE_CHECKING:
     from distributed import Client

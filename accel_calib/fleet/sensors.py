@@ -30,7 +30,7 @@ from .store import Row, Store, write_parquet
 from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL
 from ..errors import AccelCalibError
-from ..files import read_calibration
+from ..stored import read_calibration
 from ..table import Floats
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from typing import Any, TYPE_CHECKING
 
 from .identity import as_folder
 from ..compare.parameters import NAMES
+from ..disk import write_atomically
 from ..errors import InputError
-from ..files.atomic import write_atomically
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -31,14 +31,14 @@ from ..calibrate import Calibration, fit_poses
 from ..calibrate.pose_planning import determines
 from ..calibrate.unknown_orientation import directions_of
 from ..compare.parameters import NAMES, rotation_free
-from ..crash import crash_words
-from ..errors import AccelCalibError, RefusedFitError, system_error
-from ..files import LogOptions, write_calibration
-from ..files.atomic import write_atomically
-from ..files.exports import export
+from ..disk import write_atomically
+from ..effects import MODELS
+from ..errors import AccelCalibError, crash_words, RefusedFitError, system_error
 from ..intake import Intake, poses_of
-from ..model import MODELS
+from ..logs import LogOptions
 from ..pipeline import calibrated, Outcome
+from ..stored import write_calibration
+from ..stored.exports import export
 from ..table import Poses
 
 RESULTS = 2
@@ -66,7 +66,7 @@ class Options:
     refined : bool
         Look for effects beyond offset, gain and cross-axis.
     exports : tuple of str
-        Formats of `accel_calib.files.exports.FORMATS` to write beside each calibration.
+        Formats of `accel_calib.stored.exports.FORMATS` to write beside each calibration.
 
     """
 

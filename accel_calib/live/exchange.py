@@ -17,12 +17,12 @@ from time import monotonic, time
 from . import messages
 from ..calibrate import Calibration
 from ..errors import InputError
-from ..files.exports import export, Exported
-from ..one_reading import Triple
+from ..messages.one_reading import Triple
 from ..rating import rate, Rating
 from ..report.page import calibration_page, STORED
 from ..session import Health, Job, Log, Session, ShowPoses
 from ..session.worker import Answer, CallSoon, Worker
+from ..stored.exports import export, Exported
 
 Show = Callable[[messages.Message], object]
 """Function that shows a message to all viewers."""

@@ -24,11 +24,11 @@ from .. import __version__
 from ..calibrate import Calibration
 from ..calibrate.pose_planning import words_of
 from ..errors import InputError
-from ..files.exports import CALIBRATION_ALONE
 from ..rating import Rating
 from ..session.events import Severity
 from ..session.guidance import Progress
 from ..session.health import findings, Health, Level
+from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
 from ..units import MG
 

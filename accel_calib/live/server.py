@@ -31,9 +31,9 @@ from urllib.parse import urlsplit
 from . import messages
 from .link import check_installed, not_bound, reachable
 from .viewer import STUCK_S, TooManyError, Viewer
-from ..files.exports import Exported, FORMATS
 from ..report.sheet import SCRIPT
 from ..session.worker import Answer
+from ..stored.exports import Exported, FORMATS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..capture import samples_of
 from ..errors import InputError
-from ..files import LineReader, LogOptions, open_log
+from ..logs import LineReader, LogOptions, open_log
 from ..table import Floats, Recording
 from ..units import Units
 

@@ -25,11 +25,9 @@ The conventions for covariances are kept: a first element of -1 means no data, a
 unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
 added to a known covariance of the acceleration.
 
-**Single messages.** Correction of single serialized Imu messages.
-
-The result is the same as that of `corrected`, but computed with Python floats
-(`accel_calib.one_reading`); a test compares both. Covariances rarely change from message to
-message, so each covariance is transformed only once.
+**Single messages.** The result is the same as that of `corrected`, but computed with Python floats
+(`one_reading`); a test compares both. Covariances rarely change from message to message, so each
+covariance is transformed only once.
 
 """
 
@@ -42,7 +40,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import (
+from .one_reading import AtReading, OneReading, Triple
+from ..calibrate import Calibration, of_samples, thermal_stream
+from ..effects import Context, ThermalStream
+from ..errors import InputError
+from ..geometry import quaternion_of
+from ..logs import (
     ACCELERATION,
     ACCELERATION_COVARIANCE,
     ANGULAR_VELOCITY,
@@ -58,13 +61,7 @@ from .layout import (
     STAMP_AT,
     THREE,
 )
-from ..calibrate import Calibration, of_samples, thermal_stream
-from ..effects import Context
-from ..errors import InputError
-from ..one_reading import AtReading, OneReading, Triple
-from ..rotations import quaternion_of
 from ..table import Floats
-from ..thermal import ThermalStream
 
 if TYPE_CHECKING:
     from ..calibrate import SampleNoise
@@ -85,7 +82,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
     calibration : Calibration
         The calibration, in the unit of the messages.
     doubles : (n, 37) array
-        One row per message; see `accel_calib.messages.layout`.
+        One row per message; see `accel_calib.logs.serialized`.
     context : mapping of str to array, optional
         Columns that the effects need, n rows each.
     stream : ThermalStream, optional

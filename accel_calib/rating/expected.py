@@ -12,7 +12,7 @@ import numpy as np
 
 from ..calibrate import Calibration, in_g, next_pose, NextPose, PRIOR
 from ..calibrate.gate import deviations_g
-from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER
+from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict
 from ..estimate.equations import variance_factor
 from ..estimate.geometry import (
     error_left_in,
@@ -20,8 +20,7 @@ from ..estimate.geometry import (
     identifiability,
     pose_noise,
 )
-from ..model import Model, MODELS, predict
-from ..sphere import OVER_THE_SPHERE, unit
+from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG
 

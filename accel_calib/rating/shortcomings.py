@@ -30,7 +30,8 @@ from ..calibrate import Calibration, EDITED, FLAT, NOT_LOCATED, UNCHECKED
 from ..calibrate.checks import axes_of, fault_of
 from ..calibrate.mounting import flat_direction
 from ..effects import EMPIRICAL, WANDER
-from ..errors import counted, listed, TAKE_ALL_SIDES
+from ..errors import TAKE_ALL_SIDES
+from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:

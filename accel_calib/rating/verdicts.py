@@ -23,9 +23,9 @@ from .shortcomings import (
     temperature_words,
 )
 from ..calibrate import Calibration, Verification
-from ..errors import counted
 from ..estimate.geometry import coverage
 from ..table import Poses
+from ..text import counted
 from ..units import MG
 
 if TYPE_CHECKING:

@@ -31,11 +31,11 @@ from ..effects import (
     EMPIRICAL,
     empirical_name,
     empirical_parts,
+    Model,
     MODES,
     VARIABLES,
 )
 from ..estimate.fit import Fit, judge
-from ..model import Model
 from ..table import Floats, Poses
 
 _MOST_MODES = 10

@@ -25,15 +25,15 @@ from ..effects import (
     EFFECTS,
     EMPIRICAL,
     empirical_parts,
+    parameter_names,
     PROCESSES,
     TO_SEPARATE,
     VARIABLES,
     WANDER,
 )
-from ..errors import counted
 from ..estimate.equations import kinds
-from ..model import parameter_names
 from ..table import COLUMNS, Floats, Poses
+from ..text import counted
 from ..units import MG
 
 if TYPE_CHECKING:

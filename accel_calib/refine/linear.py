@@ -44,10 +44,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context, effect_named
+from ..effects import Context, effect_named, Model
 from ..estimate.equations import Equations
 from ..estimate.fit import Fit
-from ..model import Model
 from ..table import Floats
 
 WORTH = 4.0

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from .state import beginning, State
 from ..calibrate.quality import with_history
 from ..capture.window import rounding_left
+from ..effects import Model
 from ..estimate.fit import judge
 from ..estimate.least_squares import NotConvergedError
-from ..model import Model
 from ..table import Floats, Poses
 
 _QUIET = 0.7

@@ -44,11 +44,10 @@ from .plan_words import (
 )
 from .rivals import LEAST, probabilities
 from .state import fitted_state
-from ..effects import effect_named, WANDER
+from ..effects import effect_named, Model, WANDER
 from ..estimate.equations import kinds
 from ..estimate.fit import Fit, judge
-from ..model import Model
-from ..sphere import spread_directions
+from ..geometry import spread_directions
 from ..table import Floats, Poses
 
 if TYPE_CHECKING:

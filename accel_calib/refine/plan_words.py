@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ..calibrate.pose_planning import words_of
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Floats
 
 ENOUGH = 0.95

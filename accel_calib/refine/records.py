@@ -12,8 +12,8 @@ from typing import Literal
 from .plan_words import percent, PosePlan
 from ..calibrate import Calibration
 from ..effects import EMPIRICAL
-from ..html_table import table
 from ..table import Floats, Poses
+from ..text import table
 
 Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
 

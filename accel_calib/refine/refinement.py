@@ -32,7 +32,6 @@ from .stored import beside_stored, with_changes, with_stored
 from ..calibrate import (
     Calibration,
     check_sensor,
-    check_units,
     fit_poses,
     FLAT,
     gated,
@@ -43,16 +42,16 @@ from ..calibrate import (
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.pose_planning import refuse_if_unfit
 from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_history
-from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, WANDER
-from ..errors import counted, listed, RefusedFitError, TAKE_ALL_SIDES
+from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, Model, WANDER
+from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import fit_4
 from ..estimate.equations import variance_factor
 from ..estimate.fit import judge
 from ..estimate.geometry import LARGEST_DILUTION
 from ..estimate.least_squares import NotConvergedError
-from ..model import Model
-from ..sphere import unit
-from ..table import Floats, Poses
+from ..geometry import unit
+from ..table import check_units, Floats, Poses
+from ..text import counted, listed
 from ..units import MG, Units
 
 BASES = ('auto', 'ideal', '4', '7', '10', '12')

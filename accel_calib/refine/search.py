@@ -34,11 +34,10 @@ from .sets import accepted, explored, names_of, simpler
 from .state import beginning, changes_beside, fitted_state, is_noise, State
 from .wander import Process, process_of, SIGNIFICANT, Walk, walk_beside
 from ..calibrate.quality import with_previous
-from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, WANDER
+from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, Model, WANDER
 from ..estimate.equations import kinds
 from ..estimate.fit import judge
-from ..model import Model
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Poses
 
 _ROUNDS = 4

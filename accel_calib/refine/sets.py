@@ -23,10 +23,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from .linear import Block, LEVEL, Linear, Set
-from ..effects import effect_named
+from ..effects import effect_named, fitted_places
 from ..estimate.fit import by_pose
 from ..estimate.outliers import outliers_among
-from ..model import fitted_places
 
 LARGEST = 5
 """Largest number of effects in a set."""

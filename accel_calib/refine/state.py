@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from .linear import held_out, Linear, linearised, Set
 from ..calibrate.quality import with_history
-from ..effects import CHANGES
+from ..effects import CHANGES, Model
 from ..estimate.fit import estimate, Fit
 from ..estimate.least_squares import NotConvergedError
-from ..model import Model
 from ..table import Floats, Poses
 from ..units import MG
 

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibrate import Calibration, EDITED, in_g
-from ..effects import CHANGES, effect_named
+from ..effects import CHANGES, effect_named, Model, parameter_names
 from ..estimate.fit import estimate, judge
-from ..model import Model, parameter_names
-from ..sphere import unit
+from ..geometry import unit
 from ..table import COLUMNS, Floats, Poses
 
 _DIGITS = 7

@@ -30,12 +30,12 @@ from ..calibrate import Calibration, fit_with_fleet, FleetPrior, gated, in_g, wi
 from ..calibrate.fleet_prior import posterior
 from ..calibrate.quality import quality_of, with_history
 from ..calibrate.unknown_orientation import FLEET, only_norm
-from ..effects import PROCESSES
-from ..errors import counted, RefusedFitError
+from ..effects import Model, MODELS, PROCESSES, with_vector
+from ..errors import RefusedFitError
 from ..estimate.fit import Fit, judge
-from ..model import Model, MODELS, with_vector
-from ..sphere import unit
+from ..geometry import unit
 from ..table import Poses
+from ..text import counted
 from ..units import MG, Units
 
 _BASE = '10'

@@ -33,14 +33,13 @@ from ..effects import (
     LADDER,
     REFERENCE_TEMPERATURE,
     VARIABLES,
+    with_vector,
 )
-from ..errors import counted
 from ..estimate.geometry import coverage
-from ..model import with_vector
-from ..significant import short, with_sd
+from ..refine.words import value_unit
 from ..table import Floats
+from ..text import counted, short, with_sd
 from ..units import MG
-from ..words import value_unit
 
 if TYPE_CHECKING:
     from ..calibrate import Verification

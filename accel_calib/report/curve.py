@@ -20,8 +20,7 @@ import numpy as np
 
 from .style import ACCENT, AFTER, Chart, INK, new_figure, styled, THIRD
 from .variables import variable_of, with_thermal
-from ..effects import AXES, CARRIERS, effect_named, empirical_parts
-from ..model import parameter_names
+from ..effects import AXES, CARRIERS, effect_named, empirical_parts, parameter_names
 from ..table import Floats, Poses
 from ..units import MG
 

@@ -19,9 +19,9 @@ from .residuals import marks_of, Residuals, residuals_of_refinement
 from .style import AFTER, BEFORE, Chart, save
 from .variables import recorded, Variable, variables_of
 from ..effects import effect_named, empirical_parts, VARIABLES
-from ..significant import short
+from ..refine.words import base_words, curve_unit
 from ..table import Floats
-from ..words import base_words, curve_unit
+from ..text import short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .style import ACCENT, AFTER, Chart, FAINT, new_figure, PAPER, styled
-from ..significant import short
-from ..words import base_words
+from ..refine.words import base_words
+from ..text import short
 
 if TYPE_CHECKING:
     from ..refine import Refinement

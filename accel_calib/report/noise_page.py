@@ -21,9 +21,9 @@ from .drawings import Drawing
 from .sheet import figures, heading, listing, numbers, paragraph, scroll_table, section, sheet
 from .style import ACCENT, AFTER, Chart, Mark, new_figure, save, styled, THIRD
 from .. import __version__
-from ..allan import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
-from ..files.atomic import write_atomically
-from ..significant import with_sd
+from ..disk import write_atomically
+from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
+from ..text import with_sd
 
 _COLOURS = {'x': AFTER, 'y': ACCENT, 'z': THIRD}
 _HEIGHT_INCHES = 4.0

@@ -22,9 +22,9 @@ from . import refinement_sections as found
 from .residuals import Residuals, residuals_of
 from .sheet import heading, listing, section, sheet
 from .. import __version__
-from ..files.atomic import write_atomically
+from ..disk import write_atomically
 from ..rating import rate_refinement
-from ..words import verdict_words
+from ..refine.words import verdict_words
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration, Verification

@@ -16,8 +16,8 @@ from .residuals import Residuals, residuals_of_refinement
 from .sheet import code, figures, paragraph, scroll_table, section
 from ..effects import effect_named
 from ..refine.plan_words import percent
-from ..significant import short
-from ..words import chance, values_of, verdict_words
+from ..refine.words import chance, values_of, verdict_words
+from ..text import short
 
 if TYPE_CHECKING:
     from ..refine import Refinement, Step

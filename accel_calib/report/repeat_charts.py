@@ -33,10 +33,10 @@ from .style import (
 )
 from ..compare import Comparison, History
 from ..compare.comparison import Parameter
-from ..significant import with_sd
+from ..refine.words import value_unit
 from ..table import Floats
+from ..text import with_sd
 from ..units import MG
-from ..words import value_unit
 
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
 _BAND = 1.96

@@ -15,9 +15,9 @@ from .calibration_sections import verdict_box
 from .repeat_charts import in_words, of_history, of_parameters, scale_of
 from .sheet import figures, heading, HINT, listing, scroll_table, section, sheet
 from .. import __version__
-from ..files.atomic import write_atomically
+from ..disk import write_atomically
 from ..rating import rate_comparison
-from ..significant import short
+from ..text import short
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration

@@ -14,8 +14,8 @@ import numpy as np
 from .style import Mark
 from ..calibrate import Calibration, in_g
 from ..calibrate.quality import errors_after, errors_before, with_history
-from ..model import sensor_force
-from ..sphere import unit
+from ..effects import sensor_force
+from ..geometry import unit
 from ..table import Floats, Poses
 from ..units import MG
 

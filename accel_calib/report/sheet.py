@@ -19,7 +19,7 @@ from html import escape
 
 from .drawings import Drawing
 from .style import inline_svg
-from ..html_table import table
+from ..text import table
 
 _LIGHT = """
   --paper: #fff; --ink: #222; --soft: #5f5f5f; --shade: #0003; --axis: #666; --grid: #e6e6e6;

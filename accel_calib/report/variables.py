@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..effects import AXES, effect_named
+from ..effects import acting_temperature, AXES, effect_named, rate_at
 from ..table import Floats, Poses
-from ..thermal import acting_temperature, rate_at
 from ..units import MG
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')

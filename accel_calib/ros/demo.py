@@ -41,10 +41,11 @@ from visualization_msgs.msg import MarkerArray
 
 from . import qos
 from .domain import own_domain
-from ..errors import AccelCalibError, counted
-from ..files import read_calibration
-from ..simulate import parse_effect
+from ..effects import parse_effect
+from ..errors import AccelCalibError
+from ..stored import read_calibration
 from ..table import Floats
+from ..text import counted
 from ..units import MG, STANDARD_GRAVITY
 
 _POSES, _POSES_HIDDEN = 12, 16

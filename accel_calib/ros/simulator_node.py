@@ -31,10 +31,9 @@ from . import qos
 from .declare import declared
 from ..calibrate import of_samples, thermal_stream
 from ..calibrate.mounting import mounting_of
-from ..model import predict
+from ..effects import model_with, parse_effect, predict, turn_between
+from ..geometry import spread_directions
 from ..session.settings import parameter
-from ..simulate import model_with, parse_effect, turn_between
-from ..sphere import spread_directions
 from ..table import Floats, numbered, Recording
 from ..units import STANDARD_GRAVITY
 

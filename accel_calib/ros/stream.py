@@ -25,8 +25,7 @@ from sensor_msgs.msg import Imu
 
 from ..calibrate import Calibration
 from ..errors import AccelCalibError
-from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
-from ..messages.layout import (
+from ..logs import (
     ACCELERATION,
     IMU_DOUBLES,
     joined,
@@ -37,7 +36,8 @@ from ..messages.layout import (
     samples_of,
     THREE,
 )
-from ..one_reading import Triple
+from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
+from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, Session
 
 _NO_LAYOUT = Layout(b'', 0, -1)

@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from . import qos
 from ..errors import InputError
-from ..rotations import quaternion_of, rotation_from_quaternion
+from ..geometry import quaternion_of, rotation_from_quaternion
 from ..table import Floats
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ The calibration in use, and its comparison with the rests since the fit.
 Gravity is the mean corrected force of the last rest. It is subtracted while the sensor moves
 (Intan RHD2000 application note). This is accurate for motion near the orientation of that rest.
 
-Every rest is compared with 1 g (`accel_calib.monitor`) as soon as it is long enough. The final
-average replaces this first comparison. A robot can stand for weeks, so each interval `LONG_REST`
-of a long rest counts as one rest.
+Every rest is compared with 1 g (`accel_calib.compare.drift`) as soon as it is long enough. The
+final average replaces this first comparison. A robot can stand for weeks, so each interval
+`LONG_REST` of a long rest counts as one rest.
 
 """
 
@@ -25,10 +25,9 @@ from .live_capture import LONG_REST, overlap
 from .temperature_history import TemperatureHistory
 from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
-from ..effects import Context
+from ..compare import compared, Drift, monitor, rests_of
+from ..effects import Context, Model
 from ..messages import output_scale
-from ..model import Model
-from ..monitor import compared, Drift, monitor, rests_of
 from ..table import Floats
 from ..units import Units
 

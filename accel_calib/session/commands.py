@@ -45,15 +45,9 @@ from ..calibrate import (
 from ..calibrate.mounting import mounting_words
 from ..capture import Dwell, poses_from
 from ..effects import LADDER
-from ..errors import (
-    AccelCalibError,
-    counted,
-    InputError,
-    RefusedFitError,
-    StoredCalibrationError,
-)
+from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..refine import Refinement
-from ..words import now
+from ..text import counted, now
 
 if TYPE_CHECKING:
     from .session import Session

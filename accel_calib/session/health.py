@@ -19,9 +19,9 @@ import numpy as np
 
 from .stream_statistics import SILENT, StreamStatistics
 from ..calibrate import GyroBias, SampleNoise, USES_LIMIT
-from ..errors import counted
-from ..monitor import Drift, status
+from ..compare import Drift, status
 from ..table import Floats
+from ..text import counted
 from ..units import MG
 
 _DROPPED_SHOWN_FOR = 60.0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ..calibrate import Calibration
 from ..errors import InputError
-from ..one_reading import Known, OneReading, Triple
+from ..messages.one_reading import Known, OneReading, Triple
 from ..units import Units
 
 _NONE: Triple = (0.0, 0.0, 0.0)

@@ -35,11 +35,12 @@ from .stream_statistics import SILENT, StreamStatistics
 from .work import is_partial, plan_for, title
 from ..calibrate import Calibration, Outside, outside, USES_LIMIT, with_given_mounting
 from ..calibrate.mounting import mounting_of, mounting_words
+from ..compare import status
 from ..effects import Context
-from ..errors import AccelCalibError, counted, InputError
-from ..monitor import status
-from ..one_reading import Triple
+from ..errors import AccelCalibError, InputError
+from ..messages.one_reading import Triple
 from ..table import Floats, Poses
+from ..text import counted
 from ..units import Units, units_of
 
 BATCH = 0.3

@@ -27,24 +27,18 @@ import stat
 import numpy as np
 
 from ..calibrate import Calibration, check_sensor
-from ..crash import crash_words
+from ..disk import check_regular, copy_atomically, remove_leftovers
 from ..errors import (
     AccelCalibError,
+    crash_words,
     DamagedCalibrationError,
     FREE_SPACE,
     InputError,
     is_full,
     StoredCalibrationError,
 )
-from ..files import (
-    copy_atomically,
-    read_calibration,
-    read_poses,
-    remove_leftovers,
-    write_calibration,
-    write_table,
-)
-from ..files.regular import check_regular
+from ..logs import read_poses, write_table
+from ..stored import read_calibration, write_calibration
 from ..table import LARGEST, Poses
 from ..units import UnitName
 

@@ -19,10 +19,8 @@ import numpy as np
 
 from .live_capture import LONG_REST
 from ..calibrate import thermal_stream
-from ..effects import Context
-from ..model import Model
+from ..effects import Context, Model, ThermalStream
 from ..table import Floats
-from ..thermal import ThermalStream
 
 _APART = 2.0
 """Shortest time between two temperatures of the history [s]."""

@@ -25,17 +25,17 @@ from ..calibrate import (
 )
 from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
-from ..effects import Context
-from ..errors import counted, listed, RefusedFitError
+from ..effects import Context, Model
+from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_4
 from ..estimate.geometry import coverage, pose_noise
-from ..model import Model
+from ..geometry import spread_directions
 from ..rating import rate, rate_refinement
 from ..refine import refine, Refinement
-from ..sphere import spread_directions
+from ..refine.words import residual_words, verdict_words
 from ..table import Floats, Poses
+from ..text import counted, listed, now
 from ..units import MG, Units
-from ..words import now, residual_words, verdict_words
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""

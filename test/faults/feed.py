@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accel_calib.files import write_table
+from accel_calib.logs import write_table
 from accel_calib.units import STANDARD_GRAVITY
 from inside import Model, simulate_poses, spread_directions
 import numpy as np

@@ -39,13 +39,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 import accel_calib as ac  # noqa: E402
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError  # noqa: E402
-from accel_calib.files import (  # noqa: E402
-    correct_bag,
-    LogOptions,
-    read_calibration,
-    read_log,
-    write_table,
-)
+from accel_calib.logs import LogOptions, read_log, write_table  # noqa: E402
+from accel_calib.messages import correct_bag  # noqa: E402
+from accel_calib.stored import read_calibration  # noqa: E402
 from bag_files import a_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
 from faults.inputs import BAGS, EXTREME, Files  # noqa: E402

@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 
 import accel_calib as ac
 from accel_calib.errors import AccelCalibError
-from accel_calib.files import read_log, write_calibration, write_table
+from accel_calib.logs import read_log, write_table
+from accel_calib.stored import write_calibration
 import bag_files as bags
 from inside import format_calibration, parse_calibration
 from mcap_file import McapFile, STORE

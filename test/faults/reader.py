@@ -16,7 +16,8 @@ from pathlib import Path
 import sys
 import time
 
-from accel_calib.files import read_calibration, read_poses
+from accel_calib.logs import read_poses
+from accel_calib.stored import read_calibration
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from faults.trials import command, COMMANDS, ERRORS, FEW, KINDS, TASKS
 from inside import Identity, SensorStore
 import pytest

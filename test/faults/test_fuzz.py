@@ -13,7 +13,8 @@ import struct
 import warnings
 
 from accel_calib.errors import DamagedCalibrationError, InputError
-from accel_calib.files import read_calibration, read_log
+from accel_calib.logs import read_log
+from accel_calib.stored import read_calibration
 from faults import inputs
 from faults.fuzz import KINDS, outcomes
 from faults.inputs import Files

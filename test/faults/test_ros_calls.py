@@ -14,7 +14,7 @@ import signal
 import sys
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import Call, explained, State

@@ -16,7 +16,8 @@ import sys
 import time
 from typing import Any
 
-from accel_calib.files import read_calibration, read_poses
+from accel_calib.logs import read_poses
+from accel_calib.stored import read_calibration
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import AFTER, Call, State

@@ -25,7 +25,7 @@ import shutil
 import sys
 from typing import Any
 
-from accel_calib.files import read_calibration
+from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
 from inside import Identity, SensorStore
 from inside import main as command

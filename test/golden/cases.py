@@ -15,7 +15,7 @@ import re
 import shlex
 from typing import Any
 
-from accel_calib.files import LogOptions
+from accel_calib.logs import LogOptions
 from golden import inputs
 from golden.driven import session
 from golden.figures import attempt, LOOKS

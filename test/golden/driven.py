@@ -12,25 +12,14 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
-from accel_calib.messages import (
-    corrected,
-    doubles_at,
-    frame_ids,
-    joined,
-    layout_of,
-    motion_of,
-    output_frame,
-    renamed,
-    Rewriter,
-    samples_of,
-    stamps_of,
-)
+from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
+from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import CalibratorSettings, findings, Job, Log, Session, ShowPoses
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
 from inside import figures as health_figures
-from inside import layout_with, Model
+from inside import frame_ids, layout_with, Model, stamps_of
 import numpy as np
 
 SENSOR: dict[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array(

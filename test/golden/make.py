@@ -15,7 +15,7 @@ import time
 
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
 
-from golden.cases import CASES, result_of  # noqa: E402, the path above
+from golden.cases import CASES, result_of  # noqa: E402
 from golden.record import EXPECTED, text_of  # noqa: E402
 from golden.sweeps import SWEEPS  # noqa: E402
 import pytest  # noqa: E402

@@ -13,7 +13,6 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.calibrate import (
     Calibration,
-    check_units,
     fit_poses,
     FleetPrior,
     FRAMES,
@@ -38,7 +37,7 @@ from accel_calib.estimate import (
     variance_factor,
 )
 from accel_calib.rating import Expected, LIMITS, rate
-from accel_calib.table import numbered, Poses
+from accel_calib.table import check_units, numbered, Poses
 from accel_calib.units import units_of
 from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, those

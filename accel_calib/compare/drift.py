@@ -1,0 +1,402 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Drift of a calibrated sensor: every rest is compared with 1 g and the stated uncertainty.
+
+A rest has the error e = |force| - 1. The variance of e has three parts: the noise of the mean
+along the force, the uncertainty of the calibration (common to rests in similar orientations), and
+the part by which the poses of the calibration repeat worse than the noise of their samples
+predicts. The last part is badly known from few poses. A factor on the stated scatter is therefore
+estimated from the rests. It follows the median of the differences of successive rests, which a
+lasting change does not affect. The state is one record of bounded size.
+
+**Lasting change.** It is detected by a likelihood ratio. The errors of the last n rests are
+jointly normal with covariance S. S contains the noise of each rest, and the uncertainty of the
+calibration. Each rest can be disturbed by a knock, with probability `_KNOCKED` and a size of about
+`_KNOCK` [g]. The likelihood is therefore the sum over all 2ⁿ combinations of knocks. The
+alternative is a change that began at the third last rest or earlier:
+
+    offset   e changes by up · b    b normal with a standard deviation of `_SIZES`, three axes
+    gain     e changes by b         the same in every orientation
+
+The likelihood of the alternative is averaged over instants, kinds and sizes. The change may
+continue to vary by `_WANDER` of its size, for example with temperature. By Markov's inequality the
+ratio exceeds `SURE` by chance in at most one of `SURE` rests. One or two knocks are not a lasting
+change; three rests that agree are.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from ..calibrate import Calibration
+from ..effects import Context, length_rows, sensor_force
+from ..table import Floats
+from ..text import counted
+from ..units import MG
+
+MEMORY = 6
+"""Number of rests that are used."""
+
+_FEWEST = 3
+"""Smallest number of rests that a lasting change has."""
+
+SURE = float(np.exp(13.0))
+"""Likelihood ratio above which a change is reported: 440,000."""
+
+_KNOCKED, _KNOCK = 0.003, 0.05   # probability and size [g] of a knock
+_SIZES = (0.005, 0.05)           # sizes of a change [g]
+_WANDER = 0.1                    # variation of a change from rest to rest, relative to its size
+_CLEAR = 20.0                    # likelihood ratio above which one kind is clearly distinguished
+
+KINDS: dict[str, Callable[[Floats], Floats]] = {
+    'offset': lambda up: up, 'gain': lambda up: np.ones((len(up), 1))}
+"""Kinds of change: (n, 3) up -> (n, q) derivative of the errors by the change."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    A lasting change.
+
+    Parameters
+    ----------
+    rests : int
+        Number of rests since the change.
+    kind : str
+        More likely kind of `KINDS`.
+    clear : bool
+        Whether the orientations of the rests clearly distinguish this kind from the other.
+    shift : (q,) array
+        The change [g].
+    covariance : (q, q) array
+        Covariance of the shift [g²].
+    error : float
+        Effect on |a| at these rests, RMS [g]; signed if the sign is the same for all.
+
+    """
+
+    rests: int
+    kind: str
+    clear: bool
+    shift: Floats
+    covariance: Floats
+    error: float
+
+
+def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
+    """
+    Return a lasting change, or None.
+
+    Parameters
+    ----------
+    error : (n,) array
+        |force| - 1 of the last rests, in order of time [g].
+    covariance : (n, n) array
+        Covariance of these errors without a change [g²].
+    up : (n, 3) array
+        Direction of up in each rest, unit vectors in the sensor axes.
+
+    Returns
+    -------
+    Change or None
+        None if the stated uncertainty or knocks explain the errors.
+
+    """
+    most = 0.5 * float(error @ np.linalg.solve(covariance, error))
+    if len(error) < _FEWEST or most - len(error) * np.log1p(-_KNOCKED) < np.log(SURE):
+        return None   # the ratio cannot be larger
+    found = {(kind, rests): np.logaddexp.reduce([
+        _likelihood(error, covariance + _added(_derivative(kind, rests, up), size))
+        for size in _SIZES]) for kind in KINDS for rests in range(_FEWEST, len(error) + 1)}
+    same = _likelihood(error, covariance) + np.log(len(found) * len(_SIZES))
+    if np.logaddexp.reduce(list(found.values())) - same < np.log(SURE):
+        return None
+    kind, rests = max(found, key=lambda key: found[key])
+    each = [np.logaddexp.reduce([found[key] for key in found if key[0] == other])
+            for other in KINDS]
+    return _described(kind, rests, bool(np.ptp(each) > np.log(_CLEAR)), error, covariance, up)
+
+
+def is_over(known: Change, error: Floats, covariance: Floats, up: Floats) -> bool:
+    """Return whether this change is clearly absent now; parameters as in `change`."""
+    slope = KINDS[known.kind](up)
+    stays = _likelihood(error - slope @ known.shift,
+                        covariance + slope @ known.covariance @ slope.T)
+    return bool(_likelihood(error, covariance) - stays > np.log(SURE))
+
+
+def _derivative(kind: str, rests: int, up: Floats) -> Floats:
+    """Return the (n, q) derivative of the errors by a change before the last `rests` rests."""
+    slope = KINDS[kind](up).copy()
+    slope[:len(up) - rests] = 0.0
+    return slope
+
+
+def _added(slope: Floats, size: float) -> Floats:
+    """Return the (n, n) covariance of the errors that a change of this size causes."""
+    common: Floats = size ** 2 * slope @ slope.T
+    return common + _WANDER ** 2 * np.diag(np.diag(common))
+
+
+def _likelihood(error: Floats, covariance: Floats) -> float:
+    """Return the logarithm of the likelihood, summed over all combinations of knocks."""
+    return float(np.logaddexp.reduce(_knocks(error, covariance)[1]))
+
+
+def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Return the (k, n) combinations of knocks as 0 and 1, and their (k,) log likelihoods."""
+    knocked = np.array(list(product((0.0, 1.0), repeat=len(error))))
+    spread = covariance + _KNOCK ** 2 * knocked[:, :, np.newaxis] * np.eye(len(error))
+    count = knocked.sum(axis=1)
+    weight = count * np.log(_KNOCKED) + (len(error) - count) * np.log1p(-_KNOCKED)
+    solved = np.linalg.solve(spread, np.broadcast_to(error, knocked.shape)[:, :, np.newaxis])
+    fit = solved[:, :, 0] @ error + np.linalg.slogdet(spread)[1]
+    return knocked, weight - 0.5 * fit
+
+
+def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Floats,
+               up: Floats) -> Change:
+    """Return the estimate of a change, without the rests that were most likely knocked."""
+    slope = _derivative(kind, rests, up)
+    prior = max(_SIZES) ** 2
+    knocked, likely = _knocks(error, covariance + _added(slope, max(_SIZES)))
+    spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
+    weighted = slope.T @ np.linalg.inv(spread)
+    found = np.linalg.inv(weighted @ slope + np.eye(slope.shape[1]) / prior)
+    shift = found @ weighted @ error
+    moved = slope[len(up) - rests:] @ shift
+    sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
+    return Change(rests, kind, clear, shift, found,
+                  sign * float(np.sqrt(np.mean(moved ** 2))))
+
+
+_LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
+_LEARN = 0.02         # relative step of the scatter per rest; larger in the beginning
+_MEDIAN = 0.6745      # median of the absolute value of a standard normal variable
+_WARMER = 2.0         # temperatures outside of the range by more cause an advice [°C]
+
+
+@dataclass(frozen=True)
+class Rest:
+    """
+    One rest of the sensor.
+
+    Parameters
+    ----------
+    error : float
+        |force| - 1 [g].
+    variance : float
+        Variance of the error from the noise of the mean [g²].
+    slope : (p,) array
+        Derivative of the error by the values of the model.
+    up : (3,) array
+        Direction of up, unit vector in the sensor axes.
+    temperature : float
+        Temperature [°C]; NaN if not known.
+
+    """
+
+    error: float
+    variance: float
+    slope: Floats
+    up: Floats
+    temperature: float
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    The state of the monitor: the rests since a calibration.
+
+    Parameters
+    ----------
+    covariance : (p, p) array
+        Covariance of the calibration [g²].
+    repeats : float
+        Variance of the poses of the calibration beyond the noise of their samples [g²].
+    temperatures : tuple of float
+        Lowest and highest temperature of these poses [°C]; empty if not known.
+    rests : tuple of Rest
+        The last rests.
+    count : int
+        Number of rests so far.
+    scatter : float
+        Factor on the stated scatter of the rests.
+    change : Change or None
+        The lasting change; None if the sensor is unchanged.
+    since : int
+        Number of the first rest with the change, 1-based; 0 without a change.
+
+    """
+
+    covariance: Floats
+    repeats: float
+    temperatures: tuple[float, ...]
+    rests: tuple[Rest, ...] = ()
+    count: int = 0
+    scatter: float = 1.0
+    change: Change | None = None
+    since: int = 0
+
+    @property
+    def stated(self) -> float:
+        """Stated standard deviation of the error of the last rest [g]."""
+        return float(np.sqrt(_covariance(self, self.rests[-1:])[0, 0])) if self.rests else np.nan
+
+    @property
+    def error(self) -> float:
+        """Median of | |a| - 1 | over the last rests [g]; NaN without rests."""
+        return float(np.median([abs(rest.error) for rest in self.rests])) if self.rests else np.nan
+
+    @property
+    def lasted(self) -> int:
+        """Return the number of rests since the change; 0 without a change."""
+        return self.count - self.since + 1 if self.since else 0
+
+    @property
+    def temperature(self) -> float:
+        """Temperature of the last rest [°C]; NaN if not known."""
+        return self.rests[-1].temperature if self.rests else np.nan
+
+
+def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
+             ) -> list[Rest]:
+    """
+    Return rests with their errors from 1 g.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration in use.
+    reading, noise : (n, 3) array
+        Mean readings and noise of these means, in the unit of the readings.
+    context : mapping of str to array
+        Columns that the effects need, n rows.
+
+    """
+    model, units = calibration.model, calibration.units
+    u = sensor_force(model, units.to_g(reading), context)
+    length = np.linalg.norm(u, axis=1)
+    rows = length_rows(model, u, context)
+    variance = np.sum((rows * units.to_g(noise)) ** 2, axis=1)
+    slope = -model.basis(u, context).along(rows)
+    temperature = np.asarray(context.get('temperature', np.full(len(u), np.nan)), float)
+    return [Rest(float(length[k]) - 1.0, float(variance[k]) + _LEAST_NOISE ** 2, slope[k],
+                 u[k] / length[k], float(temperature[k])) for k in range(len(u))]
+
+
+def monitor(calibration: Calibration) -> Drift:
+    """Return the initial state of the monitor after a calibration."""
+    poses = calibration.poses
+    temperatures: tuple[float, ...] = ()
+    if 'temperature' in poses and len(poses):
+        known = poses['temperature']
+        temperatures = (float(np.min(known)), float(np.max(known)))
+    return Drift(calibration.covariance, _repeats(calibration), temperatures)
+
+
+def _repeats(calibration: Calibration) -> float:
+    """
+    Return the variance of pose means beyond the noise of their samples [g²].
+
+    It is infinite for a mounting alone, whose offset and gain are not calibrated.
+
+    """
+    if not calibration.model.effects:
+        return np.inf
+    quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
+    spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
+    excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
+    return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
+
+
+def compared(before: Drift, rest: Rest, least: float) -> Drift:
+    """
+    Return the state of the monitor after one more rest.
+
+    Parameters
+    ----------
+    before : Drift
+        The previous state.
+    rest : Rest
+        The next rest.
+    least : float
+        Smallest change to report [g].
+
+    """
+    rests = (*before.rests, rest)
+    scatter = _scatter(before, rests[:2]) if len(rests) > MEMORY else before.scatter
+    after = replace(before, rests=rests[-MEMORY:], count=before.count + 1, scatter=scatter)
+    covariance = _covariance(after, after.rests)
+    if not np.all(np.isfinite(covariance)):
+        return after
+    seen = (np.array([each.error for each in after.rests]), covariance,
+            np.array([each.up for each in after.rests]))
+    found = change(*seen)
+    if found is not None and abs(found.error) >= least:
+        since = before.since or after.count - found.rests + 1
+        return replace(after, change=found, since=since)
+    if before.change is not None and is_over(before.change, *seen):
+        return replace(after, change=None, since=0)
+    return after
+
+
+def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
+    """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
+    slope = np.array([rest.slope for rest in rests])
+    noise = np.array([rest.variance + state.repeats for rest in rests])
+    covariance: Floats = slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise)
+    return covariance
+
+
+def _scatter(state: Drift, rests: tuple[Rest, ...]) -> float:
+    """Return the updated scatter, from two rests that are older than a possible change."""
+    covariance = _covariance(state, rests)
+    stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+    step = max(_LEARN, 2.0 / (state.count + 4.0))
+    more = abs(rests[0].error - rests[1].error) > _MEDIAN * stated
+    return max(1.0, state.scatter * float(np.exp(step if more else -step)))
+
+
+def status(state: Drift) -> str:
+    """Return the state of the sensor and advice as one line."""
+    if not state.count:
+        return 'no rest since the calibration'
+    if not np.isfinite(state.stated):
+        return 'the calibration has no uncertainty, so rests cannot be compared with it'
+    if state.change is None:
+        return (f'|a| at rest differs by {state.error * MG:.2f} mg from 1 g, stated uncertainty '
+                f'{state.stated * MG:.2f} mg')
+    found = state.change
+    return (f'|a| at rest has differed by {found.error * MG:+.2f} mg from 1 g for '
+            f'{counted(state.lasted, "rest")}, stated uncertainty {state.stated * MG:.2f} mg'
+            f'{_kind(found)}: {_advice(state)}')
+
+
+def _kind(found: Change) -> str:
+    """Return a text about what changed, if the orientations of the rests show it."""
+    if not found.clear:
+        return ''
+    if found.kind == 'gain':
+        return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
+    x, y, z = found.shift * MG
+    return f'; the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'
+
+
+def _advice(state: Drift) -> str:
+    """Return the advice for a change."""
+    if state.temperatures:
+        low, high = state.temperatures
+        now = state.temperature
+        if now < low - _WARMER or now > high + _WARMER:
+            return (f'the temperature is {now:.1f} °C, but the sensor was calibrated at '
+                    f'{low:.1f} to {high:.1f} °C: capture poses at this temperature and call '
+                    '~/refine')
+    return 'call ~/reset, capture poses and call ~/fit'

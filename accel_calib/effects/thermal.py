@@ -1,0 +1,426 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Lag and rate of the temperature, for poses and for streams of samples.
+
+A temperature that acts on the sensor with a lag L differs from the recorded temperature T:
+
+    the die lags:                 L dA/dt + A = T,   A = T at the start
+    the temperature sensor lags:  A = T + L dT/dt
+
+**Rate.** The temperature is modelled as a process whose third derivative is white noise. It is
+recorded with an error of the size of a small step. A smoother over all poses (a quintic smoothing
+spline, Wahba 1978) estimates the rate at the poses; a Kalman filter with the same model estimates
+it from the past samples of a stream. The noise is chosen for periods of 400 s and more: the filter
+follows them, and it averages the steps of the temperature sensor.
+
+**Low pass.** The solution of the first equation is exact for the interpolated temperature. Between
+poses that is the cubic with the temperatures and the rates at its ends; between samples it is the
+straight line. Times need not be sorted. A row without time or temperature is NaN, and the other
+rows ignore it.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..table import Floats
+
+_ERROR = 0.01
+"""Standard deviation of a recorded temperature [°C]."""
+
+_JERK = 3e-10
+"""Spectral density of the third derivative of the temperature [°C²/s⁵]."""
+
+_START_RATE = 0.05
+_START_BEND = 5e-4
+"""Standard deviation of the first and second derivative before the data [°C/s], [°C/s²]."""
+
+_BIN = 1.0
+"""Duration over which the samples of a stream are averaged for the rate [s]."""
+
+_RESTART = 1.0
+"""If the time of a stream jumps back by more than this, the stream starts again [s]."""
+
+_LONGEST = 30.0
+"""Longest part of a low pass that is computed at once, in lags; e³⁰ keeps all digits."""
+
+_SHORTEST = 0.1
+"""Shortest interval for the smoother [s]; earlier rows count as simultaneous."""
+
+
+class Lag(NamedTuple):
+    """Lag of a temperature: its size [s], and whether the temperature sensor lags."""
+
+    seconds: float
+    of_sensor: bool
+
+
+def rate_at(context: Mapping[str, Any]) -> Any:
+    """Return the rate of the temperature in a context [°C/s]; one row alone has the rate 0."""
+    if 'temperature_rate' in context:
+        return context['temperature_rate']
+    if np.ndim(context['temperature']) == 0:
+        return 0.0
+    return rate_of(context['time'], context['temperature'])
+
+
+def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sensor: bool) -> Any:
+    """
+    Return the temperature that acts with a lag [°C].
+
+    Parameters
+    ----------
+    context : mapping of str to array
+        Columns ``time`` and ``temperature``, n rows each. The rows are the whole history.
+    key : str
+        Column of the context that is returned if it is present.
+    lag : float
+        Lag [s].
+    of_sensor : bool
+        Whether the temperature sensor lags; otherwise the die lags.
+
+    Returns
+    -------
+    (n,) array
+        The temperature; for one row alone it is the recorded temperature.
+
+    """
+    if key in context:
+        return context[key]
+    if np.ndim(context['temperature']) == 0:
+        return context['temperature']
+    if of_sensor:
+        return context['temperature'] + lag * rate_at(context)
+    return low_passed(context['time'], context['temperature'], lag, rate_at(context))
+
+
+def rate_of(time: Floats, temperature: Floats) -> Floats:
+    """
+    Estimate the rate of the temperature at poses.
+
+    Parameters
+    ----------
+    time, temperature : (n,) array
+        Time [s] and temperature [°C] of each pose.
+
+    Returns
+    -------
+    (n,) array
+        Rate [°C/s]; NaN where time or temperature is NaN.
+
+    """
+    known = np.isfinite(time) & np.isfinite(temperature)
+    rate = np.full(len(time), np.nan)
+    moments, place = np.unique(_merged(time[known]), return_inverse=True)
+    if len(moments) < 2:
+        rate[known] = 0.0
+        return rate
+    mean = np.bincount(place, temperature[known]) / np.bincount(place)
+    rate[known] = _smoothed_rate(moments, mean)[place]
+    return rate
+
+
+def _merged(time: Floats) -> Floats:
+    """Return the times, with equal ones in place of almost equal ones."""
+    return np.round(time / _SHORTEST) * _SHORTEST
+
+
+def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:
+    """Return the (n,) rate at n increasing times: a least-squares problem with 3 n unknowns."""
+    from scipy.linalg import solveh_banded
+
+    count, step = len(time), np.diff(time)
+    middle = float(np.mean(temperature))
+    unit = np.array([1.0, 1.0 / float(np.median(step)), float(np.median(step)) ** -2])
+    moved, spread = _motion(step)
+    weight = np.linalg.inv(spread)
+    blocks, beside = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
+    blocks[:-1] += np.swapaxes(moved, 1, 2) @ weight @ moved
+    blocks[1:] += weight
+    beside[1:] = -weight @ moved
+    blocks[:, 0, 0] += _ERROR ** -2
+    blocks[0, [1, 2], [1, 2]] += np.array([_START_RATE, _START_BEND]) ** -2.0
+    blocks, beside = (each * unit * unit[:, np.newaxis] for each in (blocks, beside))
+    banded = np.zeros((6, count, 3))  # diagonals of the lower triangle
+    for row in range(3):
+        for column in range(3):
+            if row >= column:
+                banded[row - column, :, column] = blocks[:, row, column]
+            banded[3 + row - column, :-1, column] = beside[1:, row, column]
+    right = np.zeros((count, 3))
+    right[:, 0] = (temperature - middle) / _ERROR ** 2
+    found = solveh_banded(banded.reshape(6, -1), right.ravel(), lower=True)
+    rate: Floats = found[1::3] * unit[1]
+    return rate
+
+
+def _motion(step: Floats) -> tuple[Floats, Floats]:
+    """Return the (m, 3, 3) transition over each step, and the covariance that it adds."""
+    one, none = np.ones_like(step), np.zeros_like(step)
+    moved = np.array([[one, step, step ** 2 / 2.0], [none, one, step], [none, none, one]])
+    spread = np.array([[step ** 5 / 20.0, step ** 4 / 8.0, step ** 3 / 6.0],
+                       [step ** 4 / 8.0, step ** 3 / 3.0, step ** 2 / 2.0],
+                       [step ** 3 / 6.0, step ** 2 / 2.0, step]]) * _JERK
+    return np.moveaxis(moved, 2, 0), np.moveaxis(spread, 2, 0)
+
+
+def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats | None = None
+               ) -> Floats:
+    """
+    Return the low pass of a temperature, which starts in equilibrium.
+
+    Parameters
+    ----------
+    time, temperature : (n,) array
+        Time [s] and temperature [°C]; at equal times the temperature jumps.
+    lag : float
+        Time constant [s].
+    rate : (n,) array, optional
+        Rate of the temperature at these times [°C/s]; by default the temperature is linear between
+        them.
+
+    Returns
+    -------
+    (n,) array
+        The low pass [°C]; NaN where time or temperature is NaN.
+
+    """
+    found = np.full(len(time), np.nan)
+    order = np.argsort(time, kind='stable')
+    order = order[np.isfinite(time[order]) & np.isfinite(temperature[order])]
+    if len(order):
+        time, temperature = time[order], temperature[order]
+        behind = _behind(np.diff(time), np.diff(temperature), lag,
+                         None if rate is None else rate[order])
+        found[order] = temperature - _decayed(time, behind, lag, 0.0)
+    return found
+
+
+def _behind(step: Floats, rise: Floats, lag: float, rate: Floats | None) -> Floats:
+    """Return how far the low pass falls behind over each step if it starts in equilibrium."""
+    steps = step / lag
+    share = np.ones_like(steps)
+    np.divide(-np.expm1(-steps), steps, out=share, where=steps > 0.0)
+    behind: Floats = rise * share
+    if rate is None:
+        return behind
+    # Cubic Hermite: the rate is the mean rate plus a(1 - 2s) + b(1 - 6s + 6s²), s from 0 to 1,
+    # and ∫ rate exp(-(1 - s) x) ds over the step with moments M_k = ∫ s^k exp(-(1 - s) x) ds.
+    usable = step > 0.0
+    mean = np.divide(rise, step, out=np.zeros_like(rise), where=usable)
+    first, last = np.nan_to_num(rate[:-1]), np.nan_to_num(rate[1:])
+    odd, even = (first - last) / 2.0, (first + last) / 2.0 - mean
+    bent = odd * _moment(steps, (1.0, -2.0, 0.0)) + even * _moment(steps, (1.0, -6.0, 6.0))
+    return behind + np.where(usable, step * bent, 0.0)
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_SMALL = 3.0
+"""Steps up to this many lags are integrated by Gauss-Legendre; 8 points give all digits."""
+
+
+def _moment(steps: Floats, polynomial: tuple[float, float, float]) -> Floats:
+    """Return ∫ p(s) exp(-(1 - s) x) ds from 0 to 1, for p of degree 2 and each x of steps."""
+    zero, one, two = polynomial
+    s = (_NODES + 1.0) / 2.0
+    small = np.minimum(steps, _SMALL)[:, np.newaxis]
+    near = np.exp(-(1.0 - s) * small) @ ((zero + one * s + two * s * s) * _WEIGHTS / 2.0)
+    x = np.maximum(steps, _SMALL)
+    left = np.exp(-x)
+    m_0 = (1.0 - left) / x
+    m_1 = (1.0 - m_0) / x
+    m_2 = (1.0 - 2.0 * m_1) / x
+    return np.where(steps <= _SMALL, near, zero * m_0 + one * m_1 + two * m_2)
+
+
+def _decayed(time: Floats, behind: Floats, lag: float, start: float) -> Floats:
+    """Return T - A at n increasing times: `start`, then its decay plus the n - 1 steps behind."""
+    found = np.empty(len(time))
+    found[0], first = start, 0
+    while first < len(time) - 1:
+        last = max(int(np.searchsorted(time, time[first] + _LONGEST * lag)), first + 2)
+        ages = (time[first + 1:last] - time[first]) / lag
+        if last == first + 2:  # one step, of any length
+            found[first + 1] = found[first] * np.exp(-ages[0]) + behind[first]
+        else:
+            growth = np.exp(ages)
+            total = found[first] + np.cumsum(behind[first:last - 1] * growth)
+            found[first + 1:last] = total / growth
+        first = last - 1
+    return found
+
+
+class _RateFilter:
+    """Kalman filter of temperature, rate and bend (°C/s²) from averages of past samples."""
+
+    def __init__(self, time: float, temperature: float) -> None:
+        self._time = time
+        self._state = np.array([temperature, 0.0, 0.0])
+        self._spread = np.diag(np.square([_ERROR, _START_RATE, _START_BEND]))
+
+    def add(self, time: float, temperature: float) -> None:
+        """Add an average."""
+        moved, added = (each[0] for each in _motion(np.array([time - self._time])))
+        state = moved @ self._state
+        spread = moved @ self._spread @ moved.T + added
+        gain = spread[:, 0] / (spread[0, 0] + _ERROR ** 2)
+        self._state = state + gain * (temperature - state[0])
+        self._spread = spread - np.outer(gain, spread[0])
+        self._time = time
+
+    def line(self, start: float) -> tuple[float, float]:
+        """Return rate [°C/s] and bend [°C/s²] at a time."""
+        _, rate, bend = self._state.tolist()
+        return rate + bend * (start - self._time), bend
+
+
+class ThermalStream:
+    """
+    Lag and rate of the temperature of a stream of samples.
+
+    Each sample uses only itself and earlier samples. `add_all` gives the same numbers as `add`,
+    sample by sample, also if a stream is added in several parts.
+
+    Parameters
+    ----------
+    lags : mapping of str to Lag
+        Lag by column of the temperature that acts; see `accel_calib.effects.model.Model.lags`.
+    rate : bool
+        Whether the column ``temperature_rate`` is computed.
+
+    Attributes
+    ----------
+    value : dict of str to float
+        Columns at the last sample with a temperature; empty before it.
+
+    """
+
+    def __init__(self, lags: Mapping[str, Lag], *, rate: bool) -> None:
+        self._lags = lags
+        self._gives_rate = rate
+        self._uses_rate = rate or any(lag.of_sensor for lag in lags.values())
+        self.value: dict[str, float] = {}
+        self._last: tuple[float, float] | None = None
+        self._restart(math.nan)
+
+    def _restart(self, time: float) -> None:
+        self._behind = dict.fromkeys(self._lags, 0.0)
+        self._filter: _RateFilter | None = None
+        self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
+        self._line = (0.0, 0.0)
+
+    def add(self, time: float, temperature: float) -> None:
+        """Add a sample; it is ignored if its time or temperature is NaN."""
+        if not math.isfinite(time + temperature):
+            return
+        if self._last is None or time < self._last[0] - _RESTART:
+            self._restart(time)
+            self._last = time, temperature
+        before, warm = self._last
+        time = max(time, before)
+        for key, lag in self._lags.items():
+            if not lag.of_sensor:
+                self._behind[key] = _one_step(self._behind[key], time - before,
+                                              temperature - warm, lag.seconds)
+        if self._uses_rate:
+            self._average(time, temperature)
+        self._last = time, temperature
+        self._set_value(temperature)
+
+    def _average(self, time: float, temperature: float) -> None:
+        """Add a sample to the present average; a full average goes into the filter."""
+        if time >= self._begin + _BIN:
+            middle, mean = self._begin + self._times / self._count, self._sum / self._count
+            if self._filter is None:
+                self._filter = _RateFilter(middle, mean)
+            else:
+                self._filter.add(middle, mean)
+            self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
+            self._line = self._filter.line(time)
+        self._count += 1
+        self._times += time - self._begin
+        self._sum += temperature
+
+    def _set_value(self, temperature: float) -> None:
+        time = self._last[0] if self._last is not None else math.nan
+        rate = self._line[0] + self._line[1] * (time - self._begin) if self._uses_rate else 0.0
+        self.value = {key: temperature + lag.seconds * rate if lag.of_sensor
+                      else temperature - self._behind[key] for key, lag in self._lags.items()}
+        if self._gives_rate:
+            self.value['temperature_rate'] = rate
+
+    def add_all(self, time: Floats, temperature: Floats) -> dict[str, Floats]:
+        """
+        Add samples, in the order of time, and return the columns at each.
+
+        Parameters
+        ----------
+        time, temperature : (n,) array
+            Time [s] and temperature [°C]; rows without one of them have the columns NaN.
+
+        Returns
+        -------
+        dict of str to (n,) array
+            Temperatures that act [°C] and ``temperature_rate`` [°C/s].
+
+        """
+        keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))
+        found = {key: np.full(len(time), np.nan) for key in keys}
+        order = np.argsort(time, kind='stable')
+        order = order[np.isfinite(time[order] + temperature[order])]
+        if not len(order):
+            return found
+        moments, warm = time[order], temperature[order]
+        if self._last is None or moments[0] < self._last[0] - _RESTART:
+            self._restart(float(moments[0]))
+            self._last = float(moments[0]), float(warm[0])
+        moments = np.maximum(moments, self._last[0])
+        rate = self._rates(moments, warm) if self._uses_rate else np.zeros(len(warm))
+        for key, values in self._columns(moments, warm, rate).items():
+            found[key][order] = values
+        self._last = float(moments[-1]), float(warm[-1])
+        self._set_value(float(warm[-1]))
+        return found
+
+    def _columns(self, time: Floats, temperature: Floats, rate: Floats) -> dict[str, Floats]:
+        """Return the columns of sorted samples, and keep the low passes of the last one."""
+        before = self._last if self._last is not None else (time[0], temperature[0])
+        times, warm = np.append(before[0], time), np.append(before[1], temperature)
+        found = {'temperature_rate': rate} if self._gives_rate else {}
+        for key, lag in self._lags.items():
+            if lag.of_sensor:
+                found[key] = temperature + lag.seconds * rate
+                continue
+            steps = _behind(np.diff(times), np.diff(warm), lag.seconds, None)
+            behind = _decayed(times, steps, lag.seconds, self._behind[key])[1:]
+            found[key] = temperature - behind
+            self._behind[key] = float(behind[-1])
+        return found
+
+    def _rates(self, time: Floats, temperature: Floats) -> Floats:
+        """Return the rates at sorted samples, average by average."""
+        rate, first = np.empty(len(time)), 0
+        while first < len(time):
+            self._average(float(time[first]), float(temperature[first]))
+            last = max(int(np.searchsorted(time, self._begin + _BIN)), first + 1)
+            rest = slice(first + 1, last)
+            self._count += last - first - 1
+            self._times += float(np.sum(time[rest] - self._begin))
+            self._sum += float(np.sum(temperature[rest]))
+            rate[first:last] = self._line[0] + self._line[1] * (time[first:last] - self._begin)
+            first = last
+        return rate
+
+
+def _one_step(behind: float, step: float, rise: float, lag: float) -> float:
+    """Return T - A after one step of a linear temperature."""
+    steps = step / lag
+    share = -math.expm1(-steps) / steps if steps > 0.0 else 1.0
+    return behind * math.exp(-steps) + rise * share

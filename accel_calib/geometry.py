@@ -1,0 +1,111 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rotations as matrices, quaternions, roll, pitch and yaw; directions on the sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+import numpy as np
+
+from .table import Floats
+
+_VERTICAL = 1e-9
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """
+    Return the rotation matrix of fixed-axis roll, pitch and yaw [rad], as in URDF.
+
+    Returns
+    -------
+    (3, 3) array
+        It transforms from the axes of the rotated body to the fixed axes.
+
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                     [-sp, cp * sr, cp * cr]])
+
+
+def rpy_of(rotation: Floats) -> tuple[float, float, float]:
+    """
+    Return fixed-axis roll, pitch and yaw [rad]; the inverse of `rotation_from_rpy`.
+
+    At a pitch of ±90° only the sum or the difference of roll and yaw is defined; roll is then 0.
+
+    """
+    pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
+    if math.hypot(rotation[2, 1], rotation[2, 2]) < _VERTICAL:
+        return 0.0, pitch, math.atan2(-rotation[0, 1], rotation[1, 1])
+    return (math.atan2(rotation[2, 1], rotation[2, 2]), pitch,
+            math.atan2(rotation[1, 0], rotation[0, 0]))
+
+
+def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
+    """
+    Return the unit quaternion (x, y, z, w) of a rotation matrix, with w >= 0.
+
+    q qᵀ, which is linear in the matrix, is formed, and its largest column is normalised.
+
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    outer = np.array([[1 + a - e - i, b + d, c + g, h - f],
+                      [b + d, 1 - a + e - i, f + h, c - g],
+                      [c + g, f + h, 1 - a - e + i, d - b],
+                      [h - f, c - g, d - b, 1 + a + e + i]])
+    column = outer[:, int(np.argmax(np.diag(outer)))]
+    x, y, z, w = (column / np.linalg.norm(column) * (-1.0 if column[3] < 0.0 else 1.0)).tolist()
+    return x, y, z, w
+
+
+def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
+    """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any length but 0."""
+    x, y, z, w = quaternion
+    return np.eye(3) + 2.0 / (x * x + y * y + z * z + w * w) * np.array(
+        [[-y * y - z * z, x * y - w * z, x * z + w * y],
+         [x * y + w * z, -x * x - z * z, y * z - w * x],
+         [x * z - w * y, y * z + w * x, -x * x - y * y]])
+
+
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def spread_directions(count: int) -> Floats:
+    """
+    Return directions that are spread evenly over the sphere (Fibonacci lattice).
+
+    Returns
+    -------
+    (count, 3) array
+        Unit vectors.
+
+    """
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    radius, angle = np.sqrt(1.0 - z ** 2), _GOLDEN_ANGLE * np.arange(count)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+OVER_THE_SPHERE = spread_directions(300)
+"""Directions over which figures are averaged, (300, 3); not to be changed in place."""
+
+
+def unit(vectors: Floats) -> Floats:
+    """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Floats:
+    """
+    Return random directions, uniformly distributed over the sphere.
+
+    Returns
+    -------
+    (count, 3) array
+        Unit vectors.
+
+    """
+    return unit(rng.normal(size=(count, 3)))

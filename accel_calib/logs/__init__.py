@@ -1,0 +1,54 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Reader of logs: text of any dialect, bags, and flight logs of PX4 and ArduPilot.
+
+`open_log` recognises the format, the columns and the units. What it assumed is one line,
+`OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `serialized` defines the places of
+the fields in serialized messages, and `tables` writes our own tables.
+
+"""
+
+from .bag import first_frame_id, imu_topic, is_bag, lost, of_sensor, plausible_samples
+from .bag_context import context_of, ContextTopics, QUANTITIES
+from .bag_reader import Bag, damage_as_input_error, open_bag
+from .formats import NAMES
+from .incoming import LineReader
+from .read import open_log, open_own, OwnTable, read_log, read_recording
+from .records import are_samples, Log, LogOptions, OpenLog, Progress
+from .serialized import (
+    ACCELERATION,
+    ACCELERATION_COVARIANCE,
+    ANGULAR_VELOCITY,
+    ANGULAR_VELOCITY_COVARIANCE,
+    doubles_at,
+    IMU_DOUBLES,
+    joined,
+    Layout,
+    layout_of,
+    layout_with,
+    LITTLE_ENDIAN,
+    Messages,
+    NAME_AT,
+    NINE,
+    ORIENTATION,
+    ORIENTATION_COVARIANCE,
+    put_doubles,
+    renamed,
+    samples_of,
+    STAMP,
+    STAMP_AT,
+    THREE,
+)
+from .tables import read_poses, write_blocks, write_table
+
+__all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
+           'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
+           'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'QUANTITIES', 'STAMP', 'STAMP_AT',
+           'THREE', 'Bag', 'ContextTopics', 'Layout', 'LineReader', 'Log', 'LogOptions',
+           'Messages', 'OpenLog', 'OwnTable', 'Progress', 'are_samples', 'context_of',
+           'damage_as_input_error', 'doubles_at', 'first_frame_id', 'imu_topic', 'is_bag',
+           'joined', 'layout_of', 'layout_with', 'lost', 'of_sensor', 'open_bag', 'open_log',
+           'open_own', 'plausible_samples', 'put_doubles', 'read_log', 'read_poses',
+           'read_recording', 'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -1,0 +1,314 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Reader of ArduPilot flight logs (DataFlash): binary ``.bin`` on `pymavlink`, and text ``.log``.
+
+Two messages have accelerations, both in x forward, y right, z down, in m/s², and corrected by the
+stored INS_ACC parameters:
+
+=======  ===========================================================================
+message  content
+=======  ===========================================================================
+IMU      reading and angular rate of a sensor, with its temperature T
+ACC      reading of a sensor at its own rate, where LOG_BITMASK asks for raw samples
+=======  ===========================================================================
+
+Since version 4.1 the field I is the number of the sensor. Before, the second sensor has the
+messages IMU2 and ACC2. A log states the fields of each message (message FMT), which are read here.
+The text log has the same messages, one per line.
+[1] https://ardupilot.org/copter/docs/logmessages.html
+[2] https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+import re
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .flight import (
+    at,
+    AXES,
+    choose,
+    finite,
+    FlightLog,
+    is_number,
+    Message,
+    MICRO,
+    missing,
+    others,
+    RATES,
+    sound_log,
+    sound_rows,
+)
+from ..errors import InputError
+from ..table import Floats
+from ..text import counted
+
+PREFERRED = ('IMU', 'ACC')
+_READING = ('AccX', 'AccY', 'AccZ')
+_RATES = ('GyrX', 'GyrY', 'GyrZ')
+_MAGIC = b'\xa3\x95\x80'
+"""First bytes of a binary log: the head of a message FMT."""
+
+_TEXT = re.compile(r'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
+_HEAD = 8192
+_MOST_SENSORS = 255
+_NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
+_CALIBRATED = re.compile(r'INS_ACC\d?(OFFS|SCAL)_[XYZ]')
+_STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
+"""Fields with the time of a sample, the best first, and their factors to seconds."""
+
+_SCALES = {'c': 1e-2, 'C': 1e-2, 'e': 1e-2, 'E': 1e-2, 'L': 1e-7}
+_TYPES = {'b': 'i1', 'B': 'u1', 'M': 'u1', 'h': '<i2', 'H': '<u2', 'c': '<i2', 'C': '<u2',
+          'i': '<i4', 'I': '<u4', 'L': '<i4', 'e': '<i4', 'E': '<u4', 'f': '<f4', 'd': '<f8',
+          'g': '<f2', 'q': '<i8', 'Q': '<u8', 'n': 'S4', 'N': 'S16', 'Z': 'S64', 'a': 'S64'}
+"""Types of the fields, from the letters of a message FMT [2]."""
+
+_Table = dict[str, NDArray[Any]]
+
+
+def is_dataflash(path: Path) -> bool:
+    """Return whether a file is an ArduPilot log, binary or text, from its first bytes."""
+    return path.is_file() and _kind(path) != ''
+
+
+def _kind(path: Path) -> Literal['binary', 'text', '']:
+    """Return the kind of an ArduPilot log; empty for other files."""
+    with path.open('rb') as file:
+        head = file.read(_HEAD)
+    if head.startswith(_MAGIC):
+        return 'binary'
+    return 'text' if _TEXT.search(head.decode('latin-1')) else ''
+
+
+@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
+def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
+    """
+    Read the accelerations of one sensor of an ArduPilot log.
+
+    Parameters
+    ----------
+    path : Path
+        The ``.bin`` or ``.log`` file.
+    topic : {'', 'IMU', 'ACC'}
+        Name of the message; by default IMU if it is dense enough, otherwise ACC.
+    sensor : str
+        Number of the sensor; by default the lowest. Another text is a name for the sensor.
+
+    Returns
+    -------
+    FlightLog
+        The samples in m/s².
+
+    Raises
+    ------
+    InputError
+        If the file is damaged or has no such message, or pymavlink is not installed (binary logs
+        only).
+    OSError
+        If the file cannot be read.
+
+    """
+    kind = _kind(path)
+    if not kind:
+        raise InputError(f'{path} has no messages FMT, expected an ArduPilot log (.bin or .log)',
+                         'check that this is the intended file')
+    tables, notes = _binary(path) if kind == 'binary' else _text(path)
+    found = _messages(tables)
+    chosen = choose(found, PREFERRED, topic, sensor, str(path))
+    columns = {key: np.asarray(chosen.fields[name], float) for key, name in zip(AXES, _READING)}
+    valid = sound_rows(columns)
+    if not np.all(valid):
+        notes.append(f'{counted(int(np.sum(~valid)), "row")} of {chosen} left out: the reading '
+                     'is not a number')
+    time = chosen.time[valid]
+    warm = _temperature(chosen, time, found)
+    name = sensor if sensor and not is_number(sensor, found) else str(chosen)
+    read_as = (f'ArduPilot log, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, x forward, y right, '
+               'z down' + (', temperature T' if warm else ''))
+    notes += [*others(chosen, found, PREFERRED), *_corrected(tables)]
+    return FlightLog({'time': time, **{key: values[valid] for key, values in columns.items()},
+                      **_rates(chosen, time, found), **warm}, 'm/s2', name, read_as,
+                     tuple(notes))
+
+
+def _messages(tables: Mapping[str, _Table]) -> list[Message]:
+    """Return the messages of each sensor: by the field I, or by the number in the name."""
+    found = []
+    for name, table in tables.items():
+        match = _NAME.fullmatch(name)
+        stamp = next((key for key in _STAMPS if key in table), '')
+        needed = _RATES if name.startswith('GYR') else _READING
+        if not match or not stamp or not set(needed) <= set(table):
+            continue
+        instances = _instances(table, len(table[stamp]), max(int(match[2] or 1) - 1, 0))
+        for instance in np.unique(instances).tolist():
+            of = instances == instance
+            time = table[stamp][of].astype(float) * _STAMPS[stamp]
+            found.append(Message(match[1], instance, {key: values[of] for key, values
+                                                      in table.items()}, time))
+    return found
+
+
+def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
+    """Return the number of the sensor of each message; damaged numbers are 0."""
+    stated = table.get('I', np.full(count, number))
+    if stated.dtype.kind not in 'iuf':
+        return np.full(count, number)
+    return np.clip(np.nan_to_num(stated.astype(float)), 0.0, _MOST_SENSORS).astype(np.int64)
+
+
+def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
+    """Return the temperature that IMU of the same sensor reports."""
+    for each in found:
+        name = next((key for key in ('T', 'Temp') if key in each.fields), '')
+        if (each.name, each.instance) == ('IMU', chosen.instance) and name:
+            values = each.fields[name]
+            if finite(values) and np.any(values):
+                return {'temperature': at(time, each, values)}
+    return {}
+
+
+def _rates(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
+    """Return the angular rates of IMU, or of GYR with the same number, if they are as dense."""
+    for each in (chosen, *found):
+        if (each.instance == chosen.instance and set(_RATES) <= set(each.fields)
+                and each.rate_hz >= 0.5 * chosen.rate_hz):
+            rates = {key: np.asarray(each.fields[name], float)
+                     for key, name in zip(RATES, _RATES)}
+            if finite(*rates.values()):
+                return {key: at(time, each, values) for key, values in rates.items()}
+    return {}
+
+
+def _corrected(tables: Mapping[str, _Table]) -> list[str]:
+    """Return a note on the calibration that the readings hold already."""
+    values = _parameters(tables.get('PARM', {}))
+    stored = {name: value for name, value in values.items() if _CALIBRATED.fullmatch(name)
+              and value != (1.0 if 'SCAL' in name else 0.0)}
+    if not values:
+        return ['readings are corrected by the INS_ACC parameters that the vehicle had']
+    if not stored:
+        return []
+    shown = ', '.join(f'{name} {value:.4g}' for name, value in sorted(stored.items())[:3])
+    more = f' and {len(stored) - 3} more' if len(stored) > 3 else ''
+    return [f'readings are corrected by the parameters of the vehicle: {shown}{more}']
+
+
+def _parameters(table: _Table) -> dict[str, float]:
+    """Return the parameters by name."""
+    if 'Name' not in table or 'Value' not in table:
+        return {}
+    names = [name.decode('latin-1') if isinstance(name, bytes) else str(name)
+             for name in table['Name'].tolist()]
+    try:
+        return dict(zip(names, table['Value'].astype(float).tolist()))
+    except ValueError:  # a damaged line of text; only a note depends on the parameters
+        return {}
+
+
+def _wanted(name: str) -> bool:
+    return name == 'PARM' or bool(_NAME.fullmatch(name))
+
+
+def _indexed(path: Path) -> Any:
+    """Return the log of pymavlink, which knows where each message begins."""
+    try:
+        from pymavlink.DFReader import DFReader_binary
+    except ImportError as err:
+        raise missing('pymavlink', 'ArduPilot logs (.bin)', err) from err
+
+    class Index(DFReader_binary):  # type: ignore[misc]
+        def init_clock(self) -> None:
+            """Skip the search for a GPS time, which parses a whole log that has none."""
+
+    with sound_log(path, 'an ArduPilot log (.bin)'):
+        log = Index(str(path))
+        log.close()
+    return log
+
+
+def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
+    """Return the fields of the messages of a binary log."""
+    log = _indexed(path)
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    tables, cut = {}, 0
+    for number, form in log.formats.items():
+        starts = np.array(log.offsets[number], dtype=np.int64) + 3
+        if not _wanted(form.name) or not len(starts) or not _is_sound(form):
+            continue
+        layout = _layout(form.format, form.columns)
+        whole = starts[starts + layout.itemsize <= len(data)]
+        cut += len(starts) - len(whole)
+        rows = data[whole[:, np.newaxis] + np.arange(layout.itemsize)]
+        tables[form.name] = _scaled(rows.view(layout)[:, 0], form.format, form.columns)
+    notes = [f'{counted(cut, "message")} cut off at the end'] if cut else []
+    known = sum(len(log.offsets[number]) * form.len for number, form in log.formats.items())
+    if known < len(data):
+        notes.append(f'{counted(len(data) - known, "byte")} between messages left out')
+    return tables, notes
+
+
+def _is_sound(form: Any) -> bool:
+    """Return whether a message has one letter for each field, and a name of its own for each."""
+    return all(form.columns) and len(form.format) == len(form.columns) == len(set(form.columns))
+
+
+def _layout(letters: str, names: Sequence[str]) -> np.dtype[Any]:
+    """Return the type of a message from its letters and the names of its fields."""
+    return np.dtype([(name, _TYPES[letter]) for name, letter in zip(names, letters)])
+
+
+def _scaled(rows: NDArray[Any], letters: str, names: Sequence[str]) -> _Table:
+    """Return the fields of a message, in the units that their letters imply."""
+    return {name: rows[name] * _SCALES[letter] if letter in _SCALES else rows[name]
+            for name, letter in zip(names, letters)}
+
+
+def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
+    """Return the fields of the messages of a text log: ``IMU, 123456, 0, …`` on each line."""
+    names: dict[str, list[str]] = {}
+    lines: dict[str, list[str]] = {}
+    notes: list[str] = []
+    with path.open(encoding='latin-1') as file:
+        for line in file:
+            if not line.endswith('\n'):
+                notes.append('the last line left out: it has no end')
+                break
+            kind, _, rest = line.partition(',')
+            if kind == 'FMT':
+                cells = [cell.strip() for cell in rest.split(',')]
+                if len(cells) > 4 and _wanted(cells[2]):
+                    names[cells[2]] = cells[4:]
+            elif kind in names:
+                lines.setdefault(kind, []).append(rest)
+    tables: dict[str, _Table] = {}
+    bad = 0
+    for kind, rows in lines.items():
+        sound = [row for row in rows if row.count(',') == len(names[kind]) - 1]
+        bad += len(rows) - len(sound)
+        if sound:
+            tables[kind] = _parsed(path, kind, names[kind], sound)
+    if bad:
+        notes.append(f'{counted(bad, "line")} of another length left out')
+    return tables, notes
+
+
+def _parsed(path: Path, kind: str, names: Sequence[str], rows: Sequence[str]) -> _Table:
+    """Return the fields of the lines of one message; only those of PARM are not all numbers."""
+    if kind == 'PARM':
+        cells = [[cell.strip() for cell in row.split(',')] for row in rows]
+        return dict(zip(names, np.array(cells, dtype=str).reshape(-1, len(names)).T))
+    try:
+        numbers = np.loadtxt(rows, delimiter=',', ndmin=2, comments=None)
+    except ValueError as err:
+        raise InputError(f'{path}: message {kind}: {err}, expected numbers',
+                         'correct the line or remove it') from err
+    return dict(zip(names, numbers.reshape(-1, len(names)).T))

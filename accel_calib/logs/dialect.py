@@ -1,0 +1,405 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Dialect of a text table: where the table begins, and how its cells are parted.
+
+`layout_of` decides from the first lines of a file, its head. It finds the header line, the
+delimiter, the decimal mark and the first line of numbers.
+
+`csv.Sniffer` is not used: it needs many equal rows, and takes a letter, a decimal mark or a blank
+for the delimiter. The delimiter here is that of a header line with known names, or else the one
+whose cells are numbers in most lines. `csv` splits lines with quotes.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+import csv
+from dataclasses import dataclass, field
+import json
+import math
+from pathlib import Path
+import re
+from typing import Any
+
+from .clock import is_clock
+from ..errors import InputError
+from ..text import counted
+from ..units import UNIT_NAMES
+
+DELIMITERS = (';', '\t', '|', ',', '')
+"""Delimiters in the order of preference; the empty one is any run of blanks."""
+
+_DELIMITER_WORDS = {'\t': 'tab', '': 'blanks', '|': "'|'", ';': "';'"}
+_COMMENTS = ('#', '//', '%')
+_TRIED_LINES = 200
+"""Number of lines from which the delimiter and the decimal mark are found."""
+
+_SAMPLE_ROWS = 5
+_MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
+"""Time that the serial monitor of the Arduino IDE puts before a line."""
+
+_LABEL = re.compile(r'(?:^|(?<=[\s,;|]))[A-Za-z_][A-Za-z_0-9 .]*?\s*[:=]\s*(?=[-+.\d])')
+"""Name before a number, as the serial plotter of the Arduino IDE has it: ``ax:0.01``."""
+
+_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?', re.ASCII)
+_LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan|inf)',
+                          re.ASCII | re.IGNORECASE)
+_DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
+_UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
+_UNREADABLE_SHARE = 0.3
+_SHOWN_NAMES = 12
+_SHOWN_CHARACTERS = 40
+_ABOUT = ('units', 'sensor')
+
+IsHeader = Callable[[Sequence[str]], bool]
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """
+    How the cells of a table are parted.
+
+    Parameters
+    ----------
+    delimiter : str
+        Delimiter of the cells; empty for any run of blanks.
+    monitor, labelled : bool
+        Whether each line begins with the time of a serial monitor, and whether each number
+        follows its name.
+
+    """
+
+    delimiter: str
+    monitor: bool = False
+    labelled: bool = False
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line, without quotes and blanks around them."""
+        return split(self.plain(line), self.delimiter)
+
+    def plain(self, line: str) -> str:
+        """Return a line without names, and with the time of a monitor as its first cell."""
+        if self.monitor:
+            line = _MONITOR.sub(lambda found: found[1] + (self.delimiter or ' '), line)
+        return _LABEL.sub('', line) if self.labelled else line
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Where the table of a text file begins, and how its cells are parted.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    dialect : Dialect
+        How the cells are parted.
+    decimal : {'.', ',', ''}
+        Decimal mark; empty if the first rows have whole numbers only.
+    header : tuple of str
+        Names of the columns; empty if there is no header.
+    units_row : tuple of str
+        Cells of a row of units below the header; empty if there is none.
+    width : int
+        Number of cells in a row.
+    start : int
+        Number of lines before the first row.
+    encoding : str
+        Encoding of the text.
+    about : mapping
+        Units and sensor from the comments.
+    notes : tuple of str
+        What was skipped before the table.
+    sample : tuple of tuple of str
+        Cells of the first rows.
+
+    """
+
+    path: Path
+    dialect: Dialect
+    decimal: str
+    header: tuple[str, ...]
+    units_row: tuple[str, ...]
+    width: int
+    start: int
+    encoding: str = 'utf-8'
+    about: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    sample: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def words(self) -> list[str]:
+        """Return what differs from a plain CSV table."""
+        found = []
+        if self.encoding not in ('utf-8', 'utf-8-sig'):
+            found.append(self.encoding.upper())
+        if self.dialect.delimiter != ',':
+            found.append(_DELIMITER_WORDS[self.dialect.delimiter])
+        if self.decimal == ',':
+            found.append('decimal comma')
+        if self.dialect.labelled:
+            found.append('names before the numbers')
+        return found if self.header else [*found, 'no header']
+
+    def name(self, column: int) -> str:
+        """Return the name of a column, or its number from 1."""
+        has_name = column < len(self.header) and self.header[column]
+        return short(self.header[column]) if has_name else str(column + 1)
+
+
+def split(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, without quotes and blanks around them."""
+    if '"' in line:
+        try:
+            found = next(csv.reader([line], delimiter=delimiter or ' ', skipinitialspace=True), [])
+        except csv.Error:  # A cell is longer than 131,072 characters.
+            found = line.split(delimiter or None)
+        return [cell.strip() for cell in found]
+    return [cell.strip() for cell in line.split(delimiter)] if delimiter else line.split()
+
+
+def is_number(text: str) -> bool:
+    """Return whether a cell is a finite number, with a decimal point."""
+    return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
+
+
+def is_comment(line: str) -> bool:
+    """Return whether a line is a comment."""
+    return line.startswith(_COMMENTS)
+
+
+def short(text: str) -> str:
+    """Return the beginning of a text for a message, without characters that cannot be read."""
+    text = _UNREADABLE.sub('', text[:10 * _SHOWN_CHARACTERS]).strip()
+    return text if len(text) <= _SHOWN_CHARACTERS else f'{text[:_SHOWN_CHARACTERS]}…'
+
+
+def shown(names: Sequence[str]) -> str:
+    """Return the names of columns for a message."""
+    more = [f'… ({len(names)} columns)'] if len(names) > _SHOWN_NAMES else []
+    return ', '.join([*map(short, names[:_SHOWN_NAMES]), *more])
+
+
+def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str, *,
+              strict: bool, expected: str) -> Layout:
+    """
+    Return where a table begins, and how its cells are parted.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    head : sequence of str
+        The first lines.
+    is_header : function
+        Returns whether cells are the names of the columns of a log.
+    encoding : str
+        Encoding of the text.
+    strict : bool
+        Whether the first line must be the header; otherwise other lines may come before it.
+    expected : str
+        Example of a header line, for error messages.
+
+    Raises
+    ------
+    InputError
+        If there is no table of numbers.
+
+    """
+    _check_text(path, head, expected)
+    finder = _Finder(head, is_header)
+    found = (finder.strict() if strict else
+             finder.named() or finder.unnamed() or finder.narrow())
+    if found is None:
+        raise InputError(f'{path} has no table of numbers in its first '
+                         f'{counted(len(head), "line")}, expected a header line such as '
+                         f'{expected} and one row for each pose or sample',
+                         'check that this is the intended file')
+    start = found.line if strict else finder.data_from(found)
+    passed = [k for k in finder.plain if k < start and k != found.at]
+    rows = [found.dialect.cells(head[k]) for k in finder.plain if k >= start]
+    return Layout(path, found.dialect, _decimal(rows[:_TRIED_LINES]), found.header,
+                  finder.units_row(found, start), _width(found.header, rows), start, encoding,
+                  _about(path, [line for line in head if line[0] == '#']),
+                  _passed_over([head[k] for k in passed]), tuple(map(tuple, rows[:_SAMPLE_ROWS])))
+
+
+def _check_text(path: Path, head: Sequence[str], expected: str) -> None:
+    """Check that the head is text, and not empty."""
+    bad = sum(len(_UNREADABLE.findall(line)) for line in head)
+    if bad > _UNREADABLE_SHARE * sum(map(len, head)):
+        raise InputError(f'{path} is not a text file, expected a CSV table',
+                         'use a CSV table or a bag')
+    if all(line.isspace() or line[0] == '#' for line in head):
+        raise InputError(f'{path} is empty, expected a header line such as {expected} and one row '
+                         'for each pose or sample', 'check that this is the intended file')
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Dialect, names, the first line after them, and the index of the header line (or -1)."""
+
+    dialect: Dialect
+    header: tuple[str, ...]
+    line: int
+    at: int = -1
+
+
+class _Finder:
+    """Finds the header line and the delimiter in the first lines of a file."""
+
+    def __init__(self, head: Sequence[str], is_header: IsHeader) -> None:
+        self.head, self.is_header = head, is_header
+        self.filled = [k for k, line in enumerate(head) if not line.isspace()]
+        self.plain = [k for k in self.filled if not is_comment(head[k])]
+        timed = sum(_MONITOR.match(head[k]) is not None for k in self.plain)
+        self.monitor = timed > len(self.plain) / 2
+
+    def strict(self) -> _Found:
+        """Return the names in the first line."""
+        first = next(k for k in self.filled if self.head[k][0] != '#')
+        fitting = [each for each in DELIMITERS if self.is_header(split(self.head[first], each))]
+        delimiter = fitting[0] if fitting else ','
+        return _Found(Dialect(delimiter), tuple(split(self.head[first], delimiter)), first + 1,
+                      first)
+
+    def named(self) -> _Found | None:
+        """Return the names in the first line with known names."""
+        for k in self.filled:
+            if not any(map(str.isalpha, self.head[k][:1000])):
+                continue
+            for delimiter in DELIMITERS:
+                dialect = Dialect(delimiter, self.monitor)
+                cells = self._names(k, dialect)
+                if (_are_names(cells) and self.is_header(cells)
+                        and (self._fits(k + 1, dialect, cells)
+                             or (delimiter and not is_comment(self.head[k])))):
+                    return _Found(dialect, tuple(cells), k + 1, k)
+        return None
+
+    def _names(self, k: int, dialect: Dialect) -> list[str]:
+        """Return the cells of a header line; a time in front of them is the name of the times."""
+        line = self.head[k].lstrip('#/% ') if is_comment(self.head[k]) else self.head[k]
+        cells = dialect.cells(line)
+        return ['time', *cells[1:]] if dialect.monitor and is_clock(cells[0]) else cells
+
+    def _fits(self, start: int, dialect: Dialect, cells: Sequence[str]) -> bool:
+        """Return whether the next row has as many cells as a header."""
+        following = next((k for k in self.plain if k >= start), None)
+        return following is not None and len(cells) == len(dialect.cells(self.head[following]))
+
+    def unnamed(self) -> _Found | None:
+        """Return the dialect in which most lines are rows of numbers, and their names, if any."""
+        step = max(1, len(self.plain) // _TRIED_LINES)
+        lines = [self.head[k] for k in self.plain[::-step]]
+        best: tuple[int, int, Dialect] | None = None
+        for labelled in (False, True):
+            for delimiter in DELIMITERS:
+                dialect = Dialect(delimiter, self.monitor, labelled)
+                widths = Counter(filter(None, (_row_width(dialect.cells(line))
+                                               for line in lines)))
+                width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
+                if count > (best[0] if best else 0):
+                    best = count, width, dialect
+        if best is None:
+            return None
+        _, width, dialect = best
+        first = next((k for k in self.plain if _row_width(dialect.cells(self.head[k])) == width),
+                     self.plain[-1])
+        return self._with_names(dialect, first, width)
+
+    def _with_names(self, dialect: Dialect, first: int, width: int) -> _Found:
+        """Return the dialect with the names in the last line before the numbers, if any."""
+        if dialect.labelled:
+            line = _MONITOR.sub('', self.head[first])
+            names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
+            return _Found(dialect, (*(('time',) if self.monitor else ()), *names), first)
+        for k in reversed([k for k in self.filled if k < first]):
+            cells = self._names(k, dialect)
+            if len(cells) == width and _are_names(cells):
+                return _Found(dialect, tuple(cells), first, k)
+        return _Found(dialect, (), first)
+
+    def narrow(self) -> _Found | None:
+        """Return the first line as the names of a table with too few columns, or None."""
+        numbers = [k for k in self.plain if any(map(_LIKE_NUMBER.fullmatch,
+                                                    split(self.head[k], ',')))]
+        if not numbers:
+            return None
+        if numbers[0] == self.plain[0]:
+            return _Found(Dialect(','), (), self.plain[0])
+        return self.strict()
+
+    def data_from(self, found: _Found) -> int:
+        """Return the index of the first row; a line without numbers is none."""
+        rows = [k for k in self.plain if k >= found.line]
+        return next((k for k in rows if any(map(_LIKE_NUMBER.fullmatch,
+                                                found.dialect.cells(self.head[k])))),
+                    rows[0] if rows else len(self.head))
+
+    def units_row(self, found: _Found, start: int) -> tuple[str, ...]:
+        """Return the cells of a line between header and rows that can hold units."""
+        if found.at < 0:
+            return ()
+        between = (found.dialect.cells(self.head[k]) for k in self.plain if found.at < k < start)
+        return next((tuple(cells) for cells in between if len(cells) == len(found.header)), ())
+
+
+def _are_names(cells: Sequence[str]) -> bool:
+    """Return whether cells can be names: three or more, and no numbers."""
+    return len(cells) >= 3 and not any(map(_LIKE_NUMBER.fullmatch, cells))
+
+
+def _row_width(cells: Sequence[str]) -> int:
+    """Return the number of cells of a row of numbers; 0 for other lines."""
+    numbers = sum(_LIKE_NUMBER.fullmatch(cell) is not None for cell in cells)
+    others = sum(bool(cell) and not is_clock(cell) for cell in cells) - numbers
+    return len(cells) if numbers >= 3 and others <= numbers else 0
+
+
+def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
+    """Return the number of cells in a row; a delimiter at the end of each line may add one."""
+    if not header:
+        return Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+    if rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows):
+        return len(header) + 1
+    if rows and not header[-1] and all(len(row) == len(header) - 1 for row in rows):
+        return len(header) - 1
+    return len(header)
+
+
+def _decimal(rows: Sequence[Sequence[str]]) -> str:
+    """Return the decimal mark of the rows; empty if all numbers are whole."""
+    found = (_DECIMAL.fullmatch(cell) for row in rows for cell in row)
+    marks = {match[1] for match in found if match}
+    return ',' if ',' in marks else '.' if marks else ''
+
+
+def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
+    """Return a note about the lines that are no part of the table."""
+    if not lines:
+        return ()
+    words = short(lines[0])
+    return (f'skipped {counted(len(lines), "line")} before the table'
+            + (f': {words!r}' if len(lines) == 1 else f', the first is {words!r}'),)
+
+
+def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
+    """Return units and sensor from the comments."""
+    about = {}
+    for line in comments:
+        name, colon, text = line[1:].partition(':')
+        if colon and name.strip() in _ABOUT:
+            try:
+                about[name.strip()] = json.loads(text)
+            except ValueError:
+                continue  # an ordinary comment
+    if about.get('units', '') not in ('', *UNIT_NAMES):
+        raise InputError(f'{path} has the units {about["units"]!r}, expected one of '
+                         f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')
+    return about

@@ -1,0 +1,355 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Layouts of the text logs of phones, autopilots and small boards, as their makers document them.
+
+A maker has a `LogFormat` for each layout of a text log. `recognise` returns the layout whose
+columns a header has, and `named` the layout that the user names. A layout only states what the
+names in the file mean. A unit that the maker leaves to the user's settings is empty, and the
+reader finds it from the readings at rest.
+
+**Frames.** A specific force is +1 g along the axis that points up. Phones (phyphox, Sensor Logger
+on Android, MATLAB Mobile) and Betaflight log this sign with z up. PX4 and ArduPilot log this sign
+with z down, so that a level vehicle reads -1 g on z. iOS itself (CoreMotion) has the opposite
+sign: a phone that lies with its screen up reads -1 g on z. No fit depends on the sign. A flat pose
+does, and `LogFormat.frame` names the frame for it.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Literal
+
+from ..errors import InputError
+from ..units import UnitName
+
+AXES = ('x', 'y', 'z')
+READING = ('ax', 'ay', 'az')
+RATE = ('gx', 'gy', 'gz')
+MICRO = 1e-6
+MILLI = 1e-3
+NANO = 1e-9
+DEGREE = 0.017453292519943295
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """
+    One layout of a text log.
+
+    Parameters
+    ----------
+    name : str
+        Name of the maker or tool, as ``--format`` has it.
+    source : str
+        Address of the maker's documentation of the layout.
+    columns : mapping of str to str
+        Name in the file of each of our columns: ``time``, ``ax`` to ``gz``, ``temperature``.
+    scales : mapping of str to float
+        Factor from the unit of the file to ours, for the columns other than the reading that need
+        one. A time without a factor is in a unit that the reader recognises.
+    units : {'m/s2', 'g', 'native', ''}
+        Unit of the reading; empty if the file does not determine it.
+    marks : tuple of str
+        Names that together make the layout plain. The columns are looked for as well.
+    without_gravity : tuple of str
+        Names of the maker's columns of acceleration without gravity, and names of its files of
+        it (ending in ``.csv``).
+    other_sensors : tuple of str
+        Names of the maker's files of other sensors with the same columns.
+    record : str
+        What to record or to use instead of such files.
+    divisors : mapping of str to str
+        Name in the file of the column by which one of our columns is divided, if any.
+    instance : str
+        Name of the column with the number of the sensor, if rows of several sensors alternate.
+    frame : {'ros', 'win8', ''}
+        The ``--frame`` for a flat pose, if a level device does not read +1 g on z.
+    note : str
+        What else a user should know.
+    plain : bool
+        Whether the names alone determine the layout; otherwise it is used only where the user
+        names it.
+
+    """
+
+    name: str
+    source: str
+    columns: Mapping[str, str]
+    scales: Mapping[str, float]
+    units: UnitName | Literal['']
+    marks: tuple[str, ...] = ()
+    without_gravity: tuple[str, ...] = ()
+    other_sensors: tuple[str, ...] = ()
+    record: str = ''
+    divisors: Mapping[str, str] = field(default_factory=dict)
+    instance: str = ''
+    frame: Literal['ros', 'win8', ''] = ''
+    note: str = ''
+    plain: bool = True
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Names that a header of this layout has, in any order."""
+        ours = [self.columns[key] for key in ('time', *READING) if key in self.columns]
+        return tuple(dict.fromkeys((*ours, *self.divisors.values(), *self.marks)))
+
+    def fits(self, header: Sequence[str]) -> bool:
+        """Return whether a header has the names of this layout; case and spacing are ignored."""
+        given = {folded(name) for name in header}
+        return bool(self.columns) and {folded(name) for name in self.needed} <= given
+
+    def present(self, header: Sequence[str]) -> dict[str, str]:
+        """Return the columns of this layout in a header, with the spelling of the header."""
+        spelled = {folded(name): name for name in reversed(header)}
+        return {key: spelled[folded(name)] for key, name in self.columns.items()
+                if folded(name) in spelled}
+
+
+def folded(name: str) -> str:
+    """Return a name without quotes, in lower case, with single spaces."""
+    return ' '.join(name.strip().strip('"\'').split()).casefold().replace('²', '^2')
+
+
+def _axes(pattern: str, keys: Sequence[str] = READING, names: Sequence[str] = AXES
+          ) -> dict[str, str]:
+    """Return a name for each axis; ``{}`` in the pattern stands for the axis."""
+    return {key: pattern.replace('{}', name) for key, name in zip(keys, names)}
+
+
+_BY_NUMBER = ('0', '1', '2')
+
+# ---------------------------------------------------------------------------- phyphox
+# The data sets of the app's own experiments, and of those made with "Add simple experiment".
+# Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
+
+_PHYPHOX = 'https://github.com/phyphox/phyphox-android'
+_PHYPHOX_RECORD = "record 'Acceleration with g' (Raw sensors) in phyphox"
+_PHYPHOX_WITHOUT = (*_axes('Linear Acceleration {} (m/s^2)').values(), 'Linear Acceleration.csv',
+                    'Linear Accelerometer.csv', 'Acceleration without g.csv')
+
+_PHYPHOX_FORMATS = (
+    LogFormat('phyphox', _PHYPHOX,
+              {'time': 'Time (s)', **_axes('Acceleration {} (m/s^2)')}, {'time': 1.0}, 'm/s2',
+              (), _PHYPHOX_WITHOUT, record=_PHYPHOX_RECORD),
+    LogFormat('phyphox', _PHYPHOX,
+              {'time': 'Time (s)', **_axes('{} (m/s^2)')}, {'time': 1.0}, 'm/s2',
+              (), _PHYPHOX_WITHOUT, record=_PHYPHOX_RECORD),
+)
+
+# ---------------------------------------------------------------------- Sensor Logger
+# One file per sensor with the same header; the name of the file is the name of the sensor.
+
+_LOGGER = 'https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md'
+
+_LOGGER_FORMATS = (
+    LogFormat('sensor-logger', _LOGGER,
+              {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '',
+              ('time',), ('Accelerometer.csv',),
+              ('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
+               'MagnetometerUncalibrated.csv'),
+              'use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor '
+              'Logger',
+              note='Readings in g are those of an iPhone, with the opposite sign: a flat pose '
+                   'needs --frame win8.'),
+)
+
+# ---------------------------------------------------------------------- MATLAB Mobile
+# The timetable Acceleration, written by writetimetable; or sensorlog_accel_*.csv of a phone's
+# local log, where the time is in ms of Unix time.
+
+_MATLAB = 'https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html'
+
+_MATLAB_FORMATS = (
+    LogFormat('matlab', _MATLAB, {'time': 'Timestamp', **_axes('{}', names=('X', 'Y', 'Z'))}, {},
+              'm/s2', plain=False),
+    LogFormat('matlab', _MATLAB, {'time': 'Time', **_axes('{}', names=('X', 'Y', 'Z'))}, {},
+              'm/s2', plain=False),
+)
+
+# ------------------------------------------------------------------------------- PX4
+# One file for each topic, <log>_<topic>_<instance>.csv, written by ulog2csv of pyulog; the columns
+# are the fields of the message.
+
+_PX4 = 'https://docs.px4.io/main/en/msg_docs/'
+_FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g on z; --flat '
+        'turns them to x forward, y left, z up.')
+
+_PX4_FORMATS = (
+    LogFormat('px4', _PX4 + 'SensorAccel',
+              {'time': 'timestamp', **_axes('{}'), 'temperature': 'temperature'},
+              {'time': MICRO}, 'm/s2', ('device_id', 'error_count'), frame='ros', note=_FRD),
+    LogFormat('px4', _PX4 + 'SensorCombined',
+              {'time': 'timestamp', **_axes('accelerometer_m_s2[{}]', names=_BY_NUMBER),
+               **_axes('gyro_rad[{}]', RATE, _BY_NUMBER)},
+              {'time': MICRO}, 'm/s2', frame='ros',
+              note='Readings are corrected by the stored CAL_ACC parameters; those of '
+                   f'sensor_accel are not. {_FRD}'),
+    LogFormat('px4', _PX4 + 'VehicleImu',
+              {'time': 'timestamp', **_axes('delta_velocity[{}]', names=_BY_NUMBER),
+               **_axes('delta_angle[{}]', RATE, _BY_NUMBER)},
+              {'time': MICRO, **dict.fromkeys((*READING, *RATE), 1.0 / MICRO)}, 'm/s2',
+              divisors={**dict.fromkeys(READING, 'delta_velocity_dt'),
+                        **dict.fromkeys(RATE, 'delta_angle_dt')}, frame='ros', note=_FRD),
+    LogFormat('px4', _PX4 + 'VehicleAcceleration',
+              {'time': 'timestamp', **_axes('xyz[{}]', names=_BY_NUMBER)},
+              {'time': MICRO}, 'm/s2', ('timestamp_sample',), frame='ros', note=_FRD),
+)
+
+# -------------------------------------------------------------------------- ArduPilot
+# mavlogdump.py --format csv --types IMU (or ACC) writes the fields of the message after its own
+# timestamp.
+
+_ARDUPILOT = 'https://ardupilot.org/copter/docs/logmessages.html'
+_CORRECTED = f'Readings are corrected by the stored INS_ACC parameters. {_FRD}'
+_ACC = _axes('Acc{}', names=('X', 'Y', 'Z'))
+
+_ARDUPILOT_FORMATS = (
+    LogFormat('ardupilot', _ARDUPILOT + '#imu',
+              {'time': 'TimeUS', **_ACC, **_axes('Gyr{}', RATE, ('X', 'Y', 'Z')),
+               'temperature': 'T'},
+              {'time': MICRO}, 'm/s2', ('GyrX',), instance='I', frame='ros', note=_CORRECTED),
+    LogFormat('ardupilot', _ARDUPILOT + '#acc', {'time': 'SampleUS', **_ACC}, {'time': MICRO},
+              'm/s2', ('TimeUS',), instance='I', frame='ros', note=_CORRECTED),
+    LogFormat('ardupilot', _ARDUPILOT, {'time': 'TimeUS', **_ACC}, {'time': MICRO}, 'm/s2',
+              instance='I', frame='ros', note=_CORRECTED),
+)
+
+# ------------------------------------------------------------------------- Betaflight
+# blackbox_decode, whose options --unit-frame-time, --unit-acceleration and --unit-rotation add the
+# unit to the name, and the export of the Blackbox Explorer. Without units the readings are counts
+# (acc_1G of the log's header per g), and the unit of the gyro is not in the file.
+
+_BETAFLIGHT = 'https://github.com/betaflight/blackbox-tools'
+_BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
+_BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
+_BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
+
+
+def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
+    """Return the layout with these units in the names of its columns."""
+    columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
+    scales = {'time': _BLACKBOX_TIMES[time]}
+    turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER)
+    if rate:
+        columns |= turns
+        scales |= dict.fromkeys(RATE, _BLACKBOX_RATES[rate])
+    note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
+    return LogFormat('betaflight', _BETAFLIGHT, columns, scales, _BLACKBOX_UNITS[unit],
+                     tuple(turns.values()) if rate else ('loopIteration',), note=note)
+
+
+_BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_TIMES
+                            for unit in _BLACKBOX_UNITS for rate in _BLACKBOX_RATES)
+
+# ------------------------------------------------------------------- ESP32 and Arduino
+# A sketch prints the names and units that its author chose, so that the table of names finds the
+# columns (none are listed here), and the readings at rest determine the unit.
+
+_ESP32_FORMATS = (
+    LogFormat('esp32', 'https://github.com/ElectronicCats/mpu6050', {}, {}, '', plain=False),
+)
+
+FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, *_LOGGER_FORMATS, *_MATLAB_FORMATS,
+                                  *_PX4_FORMATS, *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS,
+                                  *_ESP32_FORMATS)
+
+NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
+"""Names of the formats, as ``--format`` has them."""
+
+
+def recognise(header: Sequence[str]) -> LogFormat | None:
+    """Return the layout whose names a header has, or None; the one with most names, if several."""
+    fitting = [each for each in FORMATS if each.plain and each.fits(header)]
+    return _closest(fitting, header) if fitting else None
+
+
+def named(name: str, header: Sequence[str], source: str) -> LogFormat:
+    """
+    Return the layout of a maker that a header has.
+
+    Parameters
+    ----------
+    name : str
+        Name of the maker, one of `NAMES`.
+    header : sequence of str
+        Names in the file.
+    source : str
+        Name of the file in error messages.
+
+    Raises
+    ------
+    InputError
+        If the name is not known, or the header has none of the maker's layouts.
+
+    """
+    layouts = [each for each in FORMATS if each.name == name]
+    if not layouts:
+        close = get_close_matches(name, NAMES, 1)
+        raise InputError(f'format is {name!r}, expected one of {", ".join(NAMES)}',
+                         f'use {close[0]}' if close else 'leave the format out: it is recognised')
+    fitting = [each for each in layouts if each.fits(header) or not each.columns]
+    if fitting:
+        return _closest(fitting, header)
+    given = {folded(column) for column in header}
+    nearest = max(layouts, key=lambda each: len({*map(folded, each.needed)} & given))
+    lacking = [column for column in nearest.needed if folded(column) not in given]
+    raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
+                     f'{", ".join(lacking)} of a log of {name}',
+                     'leave the format out, or name the columns with --columns')
+
+
+def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
+    """
+    Return the layout with most names, with the column of numbers of sensors only if it is there.
+
+    Logs of ArduPilot before version 4.1 have no such column.
+
+    """
+    found = max(fitting, key=lambda each: len(each.needed))
+    there = folded(found.instance) in {folded(name) for name in header}
+    return found if there else replace(found, instance='')
+
+
+def check_sensor(header: Sequence[str], path: Path) -> None:
+    """
+    Check that a file is not one of another sensor, if its maker gives all files the same columns.
+
+    Raises
+    ------
+    InputError
+        If the name of the file is that of another sensor.
+
+    """
+    layout = recognise(header)
+    if layout and _is_named(path, layout.other_sensors):
+        raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
+                         'of an accelerometer', layout.record)
+
+
+def record_instead(header: Sequence[str], path: Path) -> str:
+    """
+    Return what to record instead, if the maker marks a file as acceleration without gravity.
+
+    The names are no proof: other tools use them for readings with gravity. A reader asks here for
+    its advice once the readings at rest show no gravity.
+
+    """
+    given = {folded(name) for name in header}
+    for layout in FORMATS:
+        marks = [folded(name) for name in layout.without_gravity if not name.endswith('.csv')]
+        if marks and given.issuperset(marks):
+            return layout.record
+        if layout.plain and layout.fits(header) and _is_named(path, layout.without_gravity):
+            return layout.record
+    return ''
+
+
+def _is_named(path: Path, names: Sequence[str]) -> bool:
+    """Return whether a file has one of these names, case and spaces aside."""
+    return folded(path.name).replace(' ', '') in {folded(each).replace(' ', '') for each in names}

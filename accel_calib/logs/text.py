@@ -1,0 +1,351 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Numbers and texts of a text table of any dialect, block by block.
+
+`open_text` finds the encoding, and `accel_calib.logs.dialect` the rest of the dialect, from
+the first lines. The rows are then read once, in blocks, so the memory needed does not depend on
+the length of the file. `numpy.loadtxt` parses all numbers. A row is looked at on its own only if
+its block has a fault.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+import io
+from itertools import chain, islice
+from operator import methodcaller
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .clock import is_clock
+from .dialect import is_comment, is_number, IsHeader, Layout, layout_of, short, split
+from ..errors import InputError
+from ..table import Floats
+from ..text import counted
+
+ROWS = 65536
+"""Number of lines in a block."""
+
+_HEAD_LINES = 4000
+_HEAD_CHARACTERS = 2_000_000
+_LONGEST_LINE = 16_000_000
+"""Longest line [characters]."""
+
+_PEEKED = 1 << 16
+"""Number of bytes from which the encoding is found."""
+
+_QUOTED_LINES = 20
+"""Largest number of lines of one quoted cell."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
+
+    numbers: Floats
+    texts: list[list[str]]
+    row: NDArray[np.int64]
+
+
+@contextmanager
+def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
+              expected: str = 'time,ax,ay,az') -> Iterator[TextTable]:
+    """
+    Open a text table, and find its dialect; parameters and errors as in `layout_of`.
+
+    Raises
+    ------
+    InputError
+        If there is no table of numbers.
+    OSError
+        If the file cannot be read.
+
+    """
+    with io.BufferedReader(io.FileIO(path), _PEEKED) as raw:
+        encoding = _encoding(raw.peek())
+        with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as file:
+            head, whole = _head(path, file)
+            layout = layout_of(path, head, is_header, encoding, strict=strict, expected=expected)
+            lines = chain(head[layout.start:], () if whole else file)
+            yield TextTable(layout, lines, strict=strict)
+
+
+def _encoding(head: bytes) -> str:
+    """Return the encoding, from the byte order mark or the bytes that are 0."""
+    if head.startswith((b'\xff\xfe', b'\xfe\xff')):
+        return 'utf-16'
+    if head.startswith(b'\xef\xbb\xbf'):
+        return 'utf-8-sig'
+    pairs = len(head) // 2
+    low, high = head[:2 * pairs:2].count(0), head[1:2 * pairs:2].count(0)
+    if max(low, high) > 0.4 * pairs and min(low, high) < 0.1 * pairs:
+        return 'utf-16-le' if high > low else 'utf-16-be'
+    try:
+        head.decode('utf-8')
+    except UnicodeDecodeError as err:
+        if b'\x00' not in head and err.start < len(head) - 3:
+            return _single_byte(head)
+    return 'utf-8'
+
+
+def _single_byte(head: bytes) -> str:
+    """Return the encoding of bytes that are not UTF-8: text of Windows, or else garbage."""
+    bad = head.decode('utf-8', errors='replace').count('\ufffd')
+    return 'cp1252' if bad < 0.05 * len(head) else 'utf-8'
+
+
+def _head(path: Path, file: io.TextIOWrapper) -> tuple[list[str], bool]:
+    """Return the first lines, and whether they are the whole file."""
+    lines: list[str] = []
+    characters = 0
+    while len(lines) < _HEAD_LINES and (characters < _HEAD_CHARACTERS or len(lines) < 2):
+        line = file.readline(_LONGEST_LINE)
+        if not line:
+            return lines, True
+        if len(line) == _LONGEST_LINE:
+            raise InputError(f'{path} has a line of more than {_LONGEST_LINE} characters, '
+                             'expected a table with one line for each row',
+                             'use a CSV table or a bag')
+        lines.append(line)
+        characters += len(line)
+    return lines, False
+
+
+class TextTable:
+    """
+    An open text table, read once, block by block; `open_text` makes it.
+
+    Parameters
+    ----------
+    layout : Layout
+        Where the table begins, and how its cells are parted.
+    lines : iterator of str
+        The lines from the first row on.
+    strict : bool
+        Whether a last row that is cut is an error.
+
+    """
+
+    def __init__(self, layout: Layout, lines: Iterator[str], *, strict: bool) -> None:
+        self.layout, self.strict = layout, strict
+        self._lines = lines
+        self._line, self._row = layout.start, 0
+        self._bad = ''
+        self._bad_count = 0
+        self._cut = ''
+        self._dates: tuple[int, ...] = ()
+        self.characters = 0
+        self.more = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what has been skipped so far."""
+        notes = list(self.layout.notes)
+        if self._bad_count:
+            notes.append(f'skipped {counted(self._bad_count, "bad line")}'
+                         f'{", the first" if self._bad_count > 1 else ""}: {self._bad}')
+        return (*notes, self._cut) if self._cut else tuple(notes)
+
+    def blocks(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
+               *, skip_bad: bool = False) -> Iterator[Cells]:
+        """
+        Yield the rows, in blocks.
+
+        Parameters
+        ----------
+        numeric, text : sequence of int
+            Columns of numbers, and columns of text.
+        dates : sequence of int
+            Columns of text that have to be dates, or times of the day.
+        skip_bad : bool
+            Whether a row that cannot be read is skipped, rather than an error.
+
+        Raises
+        ------
+        InputError
+            If there is no row, or a row has a wrong number of cells, or a cell is no number or no
+            date.
+
+        """
+        found = 0
+        lines = list(islice(self._lines, ROWS))
+        while lines:
+            following = list(islice(self._lines, ROWS))
+            self.more = bool(following)
+            cells = self.read(lines, numeric, text, dates, skip_bad=skip_bad, last=not following)
+            self.characters = sum(map(len, lines))
+            found += len(cells.row)
+            if len(cells.row):
+                yield cells
+            lines = following
+        if not found:
+            raise InputError(f'{self.layout.path} has a header line but no rows, expected one row '
+                             'for each pose or sample', 'add the rows')
+
+    def read(self, lines: Sequence[str], numeric: Sequence[int], text: Sequence[int] = (),
+             dates: Sequence[int] = (), *, skip_bad: bool = False, last: bool = False) -> Cells:
+        """
+        Return the rows of the next lines; parameters and errors as in `blocks`.
+
+        If they are the last lines, the last one can be cut; it is then left out.
+
+        """
+        self._dates = tuple(dates)
+        kept = [line for line in lines if line[0] != '#' and not line.isspace()]
+        joined = _joined_quotes(kept) if '"' in ''.join(kept) else kept
+        rows = np.arange(self._row + 1, self._row + len(joined) + 1)
+        where = (self._line, lines) if len(joined) == len(kept) else (-1, lines)
+        self._line += len(lines)
+        self._row += len(joined)
+        if last and joined and self._row > 1 and not self.strict:
+            joined = self._without_cut(joined, numeric)
+            rows = rows[:len(joined)]
+        values = self._parsed(joined, numeric)
+        if values is None:
+            good = self._good(joined, numeric, rows, where, skip_bad=skip_bad)
+            joined, rows = [joined[k] for k in good], rows[good]
+            values = self._parsed(joined, numeric)
+        if values is None:
+            raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
+                             'check it for stray characters')
+        texts = [[self.layout.dialect.cells(line)[k] for line in joined] for k in text]
+        return Cells(values, texts, rows)
+
+    def _parsed(self, lines: list[str], numeric: Sequence[int]) -> Floats | None:
+        """Return the numbers of rows, or None if a row has a fault."""
+        if not lines or not numeric:
+            sound = all(self._fault(line, numeric) is None for line in lines)
+            return np.zeros((len(lines), len(numeric))) if sound else None
+        plain = self._plain(lines, numeric)
+        cells = self.layout.dialect.cells
+        if plain is None or any(not is_clock(cells(line)[k])
+                                for k in self._dates for line in lines):
+            return None
+        lines, delimiter, columns = plain
+        try:
+            values = np.loadtxt(lines, delimiter=delimiter, usecols=columns, ndmin=2,
+                                comments=None, quotechar=None)
+        except ValueError:
+            return None
+        return values if len(values) == len(lines) and np.isfinite(values).all() else None
+
+    def _plain(self, lines: list[str], numeric: Sequence[int]
+               ) -> tuple[list[str], str | None, Sequence[int]] | None:
+        """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
+        dialect, width = self.layout.dialect, self.layout.width
+        if dialect.monitor or dialect.labelled:
+            lines = [dialect.plain(line) for line in lines]
+        if '"' in ''.join(lines):
+            return self._unquoted(lines, numeric)
+        delimiter = dialect.delimiter
+        counts = (map(methodcaller('count', delimiter), lines) if delimiter else
+                  (len(line.split()) - 1 for line in lines))
+        if set(counts) != {width - 1}:
+            return None
+        if delimiter != ',' and self.layout.decimal != '.':
+            lines = [line.replace(',', '.') for line in lines]
+        return lines, delimiter or None, numeric
+
+    def _unquoted(self, lines: list[str], numeric: Sequence[int]
+                  ) -> tuple[list[str], str, Sequence[int]] | None:
+        """Return lines without quotes, parted by tabs; or None if ragged."""
+        delimiter, width = self.layout.dialect.delimiter, self.layout.width
+        between = f'"{delimiter}"'
+        stripped = [line.strip() for line in lines]
+        if all(line.count(between) == width - 1 and line.count('"') == 2 * width
+               and '\t' not in line and line[0] == line[-1] == '"' for line in stripped):
+            kept, columns = [line[1:-1].replace(between, '\t') for line in stripped], numeric
+        else:
+            rows = [split(line, delimiter) for line in lines]
+            if any(len(row) != width for row in rows):
+                return None
+            cells = [[row[k] for k in numeric] for row in rows]
+            if any('\t' in cell or '\n' in cell for row in cells for cell in row):
+                return None
+            kept, columns = ['\t'.join(row) for row in cells], list(range(len(numeric)))
+        if self.layout.decimal != '.':
+            kept = [line.replace(',', '.') for line in kept]
+        return kept, '\t', columns
+
+    def _without_cut(self, lines: list[str], numeric: Sequence[int]) -> list[str]:
+        """Return rows without a last one that is cut; note that it is left out."""
+        line = lines[-1]
+        cells = len(self.layout.dialect.cells(line))
+        fault = self._fault(line, numeric)
+        if fault is None or (line.endswith('\n') and cells >= self.layout.width):
+            return lines
+        words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
+        self._cut = f'left out the last line, which {words}'
+        return lines[:-1]
+
+    def _good(self, lines: Sequence[str], numeric: Sequence[int], rows: NDArray[np.int64],
+              where: tuple[int, Sequence[str]], *, skip_bad: bool) -> list[int]:
+        """Return the indices of the sound rows; a bad row is an error, or is skipped."""
+        good = []
+        for k, line in enumerate(lines):
+            fault = self._fault(line, numeric)
+            if fault is None:
+                good.append(k)
+            elif is_comment(line.lstrip()):
+                continue
+            elif not skip_bad or not self._bad:
+                words = f'{_place(k, *where)}row {rows[k]}{fault}'
+                if not skip_bad:
+                    raise self._error(words)
+                self._bad = words
+            self._bad_count += fault is not None
+        return good
+
+    def _error(self, words: str) -> InputError:
+        """Return the error for a bad row."""
+        mark = ',' if words.startswith('line') else ':'
+        return InputError(f'{self.layout.path}{mark} {words}', 'correct the row or remove it'
+                          + ('' if self.strict else ', or add --skip-bad'))
+
+    def _fault(self, line: str, numeric: Sequence[int]) -> str | None:
+        """Return what is wrong with a row, or None."""
+        layout = self.layout
+        cells = layout.dialect.cells(line)
+        if len(cells) != layout.width:
+            return f' has {counted(len(cells), "value")}, expected {layout.width}'
+        comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
+        for k in numeric:
+            if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
+                return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
+                        'number')
+        for k in self._dates:
+            if not is_clock(cells[k]):
+                return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a time such '
+                        'as 2026-01-31T12:00:00.250')
+        return None
+
+
+def _joined_quotes(lines: list[str]) -> list[str]:
+    """Return lines with quoted cells of several lines joined."""
+    joined: list[str] = []
+    k = 0
+    while k < len(lines):
+        end = k
+        if lines[k].count('"') % 2:
+            odd = (j for j in range(k + 1, min(k + _QUOTED_LINES, len(lines)))
+                   if lines[j].count('"') % 2)
+            end = next(odd, k)
+        joined.append(''.join(lines[k:end + 1]))
+        k = end + 1
+    return joined
+
+
+def _place(index: int, before: int, lines: Sequence[str]) -> str:
+    """Return the line number of a row among lines, in words; empty if it is not known."""
+    if before < 0:
+        return ''
+    numbers = (before + k + 1 for k, line in enumerate(lines)
+               if line[0] != '#' and not line.isspace())
+    return f'line {next(n for k, n in enumerate(numbers) if k == index)}: '

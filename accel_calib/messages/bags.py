@@ -1,0 +1,305 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Correction of a bag: a copy with a corrected Imu topic; all other messages are unchanged.
+
+`rosbags` writes the copy, with the storage of the original. The copy does not contain everything
+(not the attachments of MCAP, and not the division into several files); see docs/files.md.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import contextmanager
+import glob
+from pathlib import Path
+import shutil
+from tempfile import mkdtemp
+import time
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from .correction import corrected, output_frame, output_scale
+from ..calibrate import (
+    Calibration,
+    check_sensor,
+    joined_ranges,
+    of_samples,
+    Outside,
+    outside,
+    thermal_stream,
+)
+from ..errors import InputError
+from ..logs import (
+    Bag,
+    context_of,
+    ContextTopics,
+    damage_as_input_error,
+    doubles_at,
+    first_frame_id,
+    IMU_DOUBLES,
+    imu_topic,
+    lost,
+    Messages,
+    of_sensor,
+    open_bag,
+    plausible_samples,
+    Progress,
+    put_doubles,
+    QUANTITIES,
+    renamed,
+)
+from ..table import check_units, Recording
+from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Report = Callable[[Outside], object]
+"""Function called with a quantity that left the range of the calibration."""
+
+Note = Callable[[str], object]
+"""Function called with a note about the topics of a bag, or about lost messages."""
+
+_PARTIAL = '.partial'
+_STALE_S = 86400.0
+"""Age of an unfinished copy that no process writes any more [s]."""
+
+_NO_HASH = 'RIHS01_' + 64 * '0'
+"""Hash of a type whose definition is neither in the bag nor in Jazzy."""
+
+
+def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
+                progress: Progress = lambda done, count: None,
+                report: Report = lambda found: None, *, note: Note = lambda line: None,
+                temperature_topic: str = '', supply_topic: str = '', units: UnitName = 'm/s2',
+                gravity: float = STANDARD_GRAVITY) -> int:
+    """
+    Write a corrected copy of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
+    calibration : Calibration
+        The calibration. One in g is converted to m/s², and one in m/s² to g.
+    out : Path
+        The copy; it must not exist. A copy of a rosbag2 is a folder, or a file if `out` has the
+        suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
+    topic : str
+        Imu topic, for a bag with several Imu topics.
+    progress : callable
+        Function that is called after each block of messages.
+    report : callable
+        Function that is called at the end for each quantity of the context that left the range of
+        the calibration.
+    note : callable
+        Function that is called with each note about the topics and about lost messages.
+    temperature_topic, supply_topic : str
+        As in `accel_calib.logs.bag_context.context_of`.
+    units : {'m/s2', 'g', 'native'}
+        Unit of the recorded accelerations. The corrected ones are in m/s², the unit of Imu
+        messages.
+    gravity : float
+        Local gravity [m/s²].
+
+    Returns
+    -------
+    int
+        Number of corrected Imu messages.
+
+    Raises
+    ------
+    InputError
+        If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
+        that the calibration needs, if the readings are clearly in another unit, if only one of
+        calibration and messages is in native units, or if `out` exists.
+    StoredCalibrationError
+        If the calibration belongs to another sensor.
+    OSError
+        If a file cannot be read or written. `out` then does not exist.
+
+    """
+    if out.exists():
+        raise InputError(f'{out} exists, expected a new file', 'choose another name')
+    with open_bag(path) as bag:
+        _check_kind(bag, out)
+        name = imu_topic(bag, topic)
+        sensor = first_frame_id(bag, name)
+        check_sensor(calibration, sensor)
+        calibration = calibration.in_units(units)
+        context = _needed(bag, calibration, context_of(bag, name, sensor, temperature_topic,
+                                                       supply_topic))
+        with _new(out) as folder:
+            correction = _Correction(calibration, bag, name, sensor, context,
+                                     units_of(units, gravity), gravity)
+            count = _copy(bag, folder, out, correction, progress)
+        for each in correction.outside.values():
+            if each.count:
+                report(each)
+        for line in (*bag.notes, *context.notes, *lost(bag, name, count)):
+            note(line)
+        return count
+
+
+def _check_kind(bag: Bag, out: Path) -> None:
+    """Check that the name of the copy is that of a bag of the same kind."""
+    if (out.suffix == '.bag') is bag.ros2:
+        raise InputError(f'{bag.path} is a ROS {2 if bag.ros2 else 1} bag, but {out} is not the '
+                         'name of one', 'choose a name that ends in .mcap or .db3, or the '
+                         'name of a folder' if bag.ros2 else
+                         'choose a name that ends in .bag')
+
+
+def _needed(bag: Bag, calibration: Calibration, context: ContextTopics) -> ContextTopics:
+    """Return the topics that a calibration needs, without notes if it needs none."""
+    needs = {each.key: each for each in QUANTITIES if each.key in calibration.model.needs}
+    used = {each.quantity.key: each for each in context.used}
+    for key, quantity in needs.items():
+        if key not in used:
+            notes = ''.join(f'; {line}' for line in context.notes)
+            raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used{notes}, '
+                             f'but the calibration depends on the {quantity.words}',
+                             f'name the topic with {quantity.option}, or use a calibration '
+                             'without it')
+    return ContextTopics(tuple(each for key, each in used.items() if key in needs),
+                         context.notes if needs else ())
+
+
+@contextmanager
+def _new(out: Path) -> Iterator[Path]:
+    """Yield a new folder next to the target, and remove it and old leftovers of others."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for each in out.parent.glob(f'.{glob.escape(out.name)}.*{_PARTIAL}'):
+        if not each.is_symlink() and time.time() - each.stat().st_mtime > _STALE_S:
+            shutil.rmtree(each)
+    folder = Path(mkdtemp(_PARTIAL, f'.{out.name}.', out.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+class _Correction:
+    """The correction of the messages of one topic."""
+
+    def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str,
+                 context: ContextTopics, units: Units, gravity: float) -> None:
+        self._calibration, self._bag, self._sensor = calibration, bag, sensor
+        self._frame_id = output_frame(calibration, sensor)
+        self._units, self._tracks = units, context.tracks()
+        self._scale = output_scale(calibration, gravity)
+        self._thermal = thermal_stream(calibration.model)
+        self.topic, self.done = topic, 0
+        self.outside: dict[str, Outside] = {}
+
+    def __call__(self, raws: list[bytes]) -> Messages:
+        """Return corrected messages in a new buffer."""
+        messages = self._bag.joined(raws, self.topic, self.done)
+        of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
+        context = plausible_samples(self._bag, messages, self.done)
+        if not self.done:
+            check_units(Recording(context, np.arange(len(messages))), self._units,
+                        str(self._bag.path))
+        for key, track in self._tracks.items():
+            context[key] = track.at(context['time'])
+        doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
+        known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
+        self.outside = joined_ranges(self.outside, outside(self._calibration, known))
+        with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
+            made = corrected(self._calibration, doubles, known, scale=self._scale)
+            put_doubles(messages, made)
+        self.done += len(messages)
+        return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
+
+
+def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: Progress) -> int:
+    """Copy all messages, and correct those of the Imu topic."""
+    target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
+    count = bag.count(correction.topic)
+    imu = {id(connection) for connection in bag.connections(correction.topic)}
+    written = 0
+    writer = _writer(bag, target, out.suffix)
+    with writer:
+        with damage_as_input_error(bag.path):
+            outputs = _added(bag, writer)
+        for block in bag.blocks():
+            which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
+            new = correction([block[k][2] for k in which]).each() if which else ()
+            changed = dict(zip(which, new, strict=True))
+            with damage_as_input_error(bag.path):  # a stamp can be out of range
+                for k, (connection, stamp, raw) in enumerate(block):
+                    writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
+            written += len(block)
+            progress(correction.done, count)
+    _check_copy(bag, target, written)
+    (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
+    return correction.done
+
+
+def _check_copy(bag: Bag, target: Path, written: int) -> None:
+    """Check that a copy can be read back, and that its files hold all messages."""
+    try:
+        with open_bag(target) as copy:
+            found = copy.stored
+    except InputError as err:
+        what = err.message.removeprefix(f'{target} ')
+        raise InputError(f'{bag.path} cannot be copied: the copy {what}', 'use a bag whose topics '
+                         'have valid names, types and formats') from err
+    if found != written:
+        raise InputError(f'{bag.path}: the copy holds {found} of {written} messages, expected '
+                         'all', 'check the disk, and try again')
+
+
+def _writer(bag: Bag, target: Path, suffix: str) -> Any:
+    """Return a writer for the kind of bag that the suffix names, otherwise for the same kind."""
+    if not bag.ros2:
+        from rosbags.rosbag1 import Writer as Writer1
+
+        return Writer1(target)
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+
+    mcap = suffix == '.mcap' or (suffix != '.db3' and (
+        bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))))
+    writer = Writer2(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
+                     else StoragePlugin.SQLITE3)
+    mode = bag.reader.compression_mode if isinstance(bag.reader, Reader) else None
+    # A compressed file has another suffix.
+    if mode and (mode == 'message' or suffix not in ('.mcap', '.db3')):
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    return writer
+
+
+def _added(bag: Bag, writer: Any) -> dict[int, Any]:
+    """Add the connections of a bag to a writer; return the new ones by the id of the old ones."""
+    made: dict[tuple[Any, ...], Any] = {}
+    outputs = {}
+    for each in bag.reader.connections:
+        key = (each.topic, each.msgtype, each.msgdef.data, str(each.ext))
+        if key not in made:
+            made[key] = (_added_to_2 if bag.ros2 else _added_to_1)(writer, each)
+        outputs[id(each)] = made[key]
+    return outputs
+
+
+def _added_to_1(writer: Any, each: Any) -> Any:
+    return writer.add_connection(each.topic, each.msgtype, msgdef=each.msgdef.data,
+                                 md5sum=each.digest, callerid=each.ext.callerid,
+                                 latching=each.ext.latching)
+
+
+def _added_to_2(writer: Any, each: Any) -> Any:
+    from rosbags.typesys import get_typestore, Stores
+
+    msgdef, digest, known = each.msgdef.data, each.digest, get_typestore(Stores.ROS2_JAZZY)
+    if each.msgtype in known.types:
+        msgdef = msgdef or known.generate_msgdef(each.msgtype, ros_version=2)[0]
+        digest = digest or known.hash_rihs01(each.msgtype)
+    return writer.add_connection(
+        each.topic, each.msgtype, msgdef=msgdef, rihs01=digest or _NO_HASH,
+        serialization_format=each.ext.serialization_format,
+        offered_qos_profiles=each.ext.offered_qos_profiles)

@@ -1,0 +1,378 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Correction of one reading at a time, for a stream of messages.
+
+Each call of numpy takes about 1 µs, and `Calibration.correct` makes dozens of calls. This does not
+matter for a recording, but it is too slow for single messages. Here the terms of the catalogue
+(`accel_calib.effects`) are summed as Python floats. With the context fixed, the affine terms sum
+to an offset and a gain; only the bending terms are iterated, as in `accel_calib.effects.model`.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from operator import add
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibrate import Calibration
+from ..effects import (
+    AFFINE,
+    check_context,
+    CONVERGED_G,
+    difference,
+    Effect,
+    fitted_places,
+    FORCE,
+    LARGEST_FORCE_G,
+    LARGEST_ITERATIONS,
+    MONOMIALS,
+    ONE,
+    too_large,
+)
+from ..table import Floats
+
+Triple = tuple[float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""Nine numbers, row by row."""
+
+Known = Mapping[str, Any]
+"""Context of one reading: floats and triples, with the keys of `accel_calib.effects.Context`."""
+
+
+class _Term(NamedTuple):
+    """A term of an effect: axis, monomial, and weight times value."""
+
+    axis: int
+    monomial: int
+    size: float
+
+
+class _Part(NamedTuple):
+    """An effect whose factor depends on the context: its shape and terms."""
+
+    effect: Effect
+    shape: list[float]
+    terms: list[_Term]
+
+
+class _Bend(NamedTuple):
+    """A bending term with its context fixed: axis, coefficient, value and gradient."""
+
+    axis: int
+    size: float
+    value: Callable[[float, float, float], float]
+    gradient: Callable[[float, float, float], Triple]
+
+
+_NO_BEND: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_SLOW = 3
+"""Iterations after which the slope is computed at the present force."""
+
+
+class OneReading:
+    """
+    A calibration prepared for the correction of single readings.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    scale : float
+        Factor on the corrected force.
+
+    """
+
+    def __init__(self, calibration: Calibration, scale: float = 1.0) -> None:
+        model = calibration.model
+        self.needs = model.needs
+        self._calibration = calibration
+        self._unit = calibration.force_per_g * scale
+        self.turn = _flat(model.rotation.T * self._unit)
+        self.back = _flat(model.rotation / self._unit)
+        self.per_g = calibration.units.per_g
+        self._fixed, self._varying = [0.0] * 12, []
+        self._bends: list[_Bend] = []
+        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+            size, shape = effect.split(values)
+            terms = [_Term(each.axis, each.monomial, each.weight * float(size[each.parameter]))
+                     for each in effect.terms]
+            if effect.factor is not None:
+                self._varying.append(_Part(effect, shape.tolist(), terms))
+            else:
+                self._add(terms, None, self._fixed, self._bends)
+
+    def _add(self, terms: list[_Term], factor: Any, affine: list[float], bends: list[_Bend]
+             ) -> None:
+        """Add terms to V and W - I, row by row, and to the bending terms."""
+        for k, (axis, monomial, size) in enumerate(terms):
+            if factor is not None:
+                size = size * (factor[k] if isinstance(factor, list) else factor)
+            if monomial == ONE:
+                affine[axis] += size
+            elif monomial < AFFINE:
+                affine[3 + 3 * axis + monomial - FORCE] += size
+            else:
+                bends.append(_Bend(axis, size, *MONOMIALS[monomial]))
+
+    def held(self, known: Known) -> Known:
+        """Return the context, limited to the ranges of the calibration."""
+        ranges = self._calibration.ranges
+        if not ranges:
+            return known
+        return {**known, **{key: min(max(known[key], low), high)
+                            for key, (low, high) in ranges.items() if key in known}}
+
+    def at(self, known: Known) -> AtReading:
+        """
+        Return the calibration with its context fixed.
+
+        Parameters
+        ----------
+        known : mapping
+            Context that the effects need.
+
+        Raises
+        ------
+        InputError
+            If a quantity is missing.
+
+        """
+        if not self._varying:
+            return self._without_context
+        check_context(self._calibration.model, known)
+        known = self.held(known)
+        affine, bends = list(self._fixed), list(self._bends)
+        for effect, shape, terms in self._varying:
+            self._add(terms, _factor(effect, known, shape), affine, bends)
+        return AtReading(self, affine, bends, known)
+
+    @cached_property
+    def _without_context(self) -> AtReading:
+        return AtReading(self, self._fixed, self._bends, {})
+
+    @cached_property
+    def _spread_rows(self) -> tuple[Floats, Floats]:
+        """Return the (m, t) monomial of each term, and its (t, 3 p) part of the root."""
+        model = self._calibration.model
+        variances, axes = np.linalg.eigh(self._calibration.covariance)
+        root = axes * np.sqrt(np.maximum(variances, 0.0))
+        rows, monomials, start = [], [], 0
+        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+            shapes = [start + len(effect.parameters) + place
+                      for place in fitted_places(effect, effect.split(values)[1])]
+            for own in (None, *shapes):
+                for term in effect.terms:
+                    at = start + term.parameter if own is None else own
+                    size = 1.0 if own is None else values[term.parameter]
+                    rows.append(_row(term.axis, term.weight * size * root[at]))
+                    monomials.append(term.monomial)
+            start += len(effect.values)
+        which = np.equal.outer(self.monomials, monomials).astype(float)
+        return which, np.array(rows).reshape(len(rows), 3 * len(root))
+
+    @property
+    def monomials(self) -> tuple[int, ...]:
+        """Return the indices of the monomials of the model; the affine monomials are first."""
+        used = self._calibration.model.terms.monomials
+        return (*range(AFFINE), *(index for index in used if index >= AFFINE))
+
+    def spread_basis(self, known: Known) -> Floats:
+        """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
+        factors: list[float] = []
+        model = self._calibration.model
+        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+            count, shape = len(effect.terms), effect.split(values)[1]
+            factor = _factor(effect, known, shape.tolist())
+            factors += factor if isinstance(factor, list) else [factor] * count
+            for place in fitted_places(effect, shape):
+                if effect.factor is not None:
+                    change = difference(effect.factor, known, shape, place)
+                    factors += np.broadcast_to(change, count).tolist()
+        which, rows = self._spread_rows
+        basis: Floats = (which * factors) @ rows
+        return basis
+
+
+def _factor(effect: Effect, known: Known, shape: Any) -> Any:
+    """Return the factor of an effect: one float for all terms, or a list with one per term."""
+    factor = effect.factor(known, shape) if effect.factor is not None else 1.0
+    return factor.tolist() if isinstance(factor, np.ndarray) else float(factor)
+
+
+def _row(axis: int, values: Floats) -> Floats:
+    row = np.zeros((3, len(values)))
+    row[axis] = values
+    return row.ravel()
+
+
+class AtReading:
+    """
+    A calibration with its context fixed; `OneReading.at` returns it.
+
+    Attributes
+    ----------
+    correct : callable
+        Reading x, y, z -> specific force in the levelled frame, times the scale. It raises
+        InputError if the effects cannot be corrected.
+
+    """
+
+    def __init__(self, owner: OneReading, affine: Sequence[float], bends: list[_Bend],
+                 known: Known) -> None:
+        self._owner, self._bends, self._known = owner, bends, known
+        a, b, c, d, e, f, g, h, i = affine[3:]
+        self._gain = (a + 1.0, b, c, d, e + 1.0, f, g, h, i + 1.0)
+        inverse = _inverse(self._gain)
+        offset = _times(inverse, *affine[:3])
+        if bends:
+            self.correct = self._solving(inverse, offset)
+        else:
+            matrix = _product(owner.turn, inverse)
+            self.correct = _affine([part / owner.per_g for part in matrix],
+                                   _times(owner.turn, *offset))
+
+    def _solving(self, inverse: Matrix, offset: Triple) -> Callable[[float, float, float], Triple]:
+        """
+        Return the function that solves for u, and rotates it.
+
+        The method is Newton's, with a slope that is computed again only if convergence is slow.
+        `model.AtContext.force` solves the same equation for many readings.
+
+        """
+        undone = _affine([part / self._owner.per_g for part in inverse], offset)
+        turn, bend, near, far = self._owner.turn, self._bend, CONVERGED_G, LARGEST_FORCE_G
+        a, b, c, d, e, f, g, h, i = _NO_BEND
+
+        def correct(x: float, y: float, z: float) -> Triple:
+            nonlocal a, b, c, d, e, f, g, h, i
+            p, q, r = left, mid, right = undone(x, y, z)
+            last = near
+            for count in range(LARGEST_ITERATIONS):
+                j, k, m = _times(inverse, *bend(p, q, r))
+                j, k, m = p + j - left, q + k - mid, r + m - right
+                if count == _SLOW:
+                    a, b, c, d, e, f, g, h, i = _product(_inverse(self._slope_at((p, q, r))),
+                                                         self._gain)
+                j, k, m = (a * j + b * k + c * m, d * j + e * k + f * m, g * j + h * k + i * m)
+                p, q, r = p - j, q - k, r - m
+                if not (-far < p < far and -far < q < far and -far < r < far):
+                    break
+                step = max(abs(j), abs(k), abs(m))
+                if step * step < near * last:  # the next step would be smaller than that
+                    return _times(turn, p, q, r)
+                last = step
+            raise too_large()
+
+        return correct
+
+    def _bend(self, x: float, y: float, z: float) -> list[float]:
+        """Return what the bending terms add to a reading at a force [g]."""
+        added = [0.0, 0.0, 0.0]
+        for axis, size, value, _ in self._bends:
+            added[axis] += size * value(x, y, z)
+        return added
+
+    def _slope_at(self, u: Triple) -> Matrix:
+        """Return the slope of the reading at a force."""
+        slope = list(self._gain)
+        for axis, size, _, gradient in self._bends:
+            i, j, k = gradient(*u)
+            slope[3 * axis] += size * float(i)
+            slope[3 * axis + 1] += size * float(j)
+            slope[3 * axis + 2] += size * float(k)
+        a, b, c, d, e, f, g, h, i = slope
+        return a, b, c, d, e, f, g, h, i
+
+    def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
+        """
+        Return the covariance of a corrected force, with the uncertainty of the calibration.
+
+        Parameters
+        ----------
+        force : 3 floats
+            Corrected force, as `correct` returns it.
+        own : 9 floats
+            Covariance of the corrected force from the noise of the reading, row by row.
+
+        """
+        if self._bends:
+            added = self._bent_spread(_times(self._owner.back, *force))
+        else:
+            xx, xy, xz, yy, yz, zz = [form(*force) for form in self._forms]
+            added = [xx, xy, xz, xy, yy, yz, xz, yz, zz]
+        return [*map(add, own, added)]
+
+    @cached_property
+    def _forms(self) -> list[Callable[[float, float, float], float]]:
+        """Entries of the covariance as quadratic forms of the force; the upper triangle."""
+        basis = self._owner.spread_basis(self._known).reshape(AFFINE, 3, -1)
+        moved = np.reshape(_product(self._owner.turn, _inverse(self._gain)), (3, 3)) @ basis
+        moved[1:] = np.einsum('ij,ikp->jkp', np.reshape(self._owner.back, (3, 3)), moved[1:])
+        each = np.einsum('mip,njp->mnij', moved, moved).reshape(AFFINE, AFFINE, 9)
+        both = each + np.swapaxes(each, 0, 1)
+        form = np.array([both[m, n] / (2.0 if m == n else 1.0)
+                         for m, n in zip(*np.triu_indices(AFFINE), strict=True)])
+        return [_quadratic(*form[:, entry].tolist()) for entry in (0, 1, 2, 4, 5, 8)]
+
+    def _bent_spread(self, u: Triple) -> list[float]:
+        monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
+        to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
+        moved = to_force @ np.dot(monomials, self._basis).reshape(3, -1)
+        added: list[float] = (moved @ moved.T).ravel().tolist()
+        return added
+
+    @cached_property
+    def _basis(self) -> Floats:
+        return self._owner.spread_basis(self._known)
+
+
+def _flat(matrix: Floats) -> Matrix:
+    a, b, c, d, e, f, g, h, i = matrix.ravel().tolist()
+    return a, b, c, d, e, f, g, h, i
+
+
+def _affine(matrix: Sequence[float], less: Triple) -> Callable[[float, float, float], Triple]:
+    """Return the function v -> matrix @ v - less."""
+    a, b, c, d, e, f, g, h, i = matrix
+    p, q, r = less
+
+    def apply(x: float, y: float, z: float) -> Triple:
+        return a * x + b * y + c * z - p, d * x + e * y + f * z - q, g * x + h * y + i * z - r
+
+    return apply
+
+
+def _quadratic(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float,
+               i: float, j: float) -> Callable[[float, float, float], float]:
+    """Return the quadratic form with the coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz."""
+    def apply(x: float, y: float, z: float) -> float:
+        return a + x * (b + e * x + f * y + g * z) + y * (c + h * y + i * z) + z * (d + j * z)
+
+    return apply
+
+
+def _times(matrix: Sequence[float], x: float, y: float, z: float) -> Triple:
+    a, b, c, d, e, f, g, h, i = matrix
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
+
+
+def _product(one: Sequence[float], other: Sequence[float]) -> Matrix:
+    columns = [_times(one, *other[k::3]) for k in range(3)]
+    (a, d, g), (b, e, h), (c, f, i) = columns
+    return a, b, c, d, e, f, g, h, i
+
+
+def _inverse(matrix: Sequence[float]) -> Matrix:
+    """Return the inverse of a gain. `calibrate.gate` has checked that it is not singular."""
+    a, b, c, d, e, f, g, h, i = matrix
+    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
+    size = a * p + b * q + c * r
+    return (p / size, (c * h - b * i) / size, (b * f - c * e) / size,
+            q / size, (a * i - c * g) / size, (c * d - a * f) / size,
+            r / size, (b * g - a * h) / size, (a * e - b * d) / size)

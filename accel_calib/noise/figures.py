@@ -1,0 +1,428 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Noise figures of a sensor from a long rest.
+
+Accelerometers and gyros have three figures by axis: the white-noise density N (velocity or angle
+random walk), the bias instability B and the random walk K (of the acceleration, or of the rate).
+Kalibr and VINS use N and K of all axes together, for which the mean of the squares is taken.
+
+**How long a rest has to be.** The flat part of the curve begins where the white noise has
+decreased to it, at τ = N²/(0.664 B)². For a bias instability that is seen in nine of ten
+simulated rests, the rest has to be 100 times as long. If the curve does not show B, its upper
+limit gives the shortest length; for common parts τ is about 24 s. A random walk is seen if the
+curve rises over two octaves. Common parts need hours.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from .components import (
+    AxisNoise,
+    Component,
+    COMPONENTS,
+    FIGURES,
+    fit_components,
+    Fitted,
+    Kind,
+    NoiseFigures,
+    shown_unit,
+)
+from .curve import (
+    allan_variances,
+    check_allantools,
+    Counts,
+    FLAT,
+    octaves,
+    shares,
+    Spread,
+    spread_of,
+)
+from .rest import longest_rest, Rest
+from ..table import Floats, Recording
+from ..units import STANDARD_GRAVITY, Units
+
+_INSTABILITY_S = 40.0 * 60.0
+"""Shortest rest that shows the bias instability of common parts [s]: 100 times τ = 24 s."""
+
+_LENGTH_FOR_B = 100.0
+"""Rest that shows B, in units of the τ at which white noise equals the flat part."""
+
+_WALK_S = 5.0 * 3600.0
+"""Shortest rest that shows the random walk of common parts [s]."""
+
+_TOO_LONG = 100.0 * 3600.0
+"""Longest rest that is worth a figure [s]."""
+
+_DISTURBED = ('the curve at long τ has another form (temperature or disturbance); record at a '
+              'constant temperature')
+
+_WHITE_SAMPLES = 500
+
+_LONGER = 4.0
+"""Two octaves."""
+
+_DEPARTS = 0.1
+"""Part of the deviation by which a curve departs visibly from its components."""
+
+_LEAST_P = 1e-4
+"""Smallest probability of χ² without a note."""
+
+_WARM = 1.0
+"""Change of the temperature that is worth a warning [°C]."""
+
+_MINUTE, _HOUR = 60.0, 3600.0
+
+
+def notes_of(axes: Sequence[AxisNoise], temperature: tuple[float, float] | None) -> Iterator[str]:
+    """Yield what limits the figures."""
+    if temperature is not None and temperature[1] - temperature[0] > _WARM:
+        yield (f'the temperature changed by {temperature[1] - temperature[0]:.1f} °C '
+               f'({temperature[0]:.1f} to {temperature[1]:.1f} °C): bias instability and random '
+               'walk include its effect; record at a constant temperature')
+    groups: dict[tuple[str, str], list[str]] = {}
+    for axis in axes:
+        for note in _axis_notes(axis):
+            groups.setdefault((axis.kind, note), []).append(axis.axis)
+    for (kind, note), names in groups.items():
+        yield f'{kind} {", ".join(names)}: {note}'
+
+
+def _axis_notes(axis: AxisNoise) -> Iterator[str]:
+    """Yield what limits the figures of one axis."""
+    unit, scale = shown_unit(axis.kind, 'bias_instability', axis.unit)
+    if axis.step:
+        yield (f'the noise is smaller than one step of the output ({_three(axis.step * scale)} '
+               f'{unit}), so that the figures are those of the rounding; record with more digits '
+               'or a smaller range')
+    if axis.figures['quantisation'].seen:
+        yield ('the curve falls with slope -1 at short τ: rounding of the output (quantisation '
+               'noise); the white noise is that of longer τ')
+    drift = axis.figures['drift']
+    if drift.seen and not _disturbed(axis):
+        hourly = _three(drift.value * scale * _HOUR)
+        yield (f'a steady drift of {hourly} {unit} per hour raises the curve at long τ '
+               '(warm-up?); it is not part of the figures')
+    yield from _departures(axis)
+
+
+def _departures(axis: AxisNoise) -> Iterator[str]:
+    """Yield where the curve is not that of the components."""
+    ratio = axis.deviation / axis.model - 1.0
+    below = ratio[axis.tau < axis.used[0]]
+    above = ratio[axis.tau > axis.used[1]]
+    if len(below) and np.max(np.abs(below)) > _DEPARTS:
+        why = 'a low-pass filter' if below[0] < 0.0 else 'vibration or rounding'
+        side = 'below' if below[0] < 0.0 else 'above'
+        yield (f'for τ below {duration(axis.used[0])} the curve is {side} that of white noise '
+               f'({why}); the figures are from longer τ')
+    if len(above) and np.max(np.abs(above)) > _DEPARTS:
+        slope = float(np.mean(axis.slope[axis.tau[1:] > axis.used[1]]))
+        yield (f'for τ above {duration(axis.used[1])} the curve has slope {slope:+.1f}, and not '
+               'the form of a random walk (drift with temperature, or disturbance); the figures '
+               'are from shorter τ')
+    if axis.p_value < _LEAST_P:
+        yield ('the curve does not have the form of white noise, bias instability and random walk '
+               '(vibration?); the figures are approximate')
+
+
+def needs_of(axes: Sequence[AxisNoise], rest: Rest) -> dict[tuple[Kind, str], str]:
+    """Return why figures are not seen, and what to do."""
+    longest: dict[tuple[Kind, str], tuple[float, str]] = {}
+    for axis in axes:
+        for figure in FIGURES:
+            if not axis.figures[figure].seen:
+                need = _NEEDED[figure](axis, rest)
+                key = axis.kind, figure
+                longest[key] = max(longest.get(key, need), need)
+    return {key: words for key, (_, words) in longest.items()}
+
+
+def _white_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+    """Return why the white noise is not seen."""
+    if rest.samples < _WHITE_SAMPLES:
+        return _needs_rest(_WHITE_SAMPLES / rest.rate, rest)
+    return np.inf, ('the curve does not fall with slope -1/2 at the shortest τ '
+                    f'({duration(axis.tau[0])}); record at a higher rate, with more digits')
+
+
+def _instability_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+    """Return how long the rest has to be for the flat part of the curve."""
+    white = axis.figures['noise_density']
+    if axis.figures['random_walk'].seen:
+        return np.inf, 'the random walk hides it: the curve has no flat part'
+    if _disturbed(axis):
+        return np.inf, _DISTURBED
+    flat = FLAT * axis.figures['bias_instability'].upper**2
+    hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
+    return _needs_rest(max(_INSTABILITY_S, hidden, _LONGER * rest.seconds), rest)
+
+
+def _walk_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+    """Return how long the rest has to be for a curve that rises."""
+    if _disturbed(axis):
+        return np.inf, _DISTURBED
+    return _needs_rest(max(_WALK_S, _LONGER * rest.seconds), rest)
+
+
+def _disturbed(axis: AxisNoise) -> bool:
+    """Return whether the curve at long τ is not that of the components."""
+    return bool(axis.tau[-1] > axis.used[1])
+
+
+_NEEDED: dict[str, Callable[[AxisNoise, Rest], tuple[float, str]]] = {
+    'noise_density': _white_need, 'bias_instability': _instability_need,
+    'random_walk': _walk_need}
+
+
+def _needs_rest(seconds: float, rest: Rest) -> tuple[float, str]:
+    """Return a length, and the words for it."""
+    about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
+             else f'about {duration(_rounded(seconds))}')
+    return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
+
+
+def _rounded(seconds: float) -> float:
+    """Return a duration rounded up to one or two digits of its unit."""
+    unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)
+    step = unit * (1.0 if seconds < 10.0 * unit else 5.0 if seconds < 60.0 * unit else 50.0)
+    return float(np.ceil(seconds / step - 1e-9) * step)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in its usual unit, with two significant digits."""
+    if seconds >= 2.0 * _HOUR:
+        return f'{_two(seconds / _HOUR)} h'
+    if seconds >= 2.0 * _MINUTE:
+        return f'{_two(seconds / _MINUTE)} min'
+    return f'{_two(seconds)} s' if seconds >= 1.0 else f'{_two(seconds * 1e3)} ms'
+
+
+def _two(value: float) -> str:
+    return f'{value:.0f}' if value >= 10.0 else f'{value:.2g}'
+
+
+def _three(value: float) -> str:
+    """Return a number with three significant digits, without a power of ten."""
+    return f'{float(f"{value:.3g}"):g}'
+
+
+_POWERS = {'quantisation': 1.0, 'noise_density': 0.5, 'bias_instability': 0.0,
+           'random_walk': -0.5, 'drift': -1.0}
+"""Power of τ0 in each figure."""
+
+_LEVEL = 0.95
+
+_MOST_RATE = 0.03
+"""Noise density that no gyro in rad/s has [rad/s/√Hz]: 100 times that of a cheap one."""
+
+_COARSE = 1.0
+"""Noise in units of the step of the output below which rounding changes the noise."""
+
+_MOST_STEPS = 4096
+
+_LEAST_VARIANCE = 1e-18
+"""Allan variance that is only rounding, for samples with the standard deviation 1."""
+
+
+def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVITY,
+             progress: Callable[[int, int], object] = lambda done, count: None) -> NoiseFigures:
+    """
+    Return the noise figures of a recording with a long rest.
+
+    Parameters
+    ----------
+    recording : Recording
+        The samples. The longest rest without an interruption is used.
+    units : Units
+        Unit of the readings. Figures of native readings stay in native units.
+    gravity : float
+        Local gravity [m/s²], for readings in g.
+    progress : function of two int
+        Called with the number of axes done and of all axes.
+
+    Raises
+    ------
+    InputError
+        If there is no rest of at least 64 samples, or allantools is not installed.
+
+    """
+    check_allantools()
+    progress(0, 6 if 'rate' in recording else 3)
+    rest = longest_rest(recording, units)
+    lengths = octaves(rest.samples)
+    spread = spread_of(lengths, rest.samples)
+    axes, notes = [], list(rest.notes)
+    rad_s = _in_rad_s(rest)
+    if not rad_s:
+        notes.append('the angular rates are not in rad/s, because their noise is too large: they '
+                     'are taken as native')
+    for k, values in enumerate(rest.values):
+        kind, axis, scale, unit = _channel(k, units, gravity, rad_s=rad_s)
+        if np.ptp(values) > 0.0 and np.std(values) > 0.0:
+            axes.append(_axis(kind, axis, unit, values * scale, rest.rate, spread))
+        else:
+            notes.append(f'{kind} {axis}: all samples of the rest are the same, so that the axis '
+                         'shows no noise; record with more digits or a smaller range')
+        progress(k + 1, len(rest.values))
+    temperature = _temperatures(rest)
+    needs = needs_of(axes, rest)
+    return NoiseFigures(tuple(axes), rest.start, rest.seconds, rest.samples, rest.rate,
+                        temperature, (*notes, *notes_of(axes, temperature)), needs)
+
+
+def _in_rad_s(rest: Rest) -> bool:
+    """Return whether the noise of the rates is that of a gyro in rad/s."""
+    rates = rest.values[3:]
+    if not len(rates):
+        return True
+    density = np.std(np.diff(rates), axis=1) / np.sqrt(2.0 * rest.rate)
+    return bool(np.all(density < _MOST_RATE))
+
+
+def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
+             ) -> tuple[Kind, str, float, str]:
+    """Return sensor, axis, factor from g or rad/s, and unit of a row of `Rest.values`."""
+    if row > 2:
+        return 'gyroscope', 'xyz'[row - 3], 1.0, 'rad/s' if rad_s else 'native'
+    if units.name == 'native':
+        return 'accelerometer', 'xyz'[row], units.per_g, 'native'
+    return 'accelerometer', 'xyz'[row], gravity, 'm/s²'
+
+
+def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread: Spread
+          ) -> AxisNoise:
+    """Return the noise of one axis."""
+    lengths = octaves(len(values))
+    size = float(np.std(values))
+    variances = np.maximum(allan_variances(values / size, lengths), _LEAST_VARIANCE)
+    fitted = fit_components(variances, lengths, spread)
+    covariance = spread.covariance(fitted.squares)
+    expected = shares(lengths) @ fitted.squares
+    low, high = _band(variances, 2.0 * expected**2 / np.diag(covariance), fitted, spread)
+    tau = lengths / rate
+    return AxisNoise(
+        kind, axis, unit, tau, size * np.sqrt(variances), size * low, size * high,
+        size * np.sqrt(expected), 0.5 * np.diff(np.log2(variances)),
+        _slope_sd(covariance / np.outer(expected, expected)),
+        _figures(fitted, size, 1.0 / rate),
+        (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
+        _coarse_step(values, size * float(np.sqrt(variances[0]))))
+
+
+def _band(variances: Floats, freedom: Floats, fitted: Fitted, spread: Spread
+          ) -> tuple[Floats, Floats]:
+    """Return the 95 % interval of the Allan deviations from their degrees of freedom."""
+    # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
+    beyond = np.arange(len(variances)) > fitted.last
+    lengths = 2**np.arange(len(variances), dtype=np.int64)
+    known = np.where(beyond, _freedom_of_walk(spread, lengths), freedom)
+    tail = 0.5 - 0.5 * _LEVEL
+    low, high = (np.sqrt(variances * known / chi2.ppf(part, known)) for part in (1.0 - tail, tail))
+    return low, high
+
+
+def _slope_sd(relative: Floats) -> Floats:
+    """Return the standard deviations of the slopes from the relative covariance."""
+    across = np.diff(np.eye(len(relative)), axis=0)
+    return np.asarray(0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)))
+
+
+def _freedom_of_walk(spread: Spread, lengths: Counts) -> Floats:
+    """Return the equivalent degrees of freedom of a random walk at each length."""
+    walk = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
+    return 2.0 * (shares(lengths) @ walk)**2 / np.diag(spread.covariance(walk))
+
+
+def _figures(fitted: Fitted, size: float, spacing: float) -> dict[str, Component]:
+    """Return the components in the unit of the figures."""
+    made = {}
+    for name, found in zip(COMPONENTS, fitted.components, strict=True):
+        scale = size * spacing ** _POWERS[name]
+        made[name] = Component(found.value * scale, found.sd * scale,
+                               (found.interval[0] * scale, found.interval[1] * scale),
+                               found.upper * scale, found.share)
+    return made
+
+
+def _coarse_step(values: Floats, noise: float) -> float:
+    """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
+    levels = np.unique(values[:1_000_000])
+    if len(levels) > _MOST_STEPS:
+        return 0.0
+    gaps = np.diff(levels)
+    # Rounding of a computation leaves gaps that are not steps.
+    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), noise)]
+    step = float(np.min(gaps)) if len(gaps) else 0.0
+    return step if noise < _COARSE * step else 0.0
+
+
+def _temperatures(rest: Rest) -> tuple[float, float] | None:
+    """Return the lowest and highest mean temperature of a hundredth of the rest."""
+    if rest.temperature is None or not np.isfinite(rest.temperature).any():
+        return None
+    known = rest.temperature[np.isfinite(rest.temperature)]
+    means = [float(np.mean(part)) for part in np.array_split(known, min(100, len(known)))]
+    return min(means), max(means)
+
+
+_NATIVE_REASON = {
+    'accelerometer': 'the readings are in native units; state the unit, or apply a calibration',
+    'gyroscope': 'the rates are not in rad/s; convert them'}
+
+
+def to_json(found: NoiseFigures) -> dict[str, Any]:
+    """
+    Return the figures for JSON.
+
+    ``accelerometer_noise_density`` [m/s²/√Hz], ``accelerometer_random_walk`` [m/s³/√Hz],
+    ``gyroscope_noise_density`` [rad/s/√Hz], ``gyroscope_random_walk`` [rad/s²/√Hz] and
+    ``update_rate`` [Hz] have the names and units of Kalibr's imu.yaml. NaN, which is null in JSON,
+    is a figure that is not seen; ``…_reason`` is then the reason.
+
+    """
+    result: dict[str, Any] = {
+        'update_rate': found.rate,
+        'rest': {'start': found.start, 'seconds': found.seconds, 'samples': found.samples},
+        'temperature': found.temperature, 'notes': found.notes}
+    for kind in ('accelerometer', 'gyroscope'):
+        axes = found.of(kind)
+        result[f'{kind}_unit'] = axes[0].unit if axes else None
+        for figure in FIGURES:
+            result.update(_figure_json(found, kind, figure))
+    result['curves'] = [_curve_json(axis) for axis in found.axes]
+    return result
+
+
+def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]:
+    """Return one figure of one sensor for JSON."""
+    axes = {axis.axis: axis.figures[figure] for axis in found.of(kind)}
+    every = [axes.get(axis) for axis in 'xyz'] if axes else []
+    native = any(axis.unit == 'native' for axis in found.of(kind))
+    value, sd = (None, None) if native else found.common(kind, figure)
+    reason = found.needs.get((kind, figure))
+    if native:
+        reason = _NATIVE_REASON[kind]
+    elif not axes:
+        reason = f'the recording has no {kind} with noise'
+    name = f'{kind}_{figure}'
+    return {name: value, f'{name}_sd': sd,
+            f'{name}_axes': [each and each.value for each in every],
+            f'{name}_axes_sd': [each and each.sd for each in every],
+            f'{name}_axes_interval': [each and each.interval for each in every],
+            f'{name}_axes_upper': [each and each.upper for each in every],
+            f'{name}_reason': reason}
+
+
+def _curve_json(axis: AxisNoise) -> dict[str, Any]:
+    return {'sensor': axis.kind, 'axis': axis.axis, 'unit': axis.unit, 'tau': axis.tau,
+            'deviation': axis.deviation, 'low': axis.low, 'high': axis.high,
+            'model': axis.model, 'slope': axis.slope, 'slope_sd': axis.slope_sd,
+            'used': axis.used, 'p_value': axis.p_value}

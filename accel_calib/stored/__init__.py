@@ -1,0 +1,14 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Files of this package: calibrations and what a fleet of sensors has in common.
+
+`exports` makes the files of other programs.
+
+"""
+
+from .calibration_yaml import read_calibration, write_calibration
+from .fleet_yaml import read_prior, write_priors
+
+__all__ = ['read_calibration', 'read_prior', 'write_calibration', 'write_priors']

@@ -1,0 +1,355 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What all exports share: the steady model, the losses, and text that is safe in any file.
+
+Most formats hold no more than an offset, a matrix and a polynomial in the temperature. They are
+made from the steady model: the model in the state in which a sensor is used later. Of the context,
+only the temperature is free. The time is that of the last pose, the supply voltage is the mean of
+the poses, and vibration, rotation, lag and rate of the temperature are zero.
+
+The loss of a format is measured, not derived. The written parameters are applied to readings by
+the equation of the format. The readings are those of forces of 1 g over the sphere, with the
+context of the poses. The loss is the RMS difference to the full correction.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...calibrate import Calibration, in_g
+from ...calibrate.gate import uncertainty_g
+from ...calibrate.quality import with_history
+from ...effects import (
+    AtContext,
+    Context,
+    effect_named,
+    Model,
+    NOMINAL_SUPPLY,
+    REFERENCE_TEMPERATURE,
+)
+from ...errors import InputError
+from ...geometry import OVER_THE_SPHERE, spread_directions
+from ...table import Floats
+from ...units import MG
+
+Correction = Callable[[Floats, Floats], Floats]
+"""(n, 3) readings in the unit of the calibration, (n,) temperatures [°C] -> (n, 3) force [g]."""
+
+_TEMPERATURES = 9
+_POSES = 60
+_DIRECTIONS = 100
+LEAST_LOSS_MG = 0.005
+"""Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
+
+_LARGEST_TEXT = 200
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Choices of an export.
+
+    Parameters
+    ----------
+    name : str
+        Name of the calibration, a C identifier; empty: the sensor's name.
+    instance : int or None
+        Number of the accelerometer in the autopilot; None: the first one.
+    device_id : int or None
+        Device id of the accelerometer in the autopilot; None: not known.
+    axes : {'same', 'flu'}
+        Axes of the readings: those of the autopilot (``same``), or x forward, y left, z up of the
+        same sensor (``flu``, as ROS has them).
+    counts_per_g : float or None
+        Counts per g of the flight controller; None: found from the calibration, or 2048.
+
+    """
+
+    name: str = ''
+    instance: int | None = None
+    device_id: int | None = None
+    axes: str = 'same'
+    counts_per_g: float | None = None
+
+
+@dataclass(frozen=True)
+class Made:
+    """
+    The text of a format, and what it does.
+
+    Parameters
+    ----------
+    content : str or bytes
+        Content of the file.
+    correct : callable or None
+        The correction that the written values make, by the equation of the format; None for a
+        format that holds everything.
+    levelled : bool
+        Whether the correction includes the mounting.
+    notes : tuple of str
+        What the user has to do.
+    rounded : str
+        What the offset is rounded to; empty if it is not.
+
+    """
+
+    content: str | bytes
+    correct: Correction | None
+    levelled: bool
+    notes: tuple[str, ...] = ()
+    rounded: str = ''
+
+
+@dataclass(frozen=True)
+class Loss:
+    """
+    What a format does not hold.
+
+    Parameters
+    ----------
+    effect : str
+        Name of the effect; ``mounting`` for ΔR; empty for all effects together.
+    words : str
+        One line for the user.
+    leaves_mg : float
+        RMS difference to the full correction [mg].
+
+    """
+
+    effect: str
+    words: str
+    leaves_mg: float
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Readings with their full correction: what an export is fitted to or measured by."""
+
+    reading: Floats
+    temperature: Floats
+    force: Floats
+
+
+_TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
+
+
+def temperature_range(calibration: Calibration) -> tuple[float, float] | None:
+    """Return the range of the temperature that acts [°C]; None for a model without temperature."""
+    ranges = [calibration.ranges[key] for key in _TEMPERATURE_KEYS
+              if key in calibration.ranges and key in calibration.model.over]
+    if not ranges:
+        return None
+    low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
+    return low, max(low, high)
+
+
+def steady_context(calibration: Calibration, temperature: Floats) -> Context:
+    """Return the context of the steady model at (n,) temperatures."""
+    none, used = np.zeros((len(temperature), 3)), calibration.used_poses
+    supply = (float(np.mean(used['supply_voltage'])) if 'supply_voltage' in used and len(used)
+              else NOMINAL_SUPPLY)
+    time = calibration.ranges.get('time', (0.0, 0.0))[1]
+    return {'temperature': temperature, 'temperature_of_offset': temperature,
+            'temperature_of_gain': temperature, 'temperature_rate': np.zeros(len(temperature)),
+            'time': np.full(len(temperature), time),
+            'supply_voltage': np.full(len(temperature), supply),
+            'std': none, 'previous': none, 'rate': none}
+
+
+def steady_grid(calibration: Calibration, temperatures: int = _TEMPERATURES, size: float = 1.0
+                ) -> Grid:
+    """Return forces of this size [g] over the sphere and the range of the temperature."""
+    low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE)
+    levels = np.linspace(low, high, temperatures if high > low else 1)
+    force = np.tile(OVER_THE_SPHERE * size, (len(levels), 1))
+    temperature = np.repeat(levels, len(OVER_THE_SPHERE))
+    here = calibration.model.at(steady_context(calibration, temperature))
+    return Grid(calibration.units.from_g(here.reading(force)), temperature, force)
+
+
+def _full_grid(calibration: Calibration) -> Grid:
+    """Return forces over the sphere with the context of the poses."""
+    model = calibration.model
+    if not set(model.needs) - {'temperature'}:
+        return steady_grid(calibration)
+    poses = with_history(in_g(calibration.poses, calibration.units), model)
+    known = calibration.held_context(poses.columns)
+    rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _POSES).astype(int))]
+    directions = spread_directions(_DIRECTIONS)
+    each = np.repeat(rows, len(directions))
+    context: dict[str, Any] = {
+        **steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),
+        **{key: values[each] for key, values in known.items()}}
+    force = np.tile(directions, (len(rows), 1))
+    reading = model.at(_of_the_model(context, model)).reading(force)
+    return Grid(calibration.units.from_g(reading), context['temperature'], force)
+
+
+def _of_the_model(context: Context, model: Model) -> Context:
+    return {key: values for key, values in context.items()
+            if key in (*model.needs, *model.over)}
+
+
+def steady_at(calibration: Calibration, temperature: Floats) -> AtContext:
+    """Return the steady model at (n,) temperatures."""
+    return calibration.model.at(steady_context(calibration, temperature))
+
+
+def difference_mg(calibration: Calibration, made: Made) -> float:
+    """Return the RMS difference between the full correction and that of an export [mg]."""
+    if made.correct is None:
+        return 0.0
+    grid = _full_grid(calibration)
+    wanted = grid.force @ calibration.rotation if made.levelled else grid.force
+    found = made.correct(grid.reading, grid.temperature)
+    return float(np.sqrt(np.mean(np.sum((found - wanted) ** 2, axis=1)))) * MG
+
+
+def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration], Made],
+              made: Made) -> tuple[Loss, ...]:
+    """
+    Return what an export does not hold: the effects, largest first, then all, then the mounting.
+
+    The part of an effect is the loss for a sensor that has this effect alone.
+
+    """
+    total = difference_mg(calibration, made)
+    found = [] if total < LEAST_LOSS_MG else _by_effect(calibration, label, make, made)
+    found.sort(key=lambda loss: -loss.leaves_mg)
+    if total >= LEAST_LOSS_MG and (len(found) != 1 or found[0].leaves_mg < 0.99 * total):
+        found.append(Loss('', f'{label} leaves {total:.2g} mg in all{_where(calibration)}', total))
+    if calibration.is_levelled and not made.levelled:
+        angle = _angle_deg(calibration.rotation)
+        found.append(Loss('mounting', f'{label} has its own setting for the mounting: this file '
+                          f'leaves the rotation of {angle:.2f} deg',
+                          2.0 * np.sin(np.radians(angle) / 2.0) * np.sqrt(2.0 / 3.0) * MG))
+    return tuple(found)
+
+
+def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration], Made],
+               made: Made) -> list[Loss]:
+    """Return the losses of the effects, and of the sensitivity, where they matter."""
+    def left(values: dict[str, Floats]) -> float:
+        kept = Model(values)
+        alone = replace(calibration, model=kept, covariance=np.zeros((len(kept.vector),) * 2))
+        return difference_mg(alone, make(alone))
+
+    ideal = left({})
+    found = [Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal)]
+    for name, values in calibration.model.values.items():
+        part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
+        words = _lacking(name, values, made, left)
+        found.append(Loss(name, f'{label} {words}: leaves {part:.2g} mg', part))
+    return [loss for loss in found if loss.leaves_mg >= LEAST_LOSS_MG]
+
+
+def _lacking(name: str, values: Floats, made: Made, left: Callable[[dict[str, Floats]], float]
+             ) -> str:
+    """Return what a format does with an effect that it does not hold."""
+    if name == 'offset' and made.rounded:
+        return f'rounds the zero-g offset to {made.rounded}'
+    effect = effect_named(name)
+    parameters, shape = effect.split(values)
+    words = effect.words.partition(',')[0]
+    if effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
+        return f'has no lag ({shape[0]:.0f} s) in the {words}'
+    return f'has no {words}'
+
+
+def _where(calibration: Calibration) -> str:
+    limits = temperature_range(calibration)
+    return f', from {limits[0]:.0f} to {limits[1]:.0f} degC' if limits else ''
+
+
+def _angle_deg(rotation: Floats) -> float:
+    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+def affine_fit(calibration: Calibration, *, levelled: bool) -> tuple[Floats, Floats]:
+    """
+    Return the matrix M (3, 3) and the constant c (3,) with force = M reading - c [g].
+
+    For a model of offset and gain they are exact; for others they are the least-squares fit over
+    the sphere and the range of the temperature.
+
+    """
+    if all(effect.linear for effect in calibration.model.terms.effects):
+        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
+        offset = matrix @ calibration.offset
+    else:
+        grid = steady_grid(calibration)
+        scale = calibration.units.per_g
+        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
+        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
+        matrix, offset = found[:3].T / scale, -found[3]
+    turned = calibration.rotation.T if levelled else np.eye(3)
+    return turned @ matrix, turned @ offset
+
+
+def plain_text(text: str) -> str:
+    """
+    Return foreign text that is safe in a comment of any file, C included.
+
+    It is one line of ASCII. It does not end a comment, start one, or contain a trigraph or a
+    backslash.
+
+    """
+    line = ' '.join(text.split())[:_LARGEST_TEXT]
+    safe = ''.join(each if ' ' <= each <= '~' and each not in '?\\' else '.' for each in line)
+    while '*/' in safe or '/*' in safe:
+        safe = safe.replace('*/', '* /').replace('/*', '/ *')
+    return safe
+
+
+def about(calibration: Calibration) -> list[str]:
+    """Return lines about a calibration for a comment: sensor, date, unit, model, quality."""
+    quality, poses = calibration.quality, calibration.used_poses
+    unit = {'m/s2': 'm/s^2', 'g': 'g', 'native': 'native (counts or volts)'}[
+        calibration.units.name]
+    lines = [f'sensor: {plain_text(calibration.sensor) or "not named"}',
+             f'date: {plain_text(calibration.date) or "not known"}',
+             f'readings: {unit}, 1 g = {calibration.units.per_g:.9g}',
+             f'model {plain_text(calibration.name)}: '
+             f'{plain_text(", ".join(calibration.model.effects)) or "no effects"}',
+             f'residual over {len(poses)} poses: before {quality.rms_before_mg:.3g} mg, after '
+             f'{quality.rms_after_mg:.3g} mg',
+             f'uncertainty of |force|: {uncertainty_g(calibration) * MG:.2g} mg (1 sd, largest '
+             'over the sphere)']
+    temperature = poses['temperature'] if 'temperature' in poses else np.zeros(0)
+    if np.any(np.isfinite(temperature)):
+        lines.append(f'temperature of the poses: {np.nanmin(temperature):.1f} to '
+                     f'{np.nanmax(temperature):.1f} degC')
+    return lines
+
+
+def frame_words(calibration: Calibration, levelled: bool) -> str:
+    """Return the frame of the corrected force in words."""
+    if not levelled or not calibration.is_levelled:
+        return 'in the axes of the sensor'
+    axes = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
+            'android': 'x right, y up the screen, z out of it', 'win8': 'as android, z reversed'}
+    return f'in the levelled frame {calibration.frame}: {axes[calibration.frame]}'
+
+
+def in_metric(calibration: Calibration, label: str) -> Calibration:
+    """
+    Return the calibration for readings in m/s².
+
+    Raises
+    ------
+    InputError
+        If the readings are native.
+
+    """
+    if calibration.units.name == 'native':
+        raise InputError(f'the calibration is for native readings, but {label} corrects readings '
+                         'in m/s2', f'fit a calibration to the readings that {label} logs in m/s2')
+    return calibration.in_units('m/s2')

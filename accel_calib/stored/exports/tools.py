@@ -1,0 +1,318 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Files of other tools: imu_calib, imucal, Kalibr and VINS; JSON and NumPy.
+
+========= ================================================ ==================================
+format    equation                                         source
+========= ================================================ ==================================
+imu_calib force = SM raw - bias                            accel_calib.cpp of dpkoch/imu_calib
+imucal    force = R_a⁻¹ K_a⁻¹ (raw - b_a), K_a diagonal    FerrarisCalibrationInfo
+Kalibr    no correction; noise by square root of hertz     wiki, IMU Noise Model
+VINS      no correction; noise of one sample               integration_base.h of VINS-Fusion
+========= ================================================ ==================================
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .made import (
+    about,
+    affine_fit,
+    difference_mg,
+    frame_words,
+    LEAST_LOSS_MG,
+    Made,
+    Options,
+    plain_text,
+)
+from ... import __version__
+from ...calibrate import Calibration
+from ...disk import check_regular
+from ...errors import InputError
+from ...table import Floats
+from ...units import STANDARD_GRAVITY
+
+IMU_CALIB_URL = ('https://github.com/dpkoch/imu_calib/blob/master/src/accel_calib/'
+                 'accel_calib.cpp')
+IMUCAL_URL = 'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'
+KALIBR_URL = 'https://github.com/ethz-asl/kalibr/wiki/IMU-Noise-Model'
+VINS_URL = ('https://github.com/HKUST-Aerial-Robotics/VINS-Fusion/blob/master/vins_estimator/src/'
+            'factor/integration_base.h')
+
+_IMUCAL_VERSION = '2.0.0'
+EQUATION = ('force = transpose(rotation) matrix (reading - offset), plus the effects other than '
+            'offset and gain')
+
+NOISE_KEYS = ('accelerometer_noise_density', 'accelerometer_random_walk',
+              'gyroscope_noise_density', 'gyroscope_random_walk', 'update_rate')
+"""Figures of ``accel-calib noise --json``: m/s²/√Hz, m/s³/√Hz, rad/s/√Hz, rad/s²/√Hz, Hz."""
+
+Noise = Mapping[str, Any]
+
+
+def _affine(calibration: Calibration, factor: float = 1.0) -> tuple[Floats, Floats, Any]:
+    """Return M and c with force = M raw - c in the unit of `apply`, and the correction in g."""
+    unit = calibration.force_per_g * factor
+    matrix, constant = (each * unit for each in affine_fit(calibration, levelled=True))
+    return matrix, constant, lambda reading, temperature: (reading @ matrix.T - constant) / unit
+
+
+def make_imu_calib(calibration: Calibration, options: Options) -> Made:
+    """Return the YAML file of the ROS package imu_calib."""
+    matrix, constant, correct = _affine(calibration)
+    lines = [*_comment(calibration), f'# source: {IMU_CALIB_URL}',
+             f'# equation: force = SM raw - bias; SM row by row; {frame_words(calibration, True)}',
+             'SM:', *(f'  - {yaml_number(value)}' for value in matrix.ravel().tolist()),
+             'bias:', *(f'  - {yaml_number(value)}' for value in constant.tolist())]
+    return Made('\n'.join(lines) + '\n', correct, True)
+
+
+def yaml_number(value: float) -> str:
+    """Return a number for YAML 1.1, which reads 1e-05 without a point as text."""
+    mantissa, exponent, power = repr(float(value)).partition('e')
+    return mantissa + ('' if '.' in mantissa else '.0') + exponent + power
+
+
+def _rounded(value: float) -> float:
+    """Return a figure of the noise with more digits than it has meaning."""
+    return float(f'{value:.9g}')
+
+
+def make_imucal(calibration: Calibration, options: Options) -> Made:
+    """Return the JSON file of imucal: FerrarisCalibrationInfo."""
+    native = calibration.units.name == 'native'
+    matrix, constant, correct = _affine(calibration, STANDARD_GRAVITY if native else 1.0)
+    gain = np.linalg.inv(matrix)
+    sizes = np.linalg.norm(gain, axis=1)
+    rate = calibration.gyro.bias if calibration.gyro is not None else np.zeros(3)
+    unit = {'m/s2': 'm/s^2', 'g': 'g', 'native': 'a.u.'}[calibration.units.name]
+    gyro = '' if calibration.gyro is not None else ' The bias of the gyro is not known: it is 0.'
+    content = {
+        'cal_type': 'Ferraris', 'acc_unit': 'g' if unit == 'g' else 'm/s^2', 'gyr_unit': 'rad/s',
+        'from_acc_unit': unit, 'from_gyr_unit': 'rad/s',
+        'comment': '; '.join(['written by accel-calib export', *about(calibration)])
+        + f'; {frame_words(calibration, True)}.{gyro}',
+        'K_a': np.diag(sizes), 'R_a': gain / sizes[:, np.newaxis], 'b_a': gain @ constant,
+        'K_g': np.eye(3), 'R_g': calibration.rotation, 'K_ga': np.zeros((3, 3)), 'b_g': rate,
+        '_format_version': _IMUCAL_VERSION}
+    return Made(_json(content), correct, True)
+
+
+def make_json(calibration: Calibration, options: Options) -> Made:
+    """Return all values as JSON."""
+    return Made(_json(_content(calibration)), None, True, _affine_alone(calibration))
+
+
+def make_npz(calibration: Calibration, options: Options) -> Made:
+    """Return all values as a NumPy archive; texts and effects are arrays of text."""
+    content = _content(calibration)
+    effects = content.pop('effects')
+    arrays = {key: np.asarray(value) for key, value in content.items()
+              if not isinstance(value, Mapping)}
+    arrays['effects'] = np.asarray(json.dumps(effects, allow_nan=False))
+    for name, values in calibration.model.values.items():
+        arrays[f'effect.{name}'] = values
+    for key, limits in calibration.ranges.items():
+        arrays[f'range.{key}'] = np.array(limits)
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    return Made(file.getvalue(), None, True, _affine_alone(calibration))
+
+
+def _affine_alone(calibration: Calibration) -> tuple[str, ...]:
+    """Return a note about readers that use matrix and offset alone."""
+    left = difference_mg(calibration, Made('', lambda reading, temperature: (
+        reading - calibration.offset) @ calibration.matrix.T @ calibration.rotation
+        / calibration.force_per_g, True))
+    if left < LEAST_LOSS_MG:
+        return ()
+    return (f'matrix and offset without the other effects leave {left:.2g} mg',)
+
+
+def _content(calibration: Calibration) -> dict[str, Any]:
+    """Return the values of a calibration by name."""
+    quality, model = calibration.quality, calibration.model
+    return {
+        'format': 'accel_calib export', 'package_version': __version__, 'equation': EQUATION,
+        'sensor': calibration.sensor, 'stream': calibration.stream, 'date': calibration.date,
+        'units': calibration.units.name, 'per_g': calibration.units.per_g,
+        'force_per_g': calibration.force_per_g, 'model': calibration.name,
+        'frame': calibration.frame, 'levelled': calibration.is_levelled,
+        'matrix': calibration.matrix, 'offset': calibration.offset,
+        'gain': calibration.gain, 'rotation': calibration.rotation,
+        'offset_sd': calibration.offset_sd, 'gain_sd': calibration.gain_sd,
+        'parameters': list(calibration.parameters), 'values': model.vector,
+        'covariance': calibration.covariance,
+        'effects': {name: {'unit': effect.unit, **effect.shown(values)}
+                    for (name, values), effect in zip(model.values.items(), model.terms.effects,
+                                                      strict=True)},
+        'ranges': {key: list(limits) for key, limits in calibration.ranges.items()},
+        'rms_before_mg': quality.rms_before_mg, 'rms_after_mg': quality.rms_after_mg}
+
+
+def _json(content: Mapping[str, Any]) -> str:
+    """Return JSON text; numbers that are not finite are null."""
+    return json.dumps(_plain(content), indent=2, allow_nan=False) + '\n'
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _comment(calibration: Calibration) -> list[str]:
+    return ['# Calibration of an accelerometer, written by accel-calib export.',
+            *(f'# {line}' for line in about(calibration))]
+
+
+def _uncorrected(calibration: Calibration) -> Any:
+    """Return what a tool does that takes the readings as they are."""
+    return lambda reading, temperature: calibration.units.to_g(reading)
+
+
+def make_kalibr(calibration: Calibration, options: Options, noise: Noise | None) -> Made:
+    """
+    Return imu.yaml of Kalibr.
+
+    Raises
+    ------
+    InputError
+        If a figure of the noise is missing.
+
+    """
+    figures, notes = noise_figures(noise, 'Kalibr')
+    units = ('m/s^2/sqrt(Hz)', 'm/s^3/sqrt(Hz)', 'rad/s/sqrt(Hz)', 'rad/s^2/sqrt(Hz)', 'Hz')
+    lines = [*_comment(calibration), f'# source: {KALIBR_URL}',
+             '# Kalibr corrects no offset and gain: correct recordings with accel-calib apply.',
+             *(f'# {note}' for note in notes),
+             f'rostopic: {json.dumps(_topic(calibration))}',
+             *(f'{key}: {yaml_number(_rounded(figures[key]))}  # {unit}'
+               for key, unit in zip(NOISE_KEYS, units, strict=True))]
+    return Made('\n'.join(lines) + '\n', _uncorrected(calibration), False,
+                (*_APPLY, *notes))
+
+
+_APPLY = ('the correction is not in this file: use accel-calib apply for recordings, or the '
+          'calibrator node',)
+
+
+def make_vins(calibration: Calibration, options: Options, noise: Noise | None) -> Made:
+    """
+    Return the lines of the noise for a configuration of VINS.
+
+    Raises
+    ------
+    InputError
+        If a figure of the noise is missing.
+
+    """
+    figures, notes = noise_figures(noise, 'VINS')
+    root = float(np.sqrt(figures['update_rate']))
+    rows = [('acc_n', NOISE_KEYS[0], 'm/s^2'), ('gyr_n', NOISE_KEYS[2], 'rad/s'),
+            ('acc_w', NOISE_KEYS[1], 'm/s^3'), ('gyr_w', NOISE_KEYS[3], 'rad/s^2')]
+    gravity = (calibration.units.per_g if calibration.units.name == 'm/s2' else STANDARD_GRAVITY)
+    lines = [*_comment(calibration), f'# source: {VINS_URL}',
+             '# VINS does not correct offset and gain: correct readings with accel-calib first.',
+             f'# noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)',
+             *(f'# {note}' for note in notes),
+             '# Put these lines into the configuration file, below "imu parameters".',
+             *(f'{name}: {yaml_number(_rounded(figures[key] * root))}  # {unit}, density '
+               f'{figures[key]:.6g}' for name, key, unit in rows),
+             f'g_norm: {yaml_number(gravity)}  # m/s^2']
+    return Made('\n'.join(lines) + '\n', _uncorrected(calibration), False,
+                (*_APPLY, *notes))
+
+
+def _topic(calibration: Calibration) -> str:
+    """Return the topic of the readings; that of most examples if it is not known."""
+    return plain_text(calibration.stream) or '/imu0'
+
+
+def noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
+    """
+    Return the figures of the noise that a file needs, and notes about them.
+
+    A random walk that is not seen in the recording is replaced by its upper limit.
+
+    Raises
+    ------
+    InputError
+        If there is no file of the noise, or a figure is missing or not positive.
+
+    """
+    if noise is None:
+        raise InputError(f'{label} needs the noise of the sensor, but --noise is not given',
+                         'run accel-calib noise RECORDING --json noise.json, and add --noise '
+                         'noise.json')
+    figures, notes = {}, []
+    for key in NOISE_KEYS:
+        limit = _upper_limit(noise, key)
+        figures[key] = _figure(noise, key, label) if limit is None else limit
+        if limit is not None:
+            reason = plain_text(str(noise.get(f'{key}_reason') or 'no reason is stated'))
+            notes.append(f'{key} is not seen ({reason}): its upper limit {limit:.3g} is used')
+    return figures, tuple(notes)
+
+
+def _upper_limit(noise: Noise, key: str) -> float | None:
+    """Return the upper limit of a random walk that is not seen; None for other figures."""
+    limits = noise.get(f'{key}_axes_upper')
+    if noise.get(key) is not None or 'random_walk' not in key or not isinstance(limits, list):
+        return None
+    known = [float(limit) for limit in limits if _is_positive(limit)]
+    return max(known) if known and len(known) == len(limits) else None
+
+
+def _is_positive(value: object) -> bool:
+    return (isinstance(value, int | float) and not isinstance(value, bool)
+            and 0.0 < value < np.inf)
+
+
+def _figure(noise: Noise, key: str, label: str) -> float:
+    value = noise.get(key)
+    if _is_positive(value):
+        return float(value)  # type: ignore[arg-type]
+    reason = plain_text(str(noise.get(f'{key}_reason') or ''))
+    found = f'has no {key}' if value is None else f'has {key} {value!r}'
+    raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but {label} needs '
+                     'a positive number', 'record a longer rest and run accel-calib noise again, '
+                     'or write the figure of the data sheet into the file')
+
+
+def read_noise(path: Path) -> Noise:
+    """
+    Read a file of ``accel-calib noise --json``.
+
+    Raises
+    ------
+    InputError
+        If it is not a JSON object.
+    OSError
+        If the file cannot be read.
+
+    """
+    check_regular(path)
+    try:
+        content = json.loads(path.read_text(encoding='utf-8'))
+    except ValueError as err:
+        raise InputError(f'{path} is not a JSON file, expected the result of accel-calib noise '
+                         '--json', 'run accel-calib noise RECORDING --json noise.json') from err
+    if not isinstance(content, Mapping):
+        raise InputError(f'{path} contains no JSON object, expected the result of accel-calib '
+                         'noise --json', 'run accel-calib noise RECORDING --json noise.json')
+    return content

@@ -1,0 +1,57 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Numbers, counts, dates and tables as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
+from html import escape
+import math
+
+_ZERO = 1e-12
+"""Values below are zero but for rounding."""
+
+
+def short(value: float) -> str:
+    """Return a number with three significant digits."""
+    return f'{value:.3g}'
+
+
+def with_sd(value: float, sd: float) -> str:
+    """
+    Return ``value ± sd`` with two significant digits of the standard deviation.
+
+    A value without a standard deviation has six significant digits.
+
+    """
+    if not sd > 0.0:
+        return '0' if abs(value) < _ZERO else f'{value:.6g}'
+    decimals = max(0, 1 - math.floor(math.log10(sd)))
+    return f'{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}'
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '') -> str:
+    """Return a table of the CSS class `kind`; the text of the cells is escaped."""
+    cells = ''.join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    lines = ''.join('<tr>' + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
+                    for row in rows)
+    opening = f'<table class="{kind}">' if kind else '<table>'
+    return (f'{opening}\n<thead><tr>{cells}</tr></thead>\n'
+            f'<tbody>\n{lines}</tbody>\n</table>\n')
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as ``1 pose`` or ``2 poses``."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
+def listed(noun: str, items: Sequence[object]) -> str:
+    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``."""
+    return f'{noun}{"" if len(items) == 1 else "s"} {", ".join(map(str, items))}'
+
+
+def now() -> str:
+    """Return the date of a result: ISO 8601, UTC, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
