@@ -1,11 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: the folder of real recordings, and a simulated sensor."""
+"""Helpers of several tests: real recordings, a simulated sensor, and the command line."""
 
+import json
 from pathlib import Path
+from typing import Any
 
-from inside import Model, model_with
+from inside import main, Model, model_with
 import numpy as np
 import pytest
 
@@ -28,3 +30,14 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
                        for name in names})
+
+
+def run(*arguments: object) -> int:
+    """Run a command, and return the exit status."""
+    return main([str(argument) for argument in arguments])
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any]:
+    """Run a command, and return the exit status and the JSON on standard output."""
+    status = run(*arguments, '--json', '-')
+    return status, json.loads(capsys.readouterr().out)

@@ -30,6 +30,7 @@ from inside import (
 )
 import numpy as np
 import pytest
+from shared import run
 import yaml
 
 AFFINE = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
@@ -505,12 +506,6 @@ def test_a_damaged_stored_correction_is_refused(old, new):
     assert old in text
     with pytest.raises(DamagedCalibrationError, match='correction'):
         parse_calibration(text.replace(old, new, 1), 'c.yaml')
-
-
-def run(*arguments):
-    from inside import main
-
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture

@@ -14,26 +14,19 @@ from generator import Setup, simulate, write_csv
 from inside import (
     attitude_words,
     Guide,
-    main,
     model_with,
     NOTHING_TO_PLAN,
-    percent,
     Plan,
-    Predictions,
     random_directions,
     read_plan,
     simulate_poses,
-    unit,
     write_plan,
 )
 import numpy as np
 import pytest
+from shared import run
 
 G = units_of('g')
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 def table(path, hidden, *, size, seed, temperature='wandering'):
@@ -105,46 +98,6 @@ def test_temperature_and_drift_are_separated_at_other_temperatures(trends, tmp_p
     assert waits == sorted(waits)
 
 
-def predictions(rng):
-    """Return predictions of two linear models near each other, for 40 candidates."""
-    design = rng.normal(size=(40, 1, 4))
-    rows = (design[:, :, :3], design[:, :, 1:])
-    spreads = (np.diag([0.3, 0.2, 0.4]), np.diag([0.2, 0.3, 0.3]))
-    means = np.array([rows[0] @ [0.5, 0.2, 0.1], rows[1] @ [0.2, 0.1, 0.4]])
-    return Predictions(means, rows, spreads, np.array([0.7, 0.3]))
-
-
-def test_the_expected_probability_is_the_mean_of_simulated_ones():
-    rng = np.random.default_rng(3)
-    made = predictions(rng)
-    taken = [int(np.argmax(made.gains(())))]
-    taken.append(int(np.argmax(made.gains(taken))))
-    found = []
-    values = [np.array([0.5, 0.2, 0.1]), np.array([0.2, 0.1, 0.4])]
-    for _ in range(4000):
-        right = int(rng.uniform() > 0.7)
-        truth = values[right] + rng.normal(size=3) * np.sqrt(np.diag(made.spreads[right]))
-        reading = made.rows[right][taken, 0] @ truth + rng.normal(size=2)
-        logs = []
-        for k in range(2):
-            rows = made.rows[k][taken, 0]
-            whole = np.vstack([rows, np.diag(np.diag(made.spreads[k]) ** -0.5)])
-            known = np.concatenate([reading, values[k] / np.sqrt(np.diag(made.spreads[k]))])
-            left = known - whole @ np.linalg.lstsq(whole, known, rcond=None)[0]
-            logs.append(np.log(made.weights[k]) - left @ left / 2.0)
-        parts = np.exp(logs - np.max(logs))
-        found.append(parts[right] / np.sum(parts))
-    error = np.std(found) / np.sqrt(len(found))
-    assert abs(np.mean(found) - made.expected(taken)) < 4.0 * np.hypot(error, 0.01)
-    assert made.expected(taken) > made.expected(taken[:1]) > made.expected(())
-
-
-def test_a_pose_that_is_taken_gains_less_when_it_is_repeated():
-    made = predictions(np.random.default_rng(4))
-    first = int(np.argmax(made.gains(())))
-    assert made.gains([first])[first] < made.gains(())[first]
-
-
 def test_the_poses_of_the_plan_name_the_hidden_effect():
     rng = np.random.default_rng(11)
     model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
@@ -159,23 +112,6 @@ def test_the_poses_of_the_plan_name_the_hidden_effect():
                      row=np.arange(1, len(poses) + len(more) + 1))
     after = refine(joined, G, base='10')
     assert after.steps[-1].probabilities['cubic'] > 0.95
-
-
-@pytest.mark.parametrize(('up', 'words'), [
-    ((0, 0, 1), 'the top side up (+z)'),
-    ((1, -1, 0), 'the front right edge up (+x -y)'),
-    ((0.05, 0, -1), 'the bottom side up (-z)'),
-    ((np.sin(np.radians(20.0)), 0, np.cos(np.radians(20.0))),
-     'the top side up (+z), tilted by 20° so that the front side (+x) rises'),
-])
-def test_a_direction_is_named_by_a_side_and_a_tilt(up, words):
-    assert attitude_words(unit(np.array([up], float))[0]) == words
-
-
-@pytest.mark.parametrize(('probability', 'words'), [
-    (0.0, '0 %'), (0.001, '< 1 %'), (0.893, '89 %'), (0.999, '> 99 %'), (1.0, '100 %')])
-def test_a_probability_is_certain_only_if_it_is(probability, words):
-    assert percent(probability) == words
 
 
 def planned(up, **context):

@@ -22,14 +22,10 @@ from inside import main, spread_directions
 import pytest
 from test_session import Driver
 
+pytestmark = pytest.mark.usefixtures('home')
+
 Stored = Callable[..., Path]
 Readings = Callable[..., Any]
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return tmp_path / 'home' / 'accel_calib'
 
 
 @pytest.fixture(scope='module')
