@@ -16,7 +16,7 @@ PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
     ('errors', 'text', 'units'),
-    ('disk', 'table'),
+    ('disk', 'finding', 'table'),
     ('geometry',),
     ('effects',),
     ('logs',),

@@ -12,9 +12,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
-from ..effects import effect_named, LADDER
+from ..effects import effect_named, LADDER, value_unit
 from ..estimate.closed_form import sensing_axes
-from ..refine.words import base_words, chance, value_unit
+from ..refine.words import base_words, chance
 from ..table import Floats
 from ..text import counted, short, with_sd
 from ..units import MG

@@ -41,12 +41,13 @@ from ..effects import (
     empirical_parts,
     LADDER,
     REFERENCE_TEMPERATURE,
+    value_unit,
     VARIABLES,
     with_vector,
 )
 from ..estimate.geometry import coverage
 from ..refine.records import percent
-from ..refine.words import chance, value_unit, values_of, verdict_words
+from ..refine.words import chance, values_of, verdict_words
 from ..table import Floats
 from ..text import counted, short, with_sd
 from ..units import MG
