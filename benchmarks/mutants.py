@@ -42,7 +42,8 @@ FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'messages',
            'rating', 'refine')
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
                    r'|OrWithAnd)')
-ELSEWHERE = re.compile(r'test_(ros|live|fleet|docs|launch|packaging|bombs|store_damage)')
+ELSEWHERE = re.compile(
+    r'test_(ros|live|fleet|docs|launch|packaging|dependencies|bombs|store_damage)')
 SLOWER = 10.0
 """How much longer than without a mutant tests may take until they count as failed."""
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from accel_calib.calibrate.checks import axes_of, fault_of, flat_warnings
+from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
 from accel_calib.calibrate.fleet_prior import posterior
 from accel_calib.calibrate.gate import sound_rows
 from accel_calib.calibrate.mounting import (
@@ -163,7 +163,6 @@ from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import _values_in as values_in
 from accel_calib.stored.calibration_yaml import (
     format_calibration,
-    OTHER_CORRECTION,
     parse_calibration,
 )
 from accel_calib.stored.exports import export, identifier

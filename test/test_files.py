@@ -138,8 +138,8 @@ def test_the_previous_calibration_is_kept(calibration, tmp_path):
 
 
 @pytest.mark.parametrize(('old', 'new', 'message'), [
-    ('version: 2\n', 'version: 3\n', 'has version 3, expected 2 or less'),
-    ('version: 2\n', 'version: x\n', 'is damaged .* expected a whole calibration'),
+    ('version: 3\n', 'version: 4\n', 'has version 4, expected 3 or less'),
+    ('version: 3\n', 'version: x\n', 'is damaged .* expected a whole calibration'),
     ('format: accel_calib calibration', 'format: other', 'is not a calibration of accel_calib'),
     ('frame: ros', 'frame: moon', "frame is 'moon', expected one of"),
     ('effects:', 'causes:', 'is damaged .* expected a whole calibration'),

@@ -8,8 +8,9 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
-from accel_calib.calibrate import EDITED, fit_poses, gated
+from accel_calib.calibrate import fit_poses, gated
 from accel_calib.errors import AccelCalibError, RefusedFitError
+from accel_calib.finding import has
 from accel_calib.logs import read_poses
 from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
@@ -126,11 +127,12 @@ def test_values_that_overflow_are_refused(values, calibration):
 
 def test_a_file_edited_by_hand_is_used_with_a_warning(calibration):
     text = format_calibration(calibration)
-    assert EDITED not in parse_calibration(text, 'x.yaml').warnings
+    assert not has(parse_calibration(text, 'x.yaml').noted, 'edited')
     edited = parse_calibration(text.replace('sensor: imu', 'sensor: other'), 'x.yaml')
     assert edited.sensor == 'other'
-    assert EDITED in edited.warnings
-    assert EDITED not in parse_calibration(format_calibration(edited), 'x.yaml').warnings
+    assert has(edited.noted, 'edited')
+    again = parse_calibration(format_calibration(edited), 'x.yaml')
+    assert not has(again.noted, 'edited')
 
 
 def test_calibrations_of_version_1_still_load_and_correct_as_they_did():

@@ -12,6 +12,7 @@ import accel_calib as ac
 from accel_calib.calibrate import verify
 from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
+from accel_calib.finding import Finding
 from accel_calib.rating import rate, rate_comparison, rate_verification, Rating
 from accel_calib.report import write_history_page
 from inside import (
@@ -106,8 +107,8 @@ def test_marks_state_the_residual_of_their_pose(text, calibration):
 
 def test_hostile_names_are_text(calibration, poses):
     labelled = poses.with_columns(label=np.array([HOSTILE] * len(poses)))
-    hostile = replace(calibration, sensor=HOSTILE, date=HOSTILE, warnings=(HOSTILE,),
-                      reason=HOSTILE, poses=labelled)
+    hostile = replace(calibration, sensor=HOSTILE, date=HOSTILE, reason=HOSTILE, poses=labelled,
+                      noted=(Finding('note', HOSTILE),))
     rating = Rating('GOOD', HOSTILE, HOSTILE, HOSTILE)
     text = calibration_page(hostile, rating, HOSTILE, stored=HOSTILE, notes=(HOSTILE,))
     found = parsed(text)

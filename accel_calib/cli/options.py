@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 
 from .terminal import Output, progress
-from ..calibrate import Calibration, EDITED, FleetPrior
+from ..calibrate import Calibration, FleetPrior
 from ..disk import write_atomically
 from ..errors import AccelCalibError, InputError, system_error
 from ..intake import Intake, poses_of
 from ..logs import LogOptions, NAMES
 from ..rating import Rating
-from ..stored import read_calibration
-from ..stored.calibration_yaml import OTHER_CORRECTION
+from ..stored import OF_FILE, read_calibration
 from ..stored.fleet_yaml import read_prior
 from ..table import COLUMNS, Poses
 from ..units import STANDARD_GRAVITY, UNIT_NAMES
@@ -206,9 +205,9 @@ def plain(value: object) -> Any:
 def stored_calibration(path: Path) -> Calibration:
     """Read a stored calibration; report on standard error if it was edited by hand."""
     calibration = read_calibration(path)
-    for warning in (EDITED, OTHER_CORRECTION):
-        if warning in calibration.warnings:
-            Output(stderr=True).print(f'note: {path}: {warning}')
+    for found in calibration.noted:
+        if found.kind in OF_FILE:
+            Output(stderr=True).print(f'note: {path}: {found.words}')
     return calibration
 
 

@@ -35,10 +35,8 @@ from .work import (
     summary,
 )
 from ..calibrate import (
-    ARBITRARY_HEADING,
     Calibration,
     carried_words,
-    FLAT,
     level,
     mounting_only,
     set_heading,
@@ -262,8 +260,8 @@ class Commands:
         """Return the job that stores and uses, or offers, a calibration with a new mounting."""
         offered = offered or self._session.settings.confirm
         words = [*words, change_words(self.present, calibration), *(
-            each for each in calibration.warnings
-            if each.startswith(FLAT) or each == ARBITRARY_HEADING)]
+            each.words for each in calibration.noted
+            if each.kind in ('flat_pose', 'heading'))]
         return self._job_to_store(self._session.files.usable(), calibration, words,
                                   offered=offered)
 
