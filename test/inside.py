@@ -85,7 +85,6 @@ from accel_calib.fleet.store import schema, write_parquet
 from accel_calib.geometry import (
     OVER_THE_SPHERE,
     quaternion_of,
-    random_directions,
     rotation_from_rpy,
     spread_directions,
     unit,
@@ -169,7 +168,7 @@ from accel_calib.stored.exports import export, identifier
 from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
 from accel_calib.stored.exports import Options as ExportOptions
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
-from accel_calib.stored.plan_table import read_plan, write_plan
+from accel_calib.stored.plan_table import write_plan
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""

@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from accel_calib.geometry import unit
+from accel_calib.table import Floats
 from inside import main, Model, model_with
 import numpy as np
 import pytest
@@ -30,6 +32,11 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
                        for name in names})
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Floats:
+    """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
+    return unit(rng.normal(size=(count, 3)))
 
 
 def run(*arguments: object) -> int:

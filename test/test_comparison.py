@@ -17,7 +17,6 @@ from inside import (
     Model,
     model_with,
     PARAMETER_NAMES,
-    random_directions,
     rotation_free,
     rotation_from_rpy,
     Runs,
@@ -26,7 +25,7 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 

@@ -27,12 +27,11 @@ from inside import (
     parameter_basis,
     parse_calibration,
     predict,
-    random_directions,
     simulate_poses,
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 COUNT = 100
 G = units_of('g')

@@ -14,9 +14,10 @@ from accel_calib.rating import rate, Rating
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import format_calibration, parse_calibration, random_directions
+from inside import format_calibration, parse_calibration
 import numpy as np
 import pytest
+from shared import random_directions
 
 G = units_of('g')
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],

@@ -8,10 +8,10 @@ from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import lower_triangular, sensing_axes
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
-from inside import predict, random_directions, rotation_from_rpy, simulate_poses, spread_directions
+from inside import predict, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 

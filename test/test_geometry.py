@@ -14,7 +14,6 @@ from inside import (
     missing_poses,
     model_with,
     predict,
-    random_directions,
     refuse_if_unfit,
     rotation_from_rpy,
     simulate_poses,
@@ -23,7 +22,7 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 FACES = np.vstack([np.eye(3), -np.eye(3)])

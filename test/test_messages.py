@@ -28,7 +28,6 @@ from inside import (
     frame_ids,
     Model,
     predict,
-    random_directions,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
@@ -37,7 +36,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import sensor
+from shared import random_directions, sensor
 
 UNITS = units_of('m/s2')
 NAMES = ['', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'übung', 'x' * 300]

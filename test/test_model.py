@@ -12,13 +12,13 @@ from inside import (
     parameter_basis,
     parse_effect,
     predict,
-    random_directions,
     reading_of,
     rotation_from_rpy,
     with_linear_part,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 
 @pytest.fixture

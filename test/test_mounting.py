@@ -5,9 +5,10 @@
 
 from accel_calib.calibrate import flat_direction, FRAMES
 from accel_calib.errors import InputError
-from inside import mounting, random_directions, rotation_from_rpy, with_heading, with_heading_of
+from inside import mounting, rotation_from_rpy, with_heading, with_heading_of
 import numpy as np
 import pytest
+from shared import random_directions
 
 ATTITUDES = [(0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0),
              (0, 180, 0), (0, 0, 90), (20, -30, 40), (90, 90, 90), (179.9, 0.1, 0)]

@@ -15,14 +15,13 @@ from inside import (
     grid_step,
     Model,
     off_grid,
-    random_directions,
     simulate_recording,
     spread_directions,
     unclipped,
 )
 import numpy as np
 import pytest
-from shared import data, sensor
+from shared import data, random_directions, sensor
 
 G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
 COUNTS_PER_G = 4056.0

@@ -19,13 +19,13 @@ from inside import (
     model_with,
     OVER_THE_SPHERE,
     predict,
-    random_directions,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 hypothesis = pytest.importorskip('hypothesis')
 st = pytest.importorskip('hypothesis.strategies')

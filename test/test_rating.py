@@ -19,10 +19,10 @@ from accel_calib.rating import (
 )
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import random_directions, spread_directions
+from inside import spread_directions
 import numpy as np
 import pytest
-from shared import data
+from shared import data, random_directions
 
 MS2, NATIVE = units_of('m/s2'), units_of('native')
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],

@@ -16,13 +16,12 @@ from inside import (
     LARGEST_SAMPLE,
     model_with,
     parse_calibration,
-    random_directions,
     simulate_poses,
     spread_directions,
 )
 import numpy as np
 import pytest
-from shared import data, sensor
+from shared import data, random_directions, sensor
 
 MPS2, G = units_of('m/s2'), units_of('g')
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')

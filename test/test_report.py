@@ -11,7 +11,6 @@ from inside import (
     all_drawings,
     curve_parts,
     model_with,
-    random_directions,
     refinement_page,
     simulate_poses,
     values_of,
@@ -20,6 +19,7 @@ from inside import (
 import numpy as np
 from page_parser import parsed
 import pytest
+from shared import random_directions
 
 pytest.importorskip('matplotlib')
 

@@ -19,7 +19,6 @@ from inside import (
     names_of,
     Process,
     process_of,
-    random_directions,
     RARE,
     REFINE_LEVEL,
     SIGNIFICANT,
@@ -31,7 +30,7 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 COUNT = 60
 BASE = ('offset', 'axis_gain', 'cross_axis')

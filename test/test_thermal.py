@@ -12,13 +12,13 @@ from inside import (
     low_passed,
     Model,
     predict,
-    random_directions,
     rate_of,
     simulate_poses,
     ThermalStream,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 KEY = 'temperature_of_offset'
 START = 1.7e9

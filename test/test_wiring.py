@@ -10,18 +10,10 @@ from accel_calib.finding import without
 from accel_calib.logs import write_table
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import (
-    axes_of,
-    fault_of,
-    main,
-    random_directions,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-)
+from inside import axes_of, fault_of, main, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 SWAP_XY = np.eye(3)[[1, 0, 2]]
