@@ -554,7 +554,7 @@ def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> 
 
 def _asked(units: UnitName | None, calibration: calibrate.Calibration) -> UnitName | None:
     """Return the unit to read poses in: native for a native calibration, else recognised."""
-    return units or ('native' if calibration.units.name == 'native' else None)
+    return units or ('native' if calibration.units.is_native else None)
 
 
 def _in_units_of(calibration: calibrate.Calibration, table: Table, asked: UnitName | None

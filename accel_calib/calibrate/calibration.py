@@ -175,7 +175,7 @@ class Calibration:
     @property
     def force_per_g(self) -> float:
         """Corrected force per g: 1 for native readings, whose corrected force is in g."""
-        return 1.0 if self.units.name == 'native' else self.units.per_g
+        return 1.0 if self.units.is_native else self.units.per_g
 
     @property
     def offset(self) -> Floats:
@@ -258,9 +258,9 @@ class Calibration:
 
         """
         own = self.units
-        if table.units or own.name == 'native' or not len(table):
+        if table.units or own.is_native or not len(table):
             return self.in_units(table.units or own.name)
-        other = self.in_units('g' if own.name == 'm/s2' else 'm/s2')
+        other = self.in_units('g' if own.is_si else 'm/s2')
         with np.errstate(over='ignore'):
             length = float(np.median(np.linalg.norm(table.reading, axis=1)))
         border = float(np.sqrt(own.per_g * other.units.per_g))

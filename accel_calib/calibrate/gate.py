@@ -133,7 +133,7 @@ def _check_gain(calibration: Calibration) -> None:
                               f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     offset = float(np.linalg.norm(vec_v))
-    if calibration.units.name != 'native' and not offset <= LARGEST_OFFSET_G:
+    if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
 
@@ -238,7 +238,7 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
         centre = np.median(poses.reading, axis=0)
         away = np.linalg.norm(poses.reading - centre, axis=1)
     scale = units.per_g
-    if units.name == 'native':
+    if units.is_native:
         scale = float(np.median(away)) * _NATIVE_SPREADS / _LARGEST_REST_G
         length = away
     wild = ~(length <= _LARGEST_REST_G * scale)

@@ -63,7 +63,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         by_norm = _unless_placed_well(poses, units)
         if by_norm is not None:
             return by_norm
-    if units.name == 'native':
+    if units.is_native:
         mat_x = fit_12(poses.reading, poses['reference'])[0]
         units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
     refuse_if_unfit('12', unit(poses['reference']))
@@ -107,7 +107,7 @@ def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
         raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
                               'but model 12 needs known orientations', 'add these columns, use '
                               'only the six faces (--rows), or use model 10')
-    force = faces_up * (1.0 if units.name == 'native' else units.per_g)
+    force = faces_up * (1.0 if units.is_native else units.per_g)
     return poses.with_columns(reference=force), 'the poses are the six faces'
 
 

@@ -216,7 +216,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
 
 def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected, ...]]:
     """Return the plausible poses, without doubtful ones if others are left, and the other rows."""
-    if units.name == 'native':
+    if units.is_native:
         raise InputError(f'the readings are in native units, and {what} does not determine their '
                          'scale; expected readings in m/s2 or g', 'convert the readings, or turn '
                          'the sensor to 9 or more poses spread over the sphere and fit')

@@ -111,7 +111,7 @@ class Verification:
 def in_g(poses: Poses, units: Units) -> Poses:
     """Return the poses with readings, std and reference in g; native references are in g."""
     scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
-    if 'reference' in poses and units.name != 'native':
+    if 'reference' in poses and not units.is_native:
         scaled['reference'] = units.to_g(poses['reference'])
     return poses.with_columns(**scaled)
 
@@ -199,7 +199,7 @@ def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
 
     """
     reading = poses_g.reading
-    if units.name == 'native':
+    if units.is_native:
         reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
     if vectors:
         return np.linalg.norm(reading - poses_g['reference'], axis=1)

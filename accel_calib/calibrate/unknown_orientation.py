@@ -84,7 +84,7 @@ def directions_of(poses: Poses, units: Units) -> Floats:
 
     """
     raw = unit(poses.reading)
-    if units.name != 'native' and dilution('4', raw) > WEAK_DILUTION:
+    if not units.is_native and dilution('4', raw) > WEAK_DILUTION:
         return raw
     return unit(poses.reading - fit_4(poses.reading)[1])
 
@@ -148,7 +148,7 @@ def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -
 
 def own_scale(poses: Poses, units: Units) -> Units:
     """Return native units with the scale estimated from the poses; other units unchanged."""
-    if units.name != 'native':
+    if not units.is_native:
         return units
     if len(poses) < free_parameters('4'):
         refuse_if_unfit('4', np.zeros((len(poses), 3)))

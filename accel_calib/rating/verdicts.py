@@ -162,7 +162,7 @@ def _on_new_poses(verification: Verification, expected: Expected, error: float
                   ) -> Iterator[Finding]:
     """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
-    native = expected.calibration.units.name == 'native'
+    native = expected.calibration.units.is_native
     before = _without_noise(verification.rms_before_mg, floor)
     if error > BAD_ERROR.value:
         yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '

@@ -73,7 +73,7 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
 def ideal(poses: Poses, units: Units) -> Calibration:
     """Return the ideal sensor; for native readings with a fitted offset and scale."""
     values: dict[str, Floats] = {}
-    if units.name == 'native':
+    if units.is_native:
         mat_w, vec_v = fit_4(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
         values = {'offset': vec_v / units.per_g}
