@@ -6,62 +6,51 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from . import options
-from .terminal import progress, working
+from rich import box
+from rich.table import Table
+
+from .frame import Done, progress, working
+from .inputs import log_options, stored_calibration
 from ..calibrate import Calibration, check_sensor, of_samples
 from ..errors import InputError
 from ..logs import open_log, OpenLog, Progress
-from ..noise import check_allantools, duration, joined, noise_of, NoiseFigures, to_json
-from ..report import check_matplotlib
+from ..noise import (
+    AxisNoise,
+    check_allantools,
+    duration,
+    joined,
+    noise_of,
+    NoiseFigures,
+    to_json,
+)
 from ..report.noise_page import figure_rows, kalibr_lines, need_lines, write_noise_page
 from ..table import Recording
 from ..text import counted
 from ..units import Units, units_of
 
-if TYPE_CHECKING:
-    from rich.table import Table
 
-    from ..noise import AxisNoise
-
-_EXAMPLE = 'accel-calib noise rest.mcap --json noise.json --report noise.html'
-
-
-def add_to(made: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    options.add_example(made, _EXAMPLE)
-    made.add_argument('recording', type=Path, metavar='RECORDING',
-                      help='recording with a long rest: any log, or a bag')
-    made.add_argument('-c', '--calibration', type=Path, metavar='FILE',
-                      help='stored calibration to apply first, for readings in counts or volts')
-    made.add_argument('--report', type=Path, metavar='FILE',
-                      help='page to write with the Allan deviation and the figures (HTML)')
-    options.add_log(made)
-    options.add_json(made)
-    made.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Find the rest, compute the figures, and print them."""
+def run_noise(args: argparse.Namespace) -> Done:
+    """Find the rest, and compute the figures."""
     check_allantools()
-    if args.report is not None:
-        check_matplotlib()
     found, lines = _noise(args)
-    options.write_json(args.json, {'recording': args.recording, **to_json(found)})
     if args.report is not None:
         with working('drawing the page'):
             write_noise_page(args.report, found, str(args.recording))
-    _show(args, found, lines)
-    return 0
+        stored = [f'stored in {args.report}']
+    else:
+        stored = []
+    return Done({'recording': args.recording, **to_json(found)},
+                [*lines, *_shown(found), *stored])
 
 
 def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
     """Return the figures, and how the recording was read."""
-    asked = options.log_options(args)
-    calibration = args.calibration and options.stored_calibration(args.calibration)
+    asked = log_options(args)
+    calibration = args.calibration and stored_calibration(args.calibration)
     if calibration and calibration.units.name == 'native':
         asked = replace(asked, units=asked.units or 'native')
     with open_log(args.recording, asked) as log:
@@ -101,28 +90,19 @@ def _corrected(recording: Recording, units: Units, calibration: Calibration
     return made, units_of('g') if units.name == 'native' else units
 
 
-def _show(args: argparse.Namespace, found: NoiseFigures, lines: list[str]) -> None:
-    """Print the figures by axis, the notes, and the figures for Kalibr."""
-    console = options.console(args)
-    for line in lines:
-        console.print(line)
-    console.print(f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
-                  f'{found.rate:.5g} Hz')
+def _shown(found: NoiseFigures) -> Iterator[str | Table]:
+    """Yield the figures by axis, the notes, and the figures for Kalibr."""
+    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
+           f'{found.rate:.5g} Hz')
     for kind in found.kinds:
-        console.print(_table(kind, found.of(kind)))
-    for line in [f'note: {note}' for note in found.notes] + need_lines(found):
-        console.print(line)
-    for line in kalibr_lines(found):
-        console.print(line)
-    if args.report is not None:
-        console.print(f'stored in {args.report}')
+        yield _table(kind, found.of(kind))
+    yield from (f'note: {note}' for note in found.notes)
+    yield from need_lines(found)
+    yield from kalibr_lines(found)
 
 
 def _table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
     """Return the table of one sensor, at most 60 columns wide."""
-    from rich import box
-    from rich.table import Table
-
     table = Table(title=kind, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column('')
     for axis in axes:
