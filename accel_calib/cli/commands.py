@@ -328,7 +328,7 @@ COMMANDS = {
         'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
         'nodes', 'accel-calib demo --hidden temperature', _demo),
     'calibrate': Command(
-        'make a calibration, a page and a verdict from any log', 'refine',
+        'make a calibration, a page and a verdict from any log', 'fit',
         'accel-calib calibrate log.csv --flat last', _calibrate, 'calibration', 'log'),
     'capture': Command(
         'find the still stretches of a recording and write the pose table', 'recordings',
@@ -353,7 +353,7 @@ COMMANDS = {
         'accel-calib refine poses.csv -o refined.yaml --report report.html', _refine,
         'calibration', 'poses'),
     'fleet': Command(
-        'calibrate the recordings of many sensors in parallel, on Dask', 'fleet',
+        'calibrate the recordings of many sensors in parallel, on Dask', 'fit',
         'accel-calib fleet recordings/ -o results/\n'
         "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786",
         _fleet),
@@ -364,7 +364,7 @@ COMMANDS = {
         'write a calibration in the format of a firmware, an autopilot or another tool', 'export',
         'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
     'noise': Command(
-        'find noise density, bias instability and random walk from a long rest', 'noise',
+        'find noise density, bias instability and random walk from a long rest', 'recordings',
         'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
     'simulate': Command(
         'simulate poses or a recording of a sensor with known effects', 'recordings',

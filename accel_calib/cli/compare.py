@@ -15,8 +15,8 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from .fit import error_line, rated
-from .frame import Done, plain, working
+from .fit import error_line, rated, short_if_known
+from .frame import Done, plain, table, working
 from .inputs import intake_for, rows_between
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
@@ -56,23 +56,15 @@ def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
     for name, result in zip(names, results, strict=True):
         for line in (error_line(result),) if 'error' in result else result['read_lines']:
             yield f'{name}{line}'
-    yield _residual_table([result for result in results if 'error' not in result])
+    yield table(
+        'Residual of |force| over these poses [mg]',
+        ('poses', 'before', 'after', 'largest after', 'noise floor'),
+        ((result['file'], short(result['rms_before_mg']), short(result['rms_after_mg']),
+          short(result['max_after_percent'] * 10), short_if_known(result['noise_floor_mg']))
+         for result in results if 'error' not in result))
     for name, result in zip(names, results, strict=True):
         for line in result.get('rating_lines', ()):
             yield f'{name}{line}'
-
-
-def _residual_table(results: list[dict[str, Any]]) -> Table:
-    table = Table(title='Residual of |force| over these poses [mg]')
-    table.add_column('poses', overflow='fold')
-    for name in ('before', 'after', 'largest after', 'noise floor'):
-        table.add_column(name, justify='right')
-    for result in results:
-        floor = result['noise_floor_mg']
-        table.add_row(str(result['file']), short(result['rms_before_mg']),
-                      short(result['rms_after_mg']), short(result['max_after_percent'] * 10),
-                      'not known' if floor is None else short(floor))
-    return table
 
 
 def run_compare(args: argparse.Namespace) -> Done:
@@ -102,8 +94,19 @@ def _comparison_result(paths: list[Path], models: list[str], comparison: Compari
 
 def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
                       ) -> Iterator[Any]:
-    yield _runs_table(paths, models, comparison)
-    yield _parameters_table(comparison)
+    yield table(
+        'Corrected |a| minus the mean of the others [mg]',
+        ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
+        ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
+          f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
+         enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
+    yield table(
+        'Spread of the parameters over the runs [mg]',
+        ('', 'mean', 'spread', 'stated', 'ratio'),
+        ((one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
+          f'{(one.stated_sd ** 2).mean() ** 0.5 * MG:.3g}',
+          '' if one.ratio is None else f'{one.ratio:.2f}')
+         for one in comparison.parameters if np.any(one.stated_sd)))
     for note in comparison.notes:
         yield f'note: {note}'
     if comparison.tilt_deg is not None:
@@ -122,34 +125,6 @@ def _answer(comparison: Comparison) -> str:
         return f'The calibrations do not agree ({test}){more}.'
     return (f'The calibrations do not agree ({test}): run {comparison.outlier + 1} differs, the '
             'others agree.')
-
-
-def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) -> Table:
-    """Return a table that compares each run with the others."""
-    table = Table(title='Corrected |a| minus the mean of the others [mg]')
-    table.add_column('run', overflow='fold')
-    for name in ('model', 'RMS', 'expected', 'largest', 'p'):
-        table.add_column(name, justify='right')
-    for number, (path, model, run) in enumerate(zip(paths, models, comparison.runs,
-                                                    strict=True), 1):
-        table.add_row(f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
-                      f'{run.largest_mg:.3g}', f'{run.p_value:.2g}')
-    return table
-
-
-def _parameters_table(comparison: Comparison) -> Table:
-    """Return a table of the spread of each parameter."""
-    table = Table(title='Spread of the parameters over the runs [mg]')
-    table.add_column('')
-    for name in ('mean', 'spread', 'stated', 'ratio'):
-        table.add_column(name, justify='right')
-    for one in comparison.parameters:
-        if not np.any(one.stated_sd):
-            continue  # not in the model
-        stated = float((one.stated_sd ** 2).mean() ** 0.5) * MG
-        table.add_row(one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
-                      f'{stated:.3g}', '' if one.ratio is None else f'{one.ratio:.2f}')
-    return table
 
 
 def run_history(args: argparse.Namespace) -> Done:
@@ -212,17 +187,17 @@ def _dates_table(history: History) -> Table:
     """Return a table of offset and gain, one row per calibration and axis."""
     from ..report.repeats import GAINS, in_words, OFFSETS
 
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
+    made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for name in ('date', ''):
-        table.add_column(name, no_wrap=True)
+        made.add_column(name, no_wrap=True)
     for name in ('offset [mg]', 'gain - 1 [%]'):
-        table.add_column(name, no_wrap=True, justify='right')
+        made.add_column(name, no_wrap=True, justify='right')
     found = {each.name: each for each in history.parameters}
     for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
         warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
         for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
             cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
                      for name in names)
-            table.add_row(begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
-                                                 for cell in cells))
-    return table
+            made.add_row(begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                for cell in cells))
+    return made

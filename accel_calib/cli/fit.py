@@ -1,20 +1,21 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib fit``: from poses to a calibration, and how a calibration is shown."""
+"""``accel-calib fit``, ``calibrate`` and ``fleet``: from logs to calibrations."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
 
-from .frame import Done, working
-from .inputs import intake, prior, rows_between
+from .frame import console, Done, progress, table, working
+from .inputs import given, intake, log_options, prior, rows_between, settings
 from ..calibrate import (
     Calibration,
     fit_poses,
@@ -31,8 +32,15 @@ from ..intake import Intake
 from ..rating import rate, Rating
 from ..stored import write_calibration
 from ..table import Floats, Poses
-from ..text import counted, now, with_sd
+from ..text import counted, now, short, with_sd
 from ..units import MG
+
+if TYPE_CHECKING:
+    from ..fleet import Summary
+    from ..pipeline import Outcome
+
+BAD_RATING = 1
+"""Exit status of ``calibrate`` for a calibration that is BAD."""
 
 
 def run_fit(args: argparse.Namespace) -> Done:
@@ -96,6 +104,75 @@ def error_line(result: dict[str, Any]) -> str:
 def rated(rating: Rating) -> dict[str, str]:
     """Return a rating for JSON."""
     return {'rating': rating.name, 'rating_reason': rating.reason}
+
+
+def run_calibrate(args: argparse.Namespace) -> Done:
+    """Calibrate, store, and write the page."""
+    from .refine import refinement_result
+    from ..pipeline import calibrated
+
+    found = intake(args, args.log)
+    with working('fitting'):
+        outcome = calibrated(found.poses, found.units, flat=args.flat, nose_down=args.nose_down,
+                             frame=args.frame, sensor=args.sensor, refined=args.refined,
+                             fleet=prior(args))
+    stored = _stored_outcome(args, found, outcome)
+    refinement, rating = outcome.refinement, outcome.rating
+    return Done(
+        {'file': args.log, **calibration_result(outcome.calibration, 'auto'), **rated(rating),
+         'read_lines': found.lines, 'refined': outcome.line,
+         'refinement': None if refinement is None else refinement_result(refinement)},
+        [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
+         *rating.lines], BAD_RATING if rating.name == 'BAD' else 0)
+
+
+def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
+    """Write the calibration, unless it is BAD, and the page; return lines about them."""
+    from ..report import has_matplotlib, write_calibration_page
+
+    if outcome.rating.name != 'BAD' or args.keep_bad:
+        write_calibration(args.output, outcome.calibration)
+        line = f'stored in {args.output}'
+    else:
+        line = 'not stored, because it is BAD; to store it, use --keep-bad'
+    page = args.output.with_suffix('.html')
+    if not has_matplotlib():
+        return [line, f'no page {page}: matplotlib is not installed']
+    with working('drawing the page'):
+        write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
+                               refinement=outcome.refinement, stored=str(args.output),
+                               notes=found.lines)
+    return [line, f'page: {page}']
+
+
+def run_fleet(args: argparse.Namespace) -> Done:
+    """Calibrate many recordings on Dask."""
+    from ..fleet import cluster, Options, recordings, run, STATUS, Store
+
+    with working('looking for recordings'):
+        found = list({each.path: each for each in recordings(args.recordings)}.values())
+    asked = Options(**{**given(Options, args), 'log': log_options(args),
+                       'settings': settings(args), 'exports': tuple(dict.fromkeys(args.export))})
+    with cluster(args.scheduler, args.workers) as client:
+        console(args).print(f'{counted(len(found), "recording")}; dashboard: '
+                            f'{client.dashboard_link}')
+        with progress('recordings') as moved:
+            summary = run(client, found, asked, Store(args.output.absolute()), moved)
+    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
+                 'sensors': summary.sensors}, _summary_lines(summary, args.output))
+
+
+def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
+    """Yield the summary as lines of text."""
+    counts = summary.counts
+    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
+           f'could not be read, {counts["skipped"]} skipped because they are done')
+    for row in summary.sensors:
+        for change in row['changes']:
+            if change['for_good']:
+                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
+                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
+    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
 
 
 def calibration_result(calibration: Calibration, asked: str) -> dict[str, Any]:
@@ -179,16 +256,14 @@ def calibration_lines(calibration: Calibration) -> Iterator[Any]:
 def _quality_table(calibration: Calibration) -> Table:
     """Return a table of the residual before and after the fit."""
     quality = calibration.quality
-    table = Table(title='Residual of |force| [mg]')
-    table.add_column(f'model {calibration.name}, {counted(len(calibration.used_poses), "pose")}')
-    for name in ('before', 'after'):
-        table.add_column(name, justify='right')
-    table.add_row('RMS', _short(quality.rms_before_mg), _short(quality.rms_after_mg))
-    table.add_row('largest', _short(quality.max_before_percent * MG / 100.0),
-                  _short(quality.max_after_percent * MG / 100.0))
-    table.add_row('held out', '', _short(quality.held_out_rms_mg))
-    table.add_row('noise floor', '', _short(quality.noise_floor_mg))
-    return table
+    return table('Residual of |force| [mg]', (
+        f'model {calibration.name}, {counted(len(calibration.used_poses), "pose")}', 'before',
+        'after'), (
+        ('RMS', short(quality.rms_before_mg), short(quality.rms_after_mg)),
+        ('largest', short(quality.max_before_percent * MG / 100.0),
+         short(quality.max_after_percent * MG / 100.0)),
+        ('held out', '', short_if_known(quality.held_out_rms_mg)),
+        ('noise floor', '', short_if_known(quality.noise_floor_mg))))
 
 
 def _parameter_table(calibration: Calibration) -> Table:
@@ -228,5 +303,6 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
             yield f'{effect} {own}', with_sd(value * scale, sd * scale), unit
 
 
-def _short(value: float | None) -> str:
-    return 'not known' if value is None else f'{value:.3g}'
+def short_if_known(value: float | None) -> str:
+    """Return a number in three digits, or that it is not known."""
+    return 'not known' if value is None else short(value)

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from .commands import BAD_INPUT, COMMANDS
 from .terminal import shown
@@ -349,6 +350,17 @@ class Output(Console):
         parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
                      break_on_hyphens=False)
         return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table whose first column holds names, and the others numbers."""
+    made = Table(title=title)
+    made.add_column(columns[0], overflow='fold')
+    for name in columns[1:]:
+        made.add_column(name, justify='right')
+    for row in rows:
+        made.add_row(*row)
+    return made
 
 
 @contextmanager

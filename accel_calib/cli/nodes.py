@@ -13,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 from rich.table import Table
 
 from .commands import HIDDEN
-from .frame import console, Done, Output
+from .frame import console, Done, Output, table
 from .inputs import log_options
 from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
@@ -109,13 +109,10 @@ def _verdict(outcome: Outcome) -> str:
 
 
 def _table(outcome: Outcome) -> Table:
-    table = Table(title=f'Errors at {outcome.rests} rests in other poses, '
-                  f'after {outcome.seconds:.0f} s')
-    table.add_column('')
-    for name in (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
-                 ('imu/data_raw', 'imu/data_calibrated')):
-        table.add_column(name, justify='right')
+    columns = (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
+               ('imu/data_raw', 'imu/data_calibrated'))
     before, after = asdict(outcome.before), asdict(outcome.after)
-    for name, words in _ERRORS.items():
-        table.add_row(words, f'{before[name]:.3g}', f'{after[name]:.3g}')
-    return table
+    return table(
+        f'Errors at {outcome.rests} rests in other poses, after {outcome.seconds:.0f} s',
+        ('', *columns), ((words, f'{before[name]:.3g}', f'{after[name]:.3g}')
+                         for name, words in _ERRORS.items()))

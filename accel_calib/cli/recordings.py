@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib capture``, ``apply`` and ``simulate``: commands that write a table or a bag."""
+"""``accel-calib capture``, ``apply``, ``simulate`` and ``noise``: commands on recordings."""
 
 from __future__ import annotations
 
@@ -9,8 +9,13 @@ import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from .frame import Done, progress
+from rich import box
+from rich.table import Table
+
+from .frame import Done, progress, working
 from .inputs import log_options, settings, stored_calibration
 from ..calibrate import (
     Calibration,
@@ -25,10 +30,13 @@ from ..capture import capture, Captured, settings_from
 from ..effects import Context, parse_effect
 from ..errors import InputError
 from ..intake import Intake, nothing_still
-from ..logs import is_bag, open_log, write_blocks, write_table
+from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
 from ..table import Poses, Recording
 from ..text import counted
-from ..units import UnitName
+from ..units import UnitName, Units, units_of
+
+if TYPE_CHECKING:
+    from ..noise import AxisNoise, NoiseFigures
 
 
 def run_capture(args: argparse.Namespace) -> Done:
@@ -138,3 +146,94 @@ def run_simulate(args: argparse.Namespace) -> Done:
     table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)
     write_table(args.output, table)
     return Done(shown=[f'{counted(len(table), "row")}, stored in {args.output}'])
+
+
+def run_noise(args: argparse.Namespace) -> Done:
+    """Find a long rest, and compute the figures of its noise."""
+    from ..noise import check_allantools, to_json
+    from ..report.noise_page import write_noise_page
+
+    check_allantools()
+    found, lines = _noise(args)
+    if args.report is not None:
+        with working('drawing the page'):
+            write_noise_page(args.report, found, str(args.recording))
+        stored = [f'stored in {args.report}']
+    else:
+        stored = []
+    return Done({'recording': args.recording, **to_json(found)},
+                [*lines, *_noise_lines(found), *stored])
+
+
+def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
+    """Return the figures, and how the recording was read."""
+    from ..noise import noise_of
+
+    asked = log_options(args)
+    calibration = args.calibration and stored_calibration(args.calibration)
+    if calibration and calibration.units.name == 'native':
+        asked = replace(asked, units=asked.units or 'native')
+    with open_log(args.recording, asked) as log:
+        with progress('samples') as moved:
+            recording = _samples(log, args.recording, moved)
+        lines = [f'read as: {log.read_as}'] if log.read_as else []
+        lines += [f'note: {note}' for note in log.notes]
+        units = log.units
+    if calibration:
+        recording, units = _corrected_rest(recording, units, calibration)
+    with progress('axes') as moved:
+        return noise_of(recording, units, args.gravity, moved), lines
+
+
+def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
+    """
+    Return the samples of a log.
+
+    A table of slow samples has the form of a pose table without the columns of a pose.
+
+    """
+    from ..noise import joined
+
+    if log.poses is None:
+        return joined(log.watched(moved))
+    if 'time' in log.poses and 'count' not in log.poses:
+        return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
+    raise InputError(f'{path} is a pose table, expected a recording',
+                     'use the samples of a long rest, with their time')
+
+
+def _corrected_rest(recording: Recording, units: Units, calibration: Calibration
+                    ) -> tuple[Recording, Units]:
+    """Return the corrected recording, in g if it was in native units."""
+    own = calibration.in_units(units)
+    check_sensor(own, recording.sensor)
+    known = of_samples(recording.columns, len(recording), own.model)
+    made = recording.with_columns(reading=own.correct(recording.reading, known))
+    return made, units_of('g') if units.name == 'native' else units
+
+
+def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
+    """Yield the figures by axis, the notes, and the figures for Kalibr."""
+    from ..noise import duration
+    from ..report.noise_page import kalibr_lines, need_lines
+
+    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
+           f'{found.rate:.5g} Hz')
+    for kind in found.kinds:
+        yield _noise_table(kind, found.of(kind))
+    yield from (f'note: {note}' for note in found.notes)
+    yield from need_lines(found)
+    yield from kalibr_lines(found)
+
+
+def _noise_table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
+    """Return the table of one sensor, at most 60 columns wide."""
+    from ..report.noise_page import figure_rows
+
+    table = Table(title=kind, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column('')
+    for axis in axes:
+        table.add_column(axis.axis, justify='right', no_wrap=True)
+    for label, unit, cells in figure_rows(axes):
+        table.add_row(f'{label}, {unit}', *cells)
+    return table

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib refine``, ``report`` and ``calibrate``: find effects that a fit lacks."""
+"""``accel-calib refine`` and ``report``: find effects that a calibration lacks."""
 
 from __future__ import annotations
 
@@ -13,31 +13,27 @@ from typing import Any
 
 from rich.table import Table
 
-from .fit import calibration_lines, calibration_result, error_line, rated
+from .fit import error_line, rated
 from .frame import Done, Output, working
 from .inputs import intake, intake_for, prior, rows_between
 from ..calibrate import Calibration
 from ..effects import effect_named
-from ..intake import Intake
-from ..pipeline import calibrated, Outcome
 from ..rating import rate_refinement
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
-from ..report import has_matplotlib, write_calibration_page, write_figures, write_page
+from ..report import write_figures, write_page
 from ..stored import write_calibration
 from ..stored.plan_table import write_plan
 from ..text import counted, listed, now, short
-
-BAD_RATING = 1
-"""Exit status for a calibration that is BAD."""
 
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
     result = _refined(args)
     stored = list(_stored(args, result))
-    return Done({'file': args.poses, **_result(result), **rated(rate_refinement(result))},
-                _shown(args, result, stored), refusal=result.refusal if args.output else ())
+    found = {'file': args.poses, **refinement_result(result), **rated(rate_refinement(result))}
+    return Done(found, _shown(args, result, stored),
+                refusal=result.refusal if args.output else ())
 
 
 def _refined(args: argparse.Namespace) -> Refinement:
@@ -108,8 +104,8 @@ def _in_a_line(result: dict[str, Any]) -> str:
             f'{short(result["remaining_gap_mg"])} mg')
 
 
-def _result(result: Refinement) -> dict[str, Any]:
-    """Return the result of ``refine`` for JSON."""
+def refinement_result(result: Refinement) -> dict[str, Any]:
+    """Return a refinement for JSON."""
     return {
         'verdict': result.verdict, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
@@ -150,37 +146,3 @@ def run_report(args: argparse.Namespace) -> Done:
         count = len(write_figures(args.figures, result))
         lines.append(f'{counted(count, "file")}, stored in {args.figures}')
     return Done(shown=lines)
-
-
-def run_calibrate(args: argparse.Namespace) -> Done:
-    """Calibrate, store, and write the page."""
-    found = intake(args, args.log)
-    with working('fitting'):
-        outcome = calibrated(found.poses, found.units, flat=args.flat, nose_down=args.nose_down,
-                             frame=args.frame, sensor=args.sensor, refined=args.refined,
-                             fleet=prior(args))
-    stored = _stored_outcome(args, found, outcome)
-    refinement, rating = outcome.refinement, outcome.rating
-    return Done(
-        {'file': args.log, **calibration_result(outcome.calibration, 'auto'), **rated(rating),
-         'read_lines': found.lines, 'refined': outcome.line,
-         'refinement': None if refinement is None else _result(refinement)},
-        [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
-         *rating.lines], BAD_RATING if rating.name == 'BAD' else 0)
-
-
-def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
-    """Write the calibration, unless it is BAD, and the page; return lines about them."""
-    if outcome.rating.name != 'BAD' or args.keep_bad:
-        write_calibration(args.output, outcome.calibration)
-        line = f'stored in {args.output}'
-    else:
-        line = 'not stored, because it is BAD; to store it, use --keep-bad'
-    page = args.output.with_suffix('.html')
-    if not has_matplotlib():
-        return [line, f'no page {page}: matplotlib is not installed']
-    with working('drawing the page'):
-        write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
-                               refinement=outcome.refinement, stored=str(args.output),
-                               notes=found.lines)
-    return [line, f'page: {page}']
