@@ -57,9 +57,6 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'export': rb'(?s)PK|\{|.*accel[-_]calib'}
 """Beginning of a file of each kind."""
 
-_SILENT = ('capture', 'noise', 'export', 'demo')
-"""Commands whose errors are not in JSON."""
-
 _HEAD = 4096
 STANDARD_OUTPUT = '-'
 
@@ -141,9 +138,9 @@ def _run_one(args: argparse.Namespace) -> int:
     target, command = getattr(args, 'json', None), COMMANDS[args.command]
     try:
         done = _function('run', args.command)(args)
-    except AccelCalibError as err:
+    except (AccelCalibError, OSError) as err:
         about = {'file': getattr(args, command.about)} if command.about else {}
-        write_json(None if args.command in _SILENT else target, {**about, **_of_error(err)})
+        write_json(target, {**about, **_of_error(err)})
         raise
     write_json(target, done.result)
     output = console(args)
