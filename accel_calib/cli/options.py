@@ -39,6 +39,9 @@ def _columns(text: str) -> dict[str, str]:
     return {ours.strip(): theirs.strip() for ours, _, theirs in pairs}
 
 
+_TYPES: dict[str, Any] = {'float': positive, 'float | None': positive, 'int | None': int}
+"""Types of options by those of the fields of records; others are texts."""
+
 _SHARED: dict[str, dict[str, Any]] = {
     '--rows': {'metavar': 'A:B', 'help': 'rows A to B, 1-based, inclusive'},
     '--jobs': {'type': int, 'default': 1, 'metavar': 'N',
@@ -70,11 +73,8 @@ def add_fields(made: Parser, record: Any, options: Mapping[str, Mapping[str, Any
     """Add options for fields of a record, with their types and defaults."""
     for name, about in options.items():
         field = record.__dataclass_fields__[name]
-        kind: dict[str, Any] = {'default': field.default}
-        if field.type == 'bool':
-            kind = {'action': 'store_true'}
-        elif 'float' in field.type or 'int' in field.type:
-            kind['type'] = positive if 'float' in field.type else int
+        kind = ({'action': 'store_true'} if field.type == 'bool' else
+                {'default': field.default, 'type': _TYPES.get(field.type)})
         made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **about})
 
 
