@@ -34,10 +34,12 @@ from accel_calib.calibrate.pose_planning import (
     words_of,
 )
 from accel_calib.capture.window import rounding_left
-from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
-from accel_calib.cli.main import COMMANDS, main, parser
-from accel_calib.cli.terminal import in_one_line, Output, shown
-from accel_calib.cli.watch_view import changes, screen, state
+from accel_calib.cli.commands import COMMANDS
+from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
+from accel_calib.cli.frame import Output
+from accel_calib.cli.main import main, parser
+from accel_calib.cli.terminal import in_one_line, shown
+from accel_calib.cli.watch import changes, screen, state
 from accel_calib.compare.drift import change, is_over
 from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
 from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES

@@ -171,6 +171,18 @@ def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
     assert printed.err.count('\n') == 1
 
 
+@pytest.mark.parametrize('arguments', [
+    ('fit', 'no.csv'), ('calibrate', 'no.csv'), ('refine', 'no.csv'), ('history', 'no.yaml'),
+    ('verify', 'no.csv', '-c', 'no.yaml'), ('compare', 'no.yaml'), ('noise', 'no.csv'),
+    ('capture', 'no.csv', '-o', 'x.csv'), ('export', 'no.yaml', '--to', 'c')], ids=' '.join)
+def test_an_error_of_every_command_is_in_the_json(arguments, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, result = run_json(capsys, *arguments)
+    assert status == 2
+    assert {'error', 'advice'} <= set(result) <= {'error', 'advice', 'file'}
+    assert result['advice']
+
+
 def bad_table(folder, text):
     path = folder / 'bad.csv'
     path.write_text(text)
