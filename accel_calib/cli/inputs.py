@@ -33,9 +33,9 @@ def log_options(args: argparse.Namespace, calibration: Calibration | None = None
     if calibration is None:
         return asked
     units = calibration.units
-    if units.name == 'native':  # its readings can look like g
+    if units.is_native:  # its readings can look like g
         return replace(asked, default_units='native')
-    return replace(asked, gravity=units.per_g) if units.name == 'm/s2' else asked
+    return replace(asked, gravity=units.per_g) if units.is_si else asked
 
 
 def settings(args: argparse.Namespace) -> dict[str, Any]:

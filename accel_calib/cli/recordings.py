@@ -126,7 +126,7 @@ def _corrected(table: Poses | Recording, calibration: Calibration, known: Contex
                ) -> Poses | Recording:
     """Return a table with the corrected readings, in m/s² or g."""
     columns = {'reading': calibration.correct(table.reading, known)}
-    units: UnitName = 'g' if calibration.units.name == 'native' else calibration.units.name
+    units: UnitName = 'g' if calibration.units.is_native else calibration.units.name
     if 'rate' in table:
         columns['rate'] = table['rate'] @ calibration.model.rotation
     if 'std' in table:
@@ -171,7 +171,7 @@ def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
 
     asked = log_options(args)
     calibration = args.calibration and stored_calibration(args.calibration)
-    if calibration and calibration.units.name == 'native':
+    if calibration and calibration.units.is_native:
         asked = replace(asked, units=asked.units or 'native')
     with open_log(args.recording, asked) as log:
         with progress('samples') as moved:
@@ -209,7 +209,7 @@ def _corrected_rest(recording: Recording, units: Units, calibration: Calibration
     check_sensor(own, recording.sensor)
     known = of_samples(recording.columns, len(recording), own.model)
     made = recording.with_columns(reading=own.correct(recording.reading, known))
-    return made, units_of('g') if units.name == 'native' else units
+    return made, units_of('g') if units.is_native else units
 
 
 def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
