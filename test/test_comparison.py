@@ -254,7 +254,7 @@ def test_the_exit_status_of_compare_is_its_answer(tmp_path, capsys):
     assert (status, result['agree'], result['outlier']) == (1, False, 2)
     assert result['runs'][1]['file'] == str(paths[3])
     assert set(result) == {'agree', 'p_value', 'chi2', 'dof', 'outlier', 'runs', 'parameters',
-                           'tilt_deg', 'notes', 'rating', 'rating_reason'}
+                           'tilt_deg', 'notes', 'rating', 'rating_reason', 'findings'}
     status, result = result_of(0)
     assert status == 2
     assert set(result) == {'error', 'advice'}

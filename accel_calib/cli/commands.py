@@ -100,7 +100,7 @@ def _fit(made: options.Parser) -> None:
     add('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, 1-based; it '
         'determines the mounting')
     options.add_mounting(made)
-    options.share(made, '--prior', '--sensor-model')
+    options.share(made, '--keep-bad', '--prior', '--sensor-model')
 
 
 def _calibrate(made: options.Parser) -> None:
@@ -112,8 +112,8 @@ def _calibrate(made: options.Parser) -> None:
     add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
         'or first or last; it determines the mounting')
     options.add_mounting(made)
-    add('--keep-bad', action='store_true', help='store a calibration that is BAD, too')
-    options.share(made, '--prior', '--sensor-model', '--no-refine', '--max-dwell', '--json')
+    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--no-refine', '--max-dwell',
+                  '--json')
     options.add_log(made)
 
 

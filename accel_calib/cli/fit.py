@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ..pipeline import Outcome
 
 BAD_RATING = 1
-"""Exit status of ``calibrate`` for a calibration that is BAD."""
+"""Exit status for a calibration that is BAD."""
 
 
 def run_fit(args: argparse.Namespace) -> Done:
@@ -51,8 +51,7 @@ def run_fit(args: argparse.Namespace) -> Done:
         calibration = level_by_rows(calibration, found.poses, args.frame, args.flat,
                                     args.nose_down)
     rating = rate(calibration)
-    if args.output is not None:
-        write_calibration(args.output, calibration)
+    stored = [] if args.output is None else [_store(args, calibration, rating)]
     if args.report is not None:
         from ..report import write_calibration_page
 
@@ -60,9 +59,19 @@ def run_fit(args: argparse.Namespace) -> Done:
             write_calibration_page(args.report, calibration, rating, str(args.poses),
                                    stored=str(args.output or 'calibration.yaml'),
                                    notes=found.lines)
+        stored.append(f'stored in {args.report}')
     return Done({'file': args.poses, **calibration_result(calibration, args.model),
                  **rated(rating), 'read_lines': found.lines},
-                _shown(args, found, calibration, rating))
+                [*_shown(args, found, calibration), *stored, *rating.lines],
+                BAD_RATING if rating.name == 'BAD' else 0)
+
+
+def _store(args: argparse.Namespace, calibration: Calibration, rating: Rating) -> str:
+    """Write a calibration unless it is BAD; return a line about it."""
+    if rating.name == 'BAD' and not args.keep_bad:
+        return 'not stored, because it is BAD; to store it, use --keep-bad'
+    write_calibration(args.output, calibration)
+    return f'stored in {args.output}'
 
 
 def _fit(args: argparse.Namespace, found: Intake, chosen: Poses) -> Calibration:
@@ -77,15 +86,11 @@ def _fit(args: argparse.Namespace, found: Intake, chosen: Poses) -> Calibration:
     return fit_with_fleet(chosen, found.units, fleet, sensor=args.sensor, date=now())
 
 
-def _shown(args: argparse.Namespace, found: Intake, calibration: Calibration, rating: Rating
-           ) -> Iterator[Any]:
+def _shown(args: argparse.Namespace, found: Intake, calibration: Calibration) -> Iterator[Any]:
     yield from found.lines
     yield from calibration_lines(calibration)
     yield f'model {calibration.name}: {calibration.reason}'
     yield f'next pose: {outlook(calibration, args.model).next_pose.words}'
-    for path in filter(None, (args.output, args.report)):
-        yield f'stored in {path}'
-    yield from rating.lines
 
 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
@@ -101,9 +106,10 @@ def error_line(result: dict[str, Any]) -> str:
     return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
 
 
-def rated(rating: Rating) -> dict[str, str]:
+def rated(rating: Rating) -> dict[str, Any]:
     """Return a rating for JSON."""
-    return {'rating': rating.name, 'rating_reason': rating.reason}
+    return {'rating': rating.name, 'rating_reason': rating.reason,
+            'findings': [asdict(each) for each in rating.findings]}
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
@@ -127,14 +133,10 @@ def run_calibrate(args: argparse.Namespace) -> Done:
 
 
 def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
-    """Write the calibration, unless it is BAD, and the page; return lines about them."""
+    """Write the calibration and the page; return lines about them."""
     from ..report import has_matplotlib, write_calibration_page
 
-    if outcome.rating.name != 'BAD' or args.keep_bad:
-        write_calibration(args.output, outcome.calibration)
-        line = f'stored in {args.output}'
-    else:
-        line = 'not stored, because it is BAD; to store it, use --keep-bad'
+    line = _store(args, outcome.calibration, outcome.rating)
     page = args.output.with_suffix('.html')
     if not has_matplotlib():
         return [line, f'no page {page}: matplotlib is not installed']

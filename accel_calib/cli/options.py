@@ -57,6 +57,7 @@ _SHARED: dict[str, dict[str, Any]] = {
                 'of accel-calib fleet) for offset, gain and cross-axis, for few poses'},
     '--sensor-model': {'default': '', 'metavar': 'NAME', 'help': 'model of the sensor in the file '
                        'of --prior, if it has several'},
+    '--keep-bad': {'action': 'store_true', 'help': 'store a calibration that is BAD, too'},
     '--json': {'metavar': 'FILE', 'help': 'JSON file to write with the result; - for standard '
                'output'},
     '--force': {'action': 'store_true', 'help': 'replace files of other kinds, too'}}
