@@ -123,34 +123,6 @@ def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.Monke
     assert store_of('~/x.yaml', named, 'm/s2').calibration == Path('/me/x.yaml')
 
 
-def test_files_of_version_1_are_taken_over_once(home: Path, readings: Readings, stored: Stored
-                                                ) -> None:
-    home.mkdir(parents=True)
-    stored(sensor='imu_link').rename(home / 'imu_link.yaml')
-    (home / 'imu_link_poses.csv').write_text('ax,ay,az\n0.1,0.2,9.8\n')
-    left, right = Driver('/left/imu'), Driver('/right/imu')
-    for driver in (left, right):
-        driver.feed(readings([[0, 0, 1]])[:10])
-    assert left.session.active.calibration is not None
-    assert len(left.session.live.book.poses()) == 1
-    assert 'imu_link.yaml is now' in left.logged()
-    assert right.session.active.calibration is None
-    assert len(right.session.live.book.poses()) == 0
-    assert {path.name for path in home.iterdir()} == {
-        'left.imu@imu_link.yaml', 'left.imu@imu_link_poses.csv', 'left.imu@imu_link.lock',
-        'right.imu@imu_link.lock'}
-
-
-def test_files_of_version_1_of_another_sensor_stay(home: Path, readings: Readings, stored: Stored
-                                                   ) -> None:
-    home.mkdir(parents=True)
-    stored(sensor='left/imu').rename(home / 'left_imu.yaml')
-    driver = Driver()
-    driver.feed(readings([[0, 0, 1]])[:10], 'left_imu')
-    assert driver.session.active.calibration is None
-    assert (home / 'left_imu.yaml').exists()
-
-
 def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
         home: Path, readings: Readings) -> None:
     turned = readings(spread_directions(12))

@@ -44,7 +44,6 @@ from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
 _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
-_UNSAFE_OF_VERSION_1 = re.compile(r'[^A-Za-z0-9._-]+')
 _NAMELESS = 'imu'
 _LONGEST = 120
 _NUMBER = re.compile('[1-9][0-9]{0,17}')
@@ -347,17 +346,15 @@ def load(store: Store) -> Loaded:
 
 
 def _tidied(store: Store) -> list[str]:
-    """Take over files of version 0.1, and remove leftovers; return log lines about it."""
-    notes = []
+    """Remove leftovers of writing; return log lines about what fails."""
     try:
-        notes = take_over(store)
         failed = [error for path in (store.calibration, store.poses)
                   for error in remove_leftovers(path)]
     except OSError as error:
-        return [*notes, f'the folder {store.calibration.parent} could not be tidied: {error}; '
+        return [f'the folder {store.calibration.parent} could not be tidied: {error}; '
                 f'{writing_advice(error)}']
-    return [*notes, *(f'the temporary file {error.filename} could not be removed: '
-                      f'{error.strerror}; remove it by hand' for error in failed)]
+    return [f'the temporary file {error.filename} could not be removed: {error.strerror}; '
+            'remove it by hand' for error in failed]
 
 
 def _after(path: Path, error: Exception) -> str:
@@ -429,34 +426,6 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
                              'folder', 'state the whole path') from error
         return Store(path.absolute(), identity, units)
     return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units)
-
-
-def take_over(store: Store) -> list[str]:
-    """
-    Rename the files that version 0.1 named by the frame_id alone; return log lines about it.
-
-    Several sensors may have shared such a name. The first sensor that finds the files takes them
-    if the calibration has its frame_id, or if there is no calibration and the name is unambiguous.
-
-    """
-    sensor = store.identity.sensor
-    name = _UNSAFE_OF_VERSION_1.sub('_', sensor).strip('._') or _NAMELESS
-    former = replace(store, calibration=store.calibration.with_name(f'{name}.yaml'))
-    own = ros_home() / 'accel_calib' / store.identity.file_name
-    if (store.calibration != own or former.calibration == store.calibration
-            or _exists(store.calibration) or _exists(store.poses)):
-        return []
-    try:
-        found = former.load_calibration()
-    except (AccelCalibError, OSError):
-        return []
-    ours = found.sensor == sensor if found is not None else name == sensor
-    lines = []
-    for old, new in ((former.calibration, store.calibration), (former.poses, store.poses)):
-        if ours and old.exists():
-            old.rename(new)
-            lines.append(f'{old} is now {new}')
-    return lines
 
 
 def aside(path: Path, word: str) -> Path:
