@@ -1,10 +1,12 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: the folder of real recordings, and a simulated sensor."""
+"""Helpers of several tests: real recordings, a simulated sensor, and tasks of a session."""
 
 from pathlib import Path
+from typing import Any
 
+from accel_calib.session import Step, Task
 from inside import Model, model_with
 import numpy as np
 import pytest
@@ -28,3 +30,23 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
                        for name in names})
+
+
+def result(step: Step) -> Any:
+    """Return the result of a step, computed in this process."""
+    return step.run(lambda function, *given: function(*given))
+
+
+def answer_of(task: Task) -> Any:
+    """Run a task of a session at once, and return its answer."""
+    try:
+        step = next(task)
+        while True:
+            try:
+                found = result(step)
+            except Exception as error:
+                step = task.throw(error)
+            else:
+                step = task.send(found)
+    except StopIteration as end:
+        return end.value

@@ -11,15 +11,16 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
-from accel_calib.session import Job, Mounting
+from accel_calib.session import Mounting
 from accel_calib.stored import read_calibration
 from inside import main, spread_directions
 import pytest
+from shared import result
 from test_session import Driver
 
 Stored = Callable[..., Path]
@@ -121,13 +122,12 @@ def test_a_fit_that_ends_after_another_sensor_took_over_is_not_used_for_it(
         readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(12)))
-    job = driver.session.commands.fit()
-    assert isinstance(job, Job)
-    found = job.run(lambda function, *given: function(*given))
+    task = driver.session.commands.fit()
+    found = result(next(task))
     driver.now += 3.0
     driver.feed(readings([[0, 0, 1]])[:30], 'other')
     with pytest.raises(AccelCalibError, match='call ~/fit again'):
-        job.finish(found)
+        task.send(found)
     assert driver.session.sensor == 'other'
     assert driver.session.active.calibration is None
 
@@ -139,13 +139,13 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     turned = readings(spread_directions(12))
     driver.feed(turned)
     driver.done(driver.session.commands.fit())
-    job = getattr(driver.session.commands, name)()
-    found = job.run(lambda function, *given: function(*given))
+    task = getattr(driver.session.commands, name)()
+    found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
     poses = len(driver.session.live.book.poses())
     with pytest.raises(AccelCalibError, match="'other' has replaced 'imu_link' meanwhile"):
-        job.finish(found)
+        task.send(found)
     assert driver.session.active.calibration is None
     assert len(driver.session.live.book.poses()) == poses > 0
 
@@ -156,11 +156,11 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
     stored(sensor='imu_link').rename(home / 'imu.data_raw@imu_link.yaml')
     driver, rest = Driver(), readings([[0, 0, 1]])[:30]
     assert driver.session.accepts('imu_link')
-    late = [event for event in driver.session.events() if isinstance(event, Job)]
+    late = [event for event in driver.session.events() if isinstance(event, Generator)]
     driver.now += 3.0
     driver.feed(rest, 'other')
-    for job in late:
-        driver.done(job)
+    for task in late:
+        driver.done(task)
     assert driver.session.sensor == 'other'
     assert driver.session.active.calibration is None
 

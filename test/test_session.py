@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
 import errno
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from accel_calib.session import CalibratorSettings, findings, Level, Log, Session, Task
 from accel_calib.stored import read_calibration, write_calibration
 from inside import (
     Identity,
@@ -32,6 +32,7 @@ from inside import (
 )
 import numpy as np
 import pytest
+from shared import answer_of
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -52,19 +53,17 @@ class Driver:
 
     def handle(self) -> None:
         for event in self.session.events():
-            if isinstance(event, Job):
+            if isinstance(event, Generator):
                 words = self.done(event)
                 self.log += [Log('info', words)] if words else []
             elif isinstance(event, Log):
                 self.log.append(event)
 
-    def done(self, job: Job | str) -> str:
+    def done(self, task: Task) -> str:
         """Return the answer of a command."""
-        while isinstance(job, Job):
-            job = job.finish(job.run(lambda function, *given: function(*given)))
-        if self.session is not None:
-            self.handle()
-        return job
+        answer: str = answer_of(task)
+        self.handle()
+        return answer
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
         """Push readings [m/s²], and return the number of accepted messages."""
@@ -152,7 +151,7 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     commands = second.session.commands
     for command in (commands.fit, commands.save, commands.load):
         with pytest.raises(AccelCalibError, match='is used by the node with process id'):
-            command()
+            second.done(command())
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()
@@ -300,12 +299,12 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     rest = readings([[0, 0, 1]], dwell=6.0)
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match='no Imu message yet'):
-            getattr(driver.session.commands, name)()
+            driver.done(getattr(driver.session.commands, name)())
     driver.feed(rest[:150])
     driver.now += 6.0
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match=r'arrived 6\.0 s ago, expected one within'):
-            getattr(driver.session.commands, name)()
+            driver.done(getattr(driver.session.commands, name)())
     driver.feed(rest[150:160])
     assert driver.done(driver.session.commands.capture_pose()).startswith('1 pose:')
     assert 'levelled by this pose' in driver.done(driver.session.commands.set_level())
@@ -321,7 +320,7 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
     flat, nose_down = mounting @ [0.0, 0.0, 1.0], mounting @ [-0.6, 0.0, 0.8]
     driver.feed(readings([nose_down], dwell=6.0)[:200])
     with pytest.raises(InputError, match=r'not levelled; .*~/set_level first'):
-        driver.session.commands.set_heading()
+        driver.done(driver.session.commands.set_heading())
 
     def yaw() -> float:
         x = driver.session.active.calibration.rotation[:, 0]  # type: ignore[union-attr]
@@ -331,7 +330,7 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
     driver.done(driver.session.commands.set_level())
     assert yaw() > 50.0
     with pytest.raises(InputError, match=r'within 10° of the flat pose'):
-        driver.session.commands.set_heading()
+        driver.done(driver.session.commands.set_heading())
     driver.feed(readings([nose_down], dwell=6.0)[:200])
     assert 'the heading is set by this pose' in driver.done(driver.session.commands.set_heading())
     assert yaw() < 1.0

@@ -37,13 +37,13 @@ from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings,
     Event,
-    Job,
     Log,
     LogFilter,
     Mounting,
     Session,
     ShowPoses,
     Still,
+    Task,
 )
 from ..session.worker import Worker
 
@@ -143,10 +143,9 @@ class Calibrator:
         """Return a command of the session that first processes all messages so far."""
         command = getattr(self.session.commands, name)
 
-        def call() -> str | Job:
+        def call() -> Task:
             self.stream.flush()
-            found: str | Job = command()
-            return found
+            return (yield from command())
 
         return call
 

@@ -16,8 +16,19 @@ from .guidance import Progress
 from .health import Finding, findings, Health, Level, worst
 from .session import BATCH, Session
 from .settings import CalibratorSettings, WEB_PORT
-from .work import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
+from .work import (
+    Compute,
+    Event,
+    Files,
+    Log,
+    LogFilter,
+    Mounting,
+    ShowPoses,
+    Step,
+    Still,
+    Task,
+)
 
-__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Event', 'Finding', 'Health', 'Job',
-           'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses', 'Still',
-           'findings', 'worst']
+__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Compute', 'Event', 'Files', 'Finding',
+           'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
+           'Step', 'Still', 'Task', 'findings', 'worst']

@@ -4,10 +4,10 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-Only one thread may use a session. Long work (fits, files) is returned as a `Job`: its `run` can be
-called in any thread, and its `finish` must be called in the thread of the session. All durations
-of the measurement use header stamps, so that a bag or a simulation can run at any speed. Only the
-age of the last message uses a steady clock.
+Only one thread may use a session. Long work (fits, files) is a `Task`, which runs in this thread
+and yields `Step`s; their `run` can be called in any thread. All durations of the measurement use
+header stamps, so that a bag or a simulation can run at any speed. Only the age of the last message
+uses a steady clock.
 
 """
 
@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable
 import math
 import re
 from time import monotonic
-from typing import TypeVar
 
 import numpy as np
 
@@ -33,14 +32,15 @@ from .stream import Newest, NewestReading, SILENT, StreamStatistics
 from .work import (
     Compute,
     Event,
+    Files,
     is_partial,
-    Job,
     Log,
     Mounting,
     plan_for,
     Severity,
     ShowPoses,
     Still,
+    Task,
     title,
 )
 from ..calibrate import Calibration, Outside, outside, USES_LIMIT, with_given_mounting
@@ -51,7 +51,7 @@ from ..errors import AccelCalibError, InputError
 from ..messages.one_reading import Triple
 from ..table import Floats, Poses
 from ..text import counted
-from ..units import Units, units_of
+from ..units import units_of
 
 BATCH = 0.3
 """
@@ -72,8 +72,6 @@ _NUMBER = re.compile(r'[\d.]+')
 
 _LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
 """Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
-
-_Found = TypeVar('_Found')
 
 _AUTO_FIT_EVERY = 60.0
 """Shortest time between two automatic fits [s]."""
@@ -332,26 +330,14 @@ class Session:
         store = self.files.take(self.sensor)
         self._check_lock()
         if store is not None:
-            self._load(store)
+            self._events.append(self._load(store, self.live))
 
-    def _load(self, store: Store) -> None:
-        """Add a job that reads the files, for the sensor that is in use now."""
-        live = self.live
-        self._events.append(Job(lambda compute: load(store), lambda loaded: (
-            self._adopt_loaded(loaded) if self.live is live else '')))
-
-    def job(self, run: Callable[[Compute], _Found], finish: Callable[[_Found], str]) -> Job:
-        """Return a job whose result is used only for the sensor that is in use now."""
-        live, sensor = self.live, self.sensor
-
-        def finish_for_sensor(found: _Found) -> str:
-            if self.live is not live:
-                raise InputError(f'the sensor {self.sensor!r} has replaced {sensor!r} meanwhile, '
-                                 'expected one sensor: the result is not used',
-                                 'call the service again')
-            return finish(found)
-
-        return Job(run, finish_for_sensor)
+    def _load(self, store: Store, live: LiveCapture) -> Task:
+        """Read the files of a sensor, and use them unless another one has replaced it."""
+        loaded: Loaded = yield Files(load, store)
+        if self.live is live:
+            self._adopt_loaded(loaded)
+        return ''
 
     def _check_lock(self) -> None:
         """Report it if another node uses the files."""
@@ -359,7 +345,7 @@ class Session:
             self.problem = self.files.problem
             self._log('error', self.problem)
 
-    def _adopt_loaded(self, loaded: Loaded) -> str:
+    def _adopt_loaded(self, loaded: Loaded) -> None:
         """Use the stored poses and calibration."""
         self._loaded = {each.sensor for each in (loaded.calibration, loaded.poses)
                         if each is not None and each.sensor}
@@ -373,7 +359,6 @@ class Session:
         for line in filter(None, (loaded.problem, *loaded.notes)):
             self._log('error', line)
         self._show_poses(store=False)
-        return ''
 
     def adopt(self, calibration: Calibration | None) -> None:
         """Use this calibration for the correction, with the given mounting if there is one."""
@@ -423,7 +408,7 @@ class Session:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self._load(store)
+            self._events.append(self._load(store, self.live))
         self._report_still()
         self._report_stream()
         self._report_outside()
@@ -484,43 +469,38 @@ class Session:
         if (self.settings.auto_fit and self._auto_fit_waits and due and self.files.locked
                 and len(self.live.book.poses()) >= self.settings.auto_fit_poses):
             self._auto_fit_waits, self._auto_fit_at = False, self.clock()
-            self._events.append(self.commands.auto_fit())
+            self._events.append(self.commands.auto_fit(self.live))
 
     def auto_fit_later(self) -> None:
         """Repeat an automatic fit when the next one is due."""
         self._auto_fit_waits = True
 
     def _show_poses(self, *, store: bool, new_rest: bool = False) -> None:
-        """Add a job that stores the poses, and draws them with the next pose."""
-        poses, units, model = self.live.book.poses(), self.units, self.settings.model
-        where = self.files.store if store else None
-        guide = self.guide
-        added = guide.added(len(poses))
+        """Add a task that stores the poses, and draws them with the next pose."""
+        poses = self.live.book.poses()
+        self._events.append(self._shown(
+            poses, self.guide, self.guide.added(len(poses)), new_rest,
+            self.files.store if store else None))
+
+    def _shown(self, poses: Poses, guide: Guide, added: int, new_rest: bool, store: Store | None
+               ) -> Task:
+        """Store and draw poses, this number more than before; return the line about a new rest."""
+        units, model = self.units, self.settings.model
         due = added != 0 or guide.plan is None
-
-        def stored(compute: Compute) -> OSError | None:
-            try:
-                if where is not None:
-                    where.save_poses(poses)
-            except OSError as error:
-                return error
-            return None
-
-        def plan_next(not_stored: OSError | None) -> Job:
-            if not_stored is not None:
-                self._log('error', f'the poses could not be stored: {not_stored}; '
-                          f'{writing_advice(not_stored)}', once_in=_AGAIN)
-            # Computed even where only an average has changed, so that the lines keep their order.
-            return Job(lambda compute: _plan(compute, poses, units, model) if due else None,
-                       finish, computes=True)
-
-        def finish(plan: Plan | None) -> str:
-            if plan is not None and guide is self.guide:  # otherwise, it is of another sensor
-                guide.plan = plan
-                self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
-            return guide.line(poses, units, added=added > 0) if new_rest else ''
-
-        self._events.append(Job(stored, plan_next))
+        try:
+            yield Files() if store is None else Files(store.save_poses, poses)
+        except OSError as error:
+            self._log('error', f'the poses could not be stored: {error}; '
+                      f'{writing_advice(error)}', once_in=_AGAIN)
+        # Computed even where only an average has changed, so that the lines keep their order.
+        plan: Plan | None = yield (Compute(plan_for, poses, units, model)
+                                   if due and len(poses) else Compute())
+        if due and not len(poses):  # without the start of the worker process
+            plan = plan_for(poses, units, model)
+        if plan is not None and guide is self.guide:  # otherwise, it is of another sensor
+            guide.plan = plan
+            self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
+        return guide.line(poses, units, added=added > 0) if new_rest else ''
 
     @property
     def _all_used(self) -> bool:
@@ -634,14 +614,6 @@ class Session:
             return 'waiting for the first message'
         return ('no calibration, raw messages are published' if self.settings.passthrough
                 else 'no calibration, nothing is published')
-
-
-def _plan(compute: Compute, poses: Poses, units: Units, model: str) -> Plan:
-    """Return the next pose; without poses, do not wait for the start of the worker process."""
-    if not len(poses):
-        return plan_for(poses, units, model)
-    plan: Plan = compute(plan_for, poses, units, model)
-    return plan
 
 
 def _doubtful(poses: Poses) -> int:

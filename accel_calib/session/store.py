@@ -290,6 +290,11 @@ class Store:
         self.poses.parent.mkdir(parents=True, exist_ok=True)
         write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
 
+    def save(self, calibration: Calibration, poses: Poses) -> None:
+        """Write the calibration and the poses; raise OSError if it fails."""
+        self.save_calibration(calibration)
+        self.save_poses(poses)
+
     def set_aside(self) -> list[Path]:
         """Rename both files, and return the new paths; raise OSError if it fails."""
         if _exists(self.calibration):

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 import math
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from ..calibrate import (
 )
 from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
-from ..effects import Context, Model
+from ..effects import Context, LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_4
 from ..estimate.geometry import coverage, pose_noise
@@ -41,34 +41,55 @@ from ..table import Floats, Poses
 from ..text import counted, listed, now
 from ..units import MG, Units
 
-Compute = Callable[..., Any]
-"""Function and its arguments -> result, as in `worker_process.WorkerProcess.call`."""
-
 Severity = Literal['info', 'warning', 'error']
 
 
-@dataclass(frozen=True)
-class Job:
+class Step:
     """
-    Long work that must not delay the stream.
+    What a task waits for: the result of a function.
 
     Parameters
     ----------
-    run : callable
-        Function of a `Compute`. It does not use the session, and can raise AccelCalibError or
-        OSError.
-    finish : callable
-        Function of the result of `run`, called in the thread of the session. It returns an answer,
-        or the job that continues, and can raise AccelCalibError. An empty answer is not logged.
-    computes : bool
-        Whether `run` computes and uses no files. Commands and other jobs run at the same time.
-        Only such a job calls its `Compute`.
+    function : callable, optional
+        The function. It does not use the session, and can raise AccelCalibError or OSError, which
+        are raised in the task. None: the task only waits until the steps before it are done.
+    *given
+        Its arguments.
 
     """
 
-    run: Callable[[Compute], Any]
-    finish: Callable[[Any], str | Job]
-    computes: bool = False
+    def __init__(self, function: Callable[..., Any] | None = None, *given: Any) -> None:
+        self._function, self._given = function, given
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; `call` is `worker.WorkerProcess.call`."""
+        return None if self._function is None else call(self._function, *self._given)
+
+
+class Files(Step):
+    """A function that uses files; other functions that use files and commands wait for it."""
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; it does not need the worker process."""
+        return super().run(lambda function, *given: function(*given))
+
+
+class Compute(Step):
+    """A function that computes, in the worker process; commands and files do not wait for it."""
+
+
+Task = Generator[Step, Any, Any]
+"""
+Steps whose results are sent back, in the thread of the session; the returned value is the answer.
+
+An empty answer is not logged. A task can raise AccelCalibError.
+
+"""
+
+Found = TypeVar('Found')
+
+Part = Generator[Step, Any, Found]
+"""A part of a task, for ``yield from``."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +151,7 @@ class LogFilter:
         return True
 
 
-Event = Log | Mounting | Still | ShowPoses | Job
+Event = Log | Mounting | Still | ShowPoses | Task
 
 
 _DIRECTIONS = 100
@@ -141,6 +162,19 @@ _FEWEST_IN_CONE = 4
 
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
+
+
+def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
+        before: Calibration | None, context: Context) -> tuple[Calibration, list[str], bool]:
+    """
+    Return a fit, what to answer, and whether an automatic fit replaces the calibration before it.
+
+    Parameters and errors are as in `fitted`.
+
+    """
+    calibration = fitted(poses, units, settings, sensor, before, context)
+    return (calibration, [summary(calibration), change_words(before, calibration)],
+            replaces(before, calibration))
 
 
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
@@ -231,9 +265,18 @@ def change_words(before: Calibration | None, after: Calibration) -> str:
     return f'changes {", ".join(words)}'
 
 
-def has_changed(before: Calibration | None, after: Calibration) -> bool:
-    """Return whether a fit differs from the calibration by more than its own uncertainty."""
-    if before is None or is_partial(before):
+def replaces(before: Calibration | None, after: Calibration) -> bool:
+    """
+    Return whether an automatic fit replaces a calibration.
+
+    It does if it differs by more than its own uncertainty, and the other has only offset and gain.
+
+    """
+    if before is None:
+        return True
+    if any(name not in LADDER for name in before.model.effects):
+        return False
+    if is_partial(before):
         return True
     up = spread_directions(_DIRECTIONS)
     (gain, offset), (gain_before, offset_before) = (
@@ -243,9 +286,10 @@ def has_changed(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
+            ) -> tuple[Refinement, list[str]]:
     """
-    Return the refinement of a calibration.
+    Return the refinement of a calibration, and what to answer.
 
     Parameters
     ----------
@@ -266,8 +310,12 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
         If the readings are clearly in another unit.
 
     """
-    return refine(poses, units, base='auto' if before is None else before, sensor=sensor,
-                  date=now())
+    refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
+                        date=now())
+    words = [story(refinement)]
+    if not refinement.refusal:
+        words.append(change_words(before, refinement.calibration))
+    return refinement, words
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
