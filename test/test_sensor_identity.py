@@ -111,7 +111,7 @@ def test_node_uses_a_stored_calibration_only_for_its_sensor(
     before = path.read_bytes()
     driver = Driver(sensor=stated, calibration_file=str(path) if given else '')
     driver.feed(readings([[0, 0, 1]])[:30])
-    used = driver.session.active.calibration is not None
+    used = driver.session.sensor.calibration is not None
     assert used is (owner in ('', stated or 'imu_link'))
     if not used:
         assert repr(owner) in driver.finding('calibration').words
@@ -128,8 +128,8 @@ def test_a_fit_that_ends_after_another_sensor_took_over_is_not_used_for_it(
     driver.feed(readings([[0, 0, 1]])[:30], 'other')
     with pytest.raises(AccelCalibError, match='call ~/fit again'):
         task.send(found)
-    assert driver.session.sensor == 'other'
-    assert driver.session.active.calibration is None
+    assert driver.session.name == 'other'
+    assert driver.session.sensor.calibration is None
 
 
 @pytest.mark.parametrize('name', ['undo', 'load', 'reset'])
@@ -143,11 +143,11 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
-    poses = len(driver.session.live.book.poses())
+    poses = len(driver.session.sensor.live.book.poses())
     with pytest.raises(AccelCalibError, match="'other' has replaced 'imu_link' meanwhile"):
         task.send(found)
-    assert driver.session.active.calibration is None
-    assert len(driver.session.live.book.poses()) == poses > 0
+    assert driver.session.sensor.calibration is None
+    assert len(driver.session.sensor.live.book.poses()) == poses > 0
 
 
 def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
@@ -161,8 +161,8 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
     driver.feed(rest, 'other')
     for task in late:
         driver.done(task)
-    assert driver.session.sensor == 'other'
-    assert driver.session.active.calibration is None
+    assert driver.session.name == 'other'
+    assert driver.session.sensor.calibration is None
 
 
 def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings
@@ -170,7 +170,7 @@ def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(reading
     driver = Driver()
     driver.session.commands.enable(False)
     driver.feed(readings([[0, 0, 1]])[:30])
-    assert not driver.session.active.enabled
+    assert not driver.session.enabled
 
 
 def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_parameter(

@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, findings, Level, Log, Session, Task
+from accel_calib.session import CalibratorSettings, findings, Level, Log, Session, state, Task
 from accel_calib.stored import read_calibration, write_calibration
 from inside import (
     Identity,
@@ -84,7 +84,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in findings(self.session.health()) if each.name == name)
+        return next(each for each in findings(state.health(self.session)) if each.name == name)
 
 
 @pytest.fixture(autouse=True)
@@ -129,8 +129,8 @@ def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
     one.feed(turned)
     assert one.done(one.session.commands.fit())
     other.feed(turned[:10])
-    assert other.session.active.calibration is None
-    assert len(other.session.live.book.poses()) == 0
+    assert other.session.sensor.calibration is None
+    assert len(other.session.sensor.live.book.poses()) == 0
     found = read_calibration(next(home.glob('left_imu-*.yaml')))
     assert (found.sensor, found.stream) == ('left/imu', '/imu/data_raw')
     poses = read_poses(next(home.glob('left_imu-*_poses.csv')))
@@ -144,8 +144,8 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
     for driver in (first, second):
         driver.feed(readings(spread_directions(12)))
-    assert first.session.publishes
-    assert not second.session.publishes
+    assert first.session.files.locked
+    assert not second.session.files.locked
     assert second.finding('calibration').level == Level.ERROR
     assert 'is used by the node with process id' in second.finding('calibration').words
     commands = second.session.commands
@@ -157,8 +157,8 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     first.session.close()
     second.session.tick()
     second.handle()
-    assert second.session.publishes
-    assert second.session.active.calibration is not None
+    assert second.session.files.locked
+    assert second.session.sensor.calibration is not None
     assert second.finding('calibration').level == Level.OK
 
 
@@ -184,10 +184,10 @@ def test_damaged_calibration_is_renamed_and_the_poses_are_used(
     path.write_text(text)
     again = Driver(calibration_file=str(path))
     again.feed(readings([[0, 0, 1]])[:10])
-    assert again.session.active.calibration is None
+    assert again.session.sensor.calibration is None
     assert 'known.yaml.damaged1' in again.finding('calibration').words
     assert path.with_name('known.yaml.damaged1').read_text() == text
-    assert len(again.session.live.book.poses()) == 12
+    assert len(again.session.sensor.live.book.poses()) == 12
     assert again.done(again.session.commands.fit())
     assert again.finding('calibration').level == Level.OK
 
@@ -250,9 +250,9 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     driver = Driver()
     rest = readings([[0, 0, 1]], dwell=6.0)
     driver.feed(rest[:100])
-    assert driver.session.live.detector.still
+    assert driver.session.sensor.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
-    assert not driver.session.live.detector.still
+    assert not driver.session.sensor.live.detector.still
     assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.foreign == 1
@@ -269,10 +269,10 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(driver.session.progress().still)
+        shown.append(state.progress(driver.session).still)
     assert not any(shown)
     driver.feed((np.array([0.6, 0.0, 0.8]) + noise[:150]) * per_g)
-    assert driver.session.progress().still
+    assert state.progress(driver.session).still
 
 
 def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
@@ -283,13 +283,13 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert driver.done(driver.session.commands.fit())
     driver.now += 3.0
     assert driver.feed(turned[:50], 'another') == 50
-    assert driver.session.sensor == 'another'
-    assert driver.session.active.calibration is None
-    assert len(driver.session.live.book.poses()) < 2
+    assert driver.session.name == 'another'
+    assert driver.session.sensor.calibration is None
+    assert len(driver.session.sensor.live.book.poses()) < 2
     assert "now have frame_id 'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
-    assert driver.session.active.calibration is not None
+    assert driver.session.sensor.calibration is not None
     assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
 
 
@@ -323,7 +323,7 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
         driver.done(driver.session.commands.set_heading())
 
     def yaw() -> float:
-        x = driver.session.active.calibration.rotation[:, 0]  # type: ignore[union-attr]
+        x = driver.session.sensor.calibration.rotation[:, 0]  # type: ignore[union-attr]
         return float(np.degrees(np.arccos(x @ mounting[:, 0])))
 
     driver.feed(readings([flat], dwell=6.0)[:200])
@@ -374,7 +374,7 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
     with pytest.raises(AccelCalibError) as refusal:
         driver.done(driver.session.commands.refine())
     assert '\n' not in str(refusal.value)
-    assert driver.session.active.calibration is None
+    assert driver.session.sensor.calibration is None
     assert not list(home.glob('*.yaml'))
 
 
@@ -384,9 +384,9 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
 def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(5)))
-    before = driver.session.advice
+    before = driver.session.sensor.advice
     driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
-    assert driver.session.advice == before
+    assert driver.session.sensor.advice == before
     assert driver.logged('info').count('this rest repeats an earlier pose') == 1
 
 
@@ -394,11 +394,11 @@ def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
     driver = Driver()
     for count, direction in enumerate(spread_directions(12), 1):
         driver.feed(readings([direction]))
-        if 'call ~/fit' not in driver.session.advice:
+        if 'call ~/fit' not in driver.session.sensor.advice:
             assert count < 12
             continue
         assert driver.done(driver.session.commands.fit())
-    assert driver.session.advice == 'the calibration uses these poses'
+    assert driver.session.sensor.advice == 'the calibration uses these poses'
 
 
 def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> None:
@@ -416,14 +416,14 @@ def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
         home: Path, readings: Readings) -> None:
     driver = Driver(auto_fit=True)
     driver.feed(readings(spread_directions(12)))
-    first = driver.session.active.calibration
+    first = driver.session.sensor.calibration
     assert first is not None
     driver.feed(readings(spread_directions(31)[:8]))
     driver.now += 60.0
     driver.session.tick()
     driver.handle()
-    assert driver.session.fitted_poses > 12  # a fit has been made, and agrees
-    assert driver.session.active.calibration is first
+    assert driver.session.sensor.fitted_poses > 12  # a fit has been made, and agrees
+    assert driver.session.sensor.calibration is first
     assert len(list(home.glob('*.before*'))) == 1
 
 
@@ -431,13 +431,13 @@ def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Rea
     driver = Driver(auto_fit=True, auto_fit_poses=30)
     driver.feed(readings(spread_directions(14)))
     assert driver.done(driver.session.commands.fit())
-    fitted = driver.session.active.calibration
+    fitted = driver.session.sensor.calibration
     refined = replace(fitted, model=Model({**fitted.model.values, 'quadratic': np.zeros(3)}),
                       covariance=np.eye(len(fitted.covariance) + 3) * 1e-8)
     driver.session.adopt(refined)
     driver.feed(readings(spread_directions(33)))
-    assert driver.session.fitted_poses >= 30
-    assert driver.session.active.calibration is refined
+    assert driver.session.sensor.fitted_poses >= 30
+    assert driver.session.sensor.calibration is refined
 
 
 # The stream
@@ -539,8 +539,8 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
     for each in warm:
         driver.feed(still, temperature=each)
-    calibration, rest = driver.session.active.calibration, driver.session.active.rest
-    gravity = driver.session.active.gravity
+    calibration, rest = driver.session.sensor.calibration, driver.session.sensor.rest
+    gravity = driver.session.sensor.gravity
     assert calibration is not None
     assert rest is not None
     assert gravity is not None
@@ -554,9 +554,9 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     assert abs(expected[2] - plain[2]) > 0.15
     slow = np.append(values['offset_temperature'][:3], [2.0 * lag, of_sensor])
     offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
-    driver.session.preview = offered
+    driver.session.sensor.offered = offered
     driver.session.set_temperature(warm[-1])
     corrected = offered.apply(np.tile(still, (900, 1)), time=time,
                               temperature=np.repeat(warm, 10))[-1]
-    assert driver.session.progress().corrected == pytest.approx(
+    assert state.progress(driver.session).corrected == pytest.approx(
         np.linalg.norm(corrected) / GRAVITY, abs=1e-3)

@@ -42,6 +42,7 @@ from ..session import (
     LogFilter,
     Session,
     ShowPoses,
+    state,
     Task,
 )
 from ..session.work import Severity
@@ -98,8 +99,8 @@ class Exchange:
     # The session has news
 
     def show_progress(self, reading: Triple | None = None) -> None:
-        """Show the progress; the parameter is as in `Session.progress`."""
-        self.show(messages.progress(monotonic(), self._session.progress(reading)))
+        """Show the progress; the parameter is as in `state.progress`."""
+        self.show(messages.progress(monotonic(), state.progress(self._session, reading)))
 
     def show_poses(self, event: ShowPoses) -> None:
         """Show the poses."""
@@ -113,11 +114,11 @@ class Exchange:
     def show_state(self, health: Health | None = None) -> None:
         """Show the state; the server sends it only if it has changed."""
         session = self._session
-        if session.commands.present is not self._shown:
-            self._take(session.commands.present)
+        if session.sensor.present is not self._shown:
+            self._take(session.sensor.present)
         self.show(messages.state(
-            session.health() if health is None else health, self.problem, shown=self._shown,
-            preview=session.preview is not None, busy=next(iter(self._worker.running), ''),
+            state.health(session) if health is None else health, self.problem, shown=self._shown,
+            preview=session.sensor.offered is not None, busy=next(iter(self._worker.running), ''),
             rating=self._rating, page=self._number))
 
     def _take(self, calibration: Calibration | None) -> None:
@@ -207,11 +208,11 @@ class Exchange:
     def _exported(self, name: str) -> Task:
         """Return an export of the calibration in use."""
         session = self._session
-        if session.preview is not None:
+        if session.sensor.offered is not None:
             raise InputError('a new calibration waits', 'accept it or take it back first')
-        if session.active.calibration is None:
+        if session.sensor.calibration is None:
             raise _NO_CALIBRATION
-        return (yield Compute(export, session.active.calibration, name))
+        return (yield Compute(export, session.sensor.calibration, name))
 
 
 def drawn(calibration: Calibration, source: str, stored: str) -> str:

@@ -12,6 +12,7 @@ and the state. `settings` defines the parameters.
 
 """
 
+from . import state
 from .guidance import Progress
 from .health import Finding, findings, Health, Level, worst
 from .session import BATCH, Session
@@ -31,4 +32,4 @@ from .work import (
 
 __all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Compute', 'Event', 'Files', 'Finding',
            'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
-           'Step', 'Still', 'Task', 'findings', 'worst']
+           'Step', 'Still', 'Task', 'findings', 'state', 'worst']

@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .guidance import next_action, Plan
-from .live_capture import LiveCapture
+from .sensor import Sensor
 from .store import Store, writing_advice
 from .work import (
     at_rest,
@@ -78,12 +78,12 @@ class Commands:
         session = self._session
         self._check_fresh()
         session.files.usable()
-        dwell = session.live.capture_now()
+        dwell = session.sensor.live.capture_now()
         if dwell is None:
             raise self._not_still()
-        session.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
+        session.sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         session.poses_changed(ended=False)
-        poses = session.live.book.poses()
+        poses = session.sensor.live.book.poses()
         words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
         if session.computing:
@@ -97,10 +97,10 @@ class Commands:
         session = self._session
         if session.files.store is not None:
             session.files.usable()
-        if not session.live.undo():
+        if not session.sensor.live.undo():
             raise InputError('there are no poses to remove', 'capture a pose first')
         session.poses_changed(ended=False)
-        count = len(session.live.book.poses())
+        count = len(session.sensor.live.book.poses())
         yield Files()  # until the poses are stored
         return f'the last pose is removed; remaining: {counted(count, "pose")}'
 
@@ -111,14 +111,14 @@ class Commands:
         calibration, words, _ = yield from self._fitted()
         return (yield from self._use(calibration, words, offered=offered))
 
-    def auto_fit(self, live: LiveCapture) -> Task:
+    def auto_fit(self, sensor: Sensor) -> Task:
         """Fit the poses of a sensor; use the result if it differs by more than its uncertainty."""
-        if self._session.live is not live:
+        if self._session.sensor is not sensor:
             return ''
         try:
             calibration, words, differs = yield from self._fitted()
         except ChangedError:
-            self._session.auto_fit_later()
+            sensor.auto_fit_waits = True
             return ''
         except RefusedFitError as error:
             before, self._refused = self._refused, str(error)
@@ -132,41 +132,41 @@ class Commands:
         """Return a fit, what to answer, and whether it differs from the calibration before."""
         session = self._session
         session.files.usable()
-        session.live.refresh()
-        poses = session.live.book.poses()
+        session.sensor.live.refresh()
+        poses = session.sensor.live.book.poses()
         found = yield from self._unless_changed(
-            'fit', fit, poses, session.units, session.settings, session.sensor, self.present,
-            session.present_context())
-        session.fitted_poses = len(poses)
+            'fit', fit, poses, session.units, session.settings, session.name,
+            session.sensor.present, session.statistics.context)
+        session.sensor.fitted_poses = len(poses)
         return found
 
     def refine(self, *, offered: bool = False) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
         session.files.usable()
-        session.live.refresh()
+        session.sensor.live.refresh()
         refinement, words = yield from self._unless_changed(
-            'refine', refined, session.live.book.poses(), session.units, session.sensor,
-            self.present)
+            'refine', refined, session.sensor.live.book.poses(), session.units, session.name,
+            session.sensor.present)
         if refinement.refusal:
             raise RefusedFitError(f'{words[0]}; not used: {refinement.refusal[0]}',
                                   refinement.refusal[1])
-        session.guide.follow(refinement.plan.poses)
+        session.sensor.guide.follow(refinement.plan.poses)
         if refinement.plan.poses:
-            session.fitted_poses = 0  # more poses are asked for
+            session.sensor.fitted_poses = 0  # more poses are asked for
         return (yield from self._use(refinement.calibration, words, offered=offered))
 
     def _unless_changed(self, name: str, function: Callable[..., Found], *given: Any
                         ) -> Part[Found]:
         """Compute; fail if another command changes the calibration meanwhile."""
         session = self._session
-        changes = session.changes
+        sensor, changes = session.sensor, session.sensor.changes
         session.computing += 1
         try:
             found: Found = yield Compute(function, *given)
         finally:
             session.computing -= 1
-        if session.changes != changes:
+        if session.sensor is not sensor or sensor.changes != changes:
             raise ChangedError(f'another command changed the calibration during ~/{name}; '
                                'the result is discarded', f'call ~/{name} again')
         return found
@@ -174,31 +174,31 @@ class Commands:
     def set_level(self, *, offered: bool = False) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
         session, rest = self._session, self._rest()
-        calibration = self.present
+        calibration = session.sensor.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
-                poses_from([rest]), session.units, sensor=session.sensor, date=now()))
+                poses_from([rest]), session.units, sensor=session.name, date=now()))
         return (yield from self._use_mounting(
             self._levelled(calibration, rest), ['the mounting is levelled by this pose'],
             offered=offered))
 
     def set_heading(self, *, offered: bool = False) -> Task:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        calibration = self.present
+        calibration = self._session.sensor.present
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
         rest = self._rest()
         headed = set_heading(calibration, rest.mean,
-                             self._session.active.context_of(rest, calibration))
+                             self._session.sensor.context_of(rest, calibration))
         return (yield from self._use_mounting(headed, ['the heading is set by this pose'],
                                               offered=offered))
 
     def calibrate_at_rest(self, *, offered: bool = False) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
         session, rest = self._session, self._rest()
-        before = self.present
-        calibration = session.with_given(at_rest(rest, session.units, session.sensor, before))
+        before = session.sensor.present
+        calibration = session.with_given(at_rest(rest, session.units, session.name, before))
         words = [carried_words(calibration) if before is None or is_partial(before)
                  else 'offset and gain of the fit are kept']
         if calibration.gyro is not None:
@@ -211,22 +211,17 @@ class Commands:
         """Return a calibration levelled by a rest; check it against the given mounting."""
         session = self._session
         levelled = level(calibration, rest.mean, session.settings.frame,
-                         session.active.context_of(rest, calibration))
+                         session.sensor.context_of(rest, calibration))
         if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
             raise InputError('this pose differs by more than 10° of tilt from the mounting in '
                              'mounting_rpy or base_frame', 'place the robot level, or correct the '
                              'given mounting and restart the node')
         return levelled
 
-    @property
-    def present(self) -> Calibration | None:
-        """Return the calibration that a command starts from: the offered one, or that in use."""
-        return self._session.preview or self._session.active.calibration
-
     def _use_mounting(self, calibration: Calibration, words: list[str], *, offered: bool
                       ) -> Part[str]:
         """Store and use, or offer, a calibration with a new mounting; return the answer."""
-        words = [*words, change_words(self.present, calibration), *(
+        words = [*words, change_words(self._session.sensor.present, calibration), *(
             each for each in calibration.warnings
             if each.startswith(FLAT) or each == ARBITRARY_HEADING)]
         return (yield from self._use(calibration, words, offered=offered))
@@ -240,7 +235,7 @@ class Commands:
         mounting = [] if not calibration.is_levelled else [mounting_words(
             calibration.rotation, session.frame_id or '', session.settings.base_frame)]
         if offered:
-            session.offer(calibration)
+            session.sensor.offer(calibration)
             end = ('published on ~/preview only: call ~/save to use and store it, or ~/undo to '
                    'discard it')
             return '; '.join(filter(None, [*words, end, *mounting]))
@@ -253,10 +248,10 @@ class Commands:
 
     def _with_files(self, function: Callable[..., Found], *given: Any) -> Part[Found]:
         """Use files; fail if another sensor replaces this one meanwhile."""
-        session, live, sensor = self._session, self._session.live, self._session.sensor
+        session, sensor, name = self._session, self._session.sensor, self._session.name
         found: Found = yield Files(function, *given)
-        if session.live is not live:
-            raise InputError(f'the sensor {session.sensor!r} has replaced {sensor!r} meanwhile, '
+        if session.sensor is not sensor:
+            raise InputError(f'the sensor {session.name!r} has replaced {name!r} meanwhile, '
                              'expected one sensor: the result is not used',
                              'call the service again')
         return found
@@ -266,11 +261,11 @@ class Commands:
     def save(self) -> Task:
         """Use the offered calibration if there is one; store calibration and poses."""
         session, store = self._session, self._session.files.usable()
-        calibration = self.present
+        calibration = session.sensor.present
         if calibration is None:
             raise _NO_CALIBRATION
-        yield Files(store.save, calibration, session.live.book.poses())
-        if session.preview is calibration:
+        yield Files(store.save, calibration, session.sensor.live.book.poses())
+        if session.sensor.offered is calibration:
             session.adopt(calibration)
         return f'stored in {store.calibration} and {store.poses}'
 
@@ -287,13 +282,13 @@ class Commands:
     def undo(self) -> Task:
         """Discard the offered calibration, or return to the one before the last stored one."""
         session = self._session
-        if session.preview is not None:
-            session.offer(None)
+        if session.sensor.offered is not None:
+            session.sensor.offer(None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
         calibration = yield from self._with_files(session.files.usable().step_back)
-        before = session.active.calibration
+        before = session.sensor.calibration
         session.adopt(calibration)
-        session.fitted_poses = 0
+        session.sensor.fitted_poses = 0
         if calibration is None:
             return 'there is no calibration any more, as before the first fit'
         changes = '' if before is None else f'; {change_words(before, calibration)}'
@@ -303,9 +298,9 @@ class Commands:
         """Remove poses and calibration; the stored files are renamed."""
         session = self._session
         kept = yield from self._with_files(session.files.usable().set_aside)
-        session.live.clear()
+        session.sensor.live.clear()
         session.adopt(None)
-        session.fitted_poses = 0
+        session.sensor.fitted_poses = 0
         session.poses_changed(ended=False)
         return 'poses and calibration are removed' + ''.join(
             f'; the stored file is kept as {path.name}' for path in kept)
@@ -313,10 +308,10 @@ class Commands:
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
         session = self._session
-        session.active.enabled = on
+        session.enabled = on
         if not on:
             return 'the correction is off: raw messages are published unchanged'
-        if session.active.calibration is None:
+        if session.sensor.calibration is None:
             published = 'raw messages are' if session.settings.passthrough else 'nothing is'
             return (f'the correction is on, but there is no calibration yet: {published} '
                     'published; capture poses and call ~/fit')
@@ -327,7 +322,7 @@ class Commands:
     def _rest(self) -> Dwell:
         """Return the ongoing rest."""
         self._check_fresh()
-        rest = self._session.live.detector.current()
+        rest = self._session.sensor.live.detector.current()
         if rest is None:
             raise self._not_still()
         return rest
@@ -348,12 +343,12 @@ class Commands:
     def _not_still(self) -> InputError:
         """Return the error for a sensor that is not at rest."""
         session = self._session
-        least, length = session.settings.min_dwell, session.length_g()
+        least, length = session.settings.min_dwell, session.statistics.length_g(session.units)
         if abs(length - 1.0) > session.settings.still_norm_tolerance:
             return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
                               'hold the sensor still; if it is still, restart the node with the '
                               'right units')
-        if not session.live.still:
+        if not session.sensor.live.still:
             return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
                               'check ~/still')
         return InputError(f'the sensor has been still for less than {least:g} s',

@@ -142,6 +142,18 @@ class StreamStatistics:
         return count / span if span > 0.0 else 0.0
 
     @property
+    def context(self) -> dict[str, float]:
+        """Present time [s] and temperature [°C], if known."""
+        known = {'time': self.stamp, 'temperature': self.temperature}
+        return {key: value for key, value in known.items() if math.isfinite(value)}
+
+    def length_g(self, units: Units) -> float:
+        """Return |a| of the last messages [g]; NaN if not known."""
+        if self.reading is None or units.name == 'native':
+            return math.nan
+        return float(np.linalg.norm(self.reading)) / units.per_g
+
+    @property
     def stamp_fault(self) -> str:
         """Return what is wrong with the stamps of the last seconds, and what to do, or ''."""
         if self.age > SILENT:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 import math
 from time import monotonic
@@ -13,8 +13,8 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from .active_calibration import gyro_bias_of_rest
 from .guidance import Plan
+from .sensor import gyro_bias_of_rest
 from .settings import CalibratorSettings
 from ..calibrate import (
     Calibration,
@@ -165,13 +165,15 @@ _FEWEST_NATIVE = 4
 
 
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
-        before: Calibration | None, context: Context) -> tuple[Calibration, list[str], bool]:
+        before: Calibration | None, known: Mapping[str, float]
+        ) -> tuple[Calibration, list[str], bool]:
     """
     Return a fit, what to answer, and whether an automatic fit replaces the calibration before it.
 
-    Parameters and errors are as in `fitted`.
+    Parameters and errors are as in `fitted`; `known` has the present values of the context.
 
     """
+    context = {key: np.array([value]) for key, value in known.items()}
     calibration = fitted(poses, units, settings, sensor, before, context)
     return (calibration, [summary(calibration), change_words(before, calibration)],
             replaces(before, calibration))

@@ -14,7 +14,7 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import CalibratorSettings, findings, Log, Session, ShowPoses, Task
+from accel_calib.session import CalibratorSettings, findings, Log, Session, ShowPoses, state, Task
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
@@ -77,9 +77,9 @@ class _Driver:
 
     def state(self) -> Any:
         """Return progress, diagnostics, findings and poses."""
-        health = self.session.health()
-        return [self.session.progress(), dict(health_figures(health)), findings(health),
-                self.shown, self.session.live.book.poses(), self.session.active.drift]
+        health = state.health(self.session)
+        return [state.progress(self.session), dict(health_figures(health)), findings(health),
+                self.shown, self.session.sensor.live.book.poses(), self.session.sensor.drift]
 
     def lines(self) -> Any:
         return self.log
