@@ -353,7 +353,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
                                     covariance=covariance))
     driver = Driver(calibration_file=str(path))
     for temperature, level in ((25.0, Level.OK), (40.0, Level.WARN)):
-        driver.session.set_temperature(temperature)
+        driver.session.statistics.temperature = temperature
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
         assert driver.finding('calibration').level == level
     assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
@@ -555,7 +555,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     slow = np.append(values['offset_temperature'][:3], [2.0 * lag, of_sensor])
     offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
     driver.session.sensor.offered = offered
-    driver.session.set_temperature(warm[-1])
+    driver.session.statistics.temperature = warm[-1]
     corrected = offered.apply(np.tile(still, (900, 1)), time=time,
                               temperature=np.repeat(warm, 10))[-1]
     assert state.progress(driver.session).corrected == pytest.approx(

@@ -45,7 +45,7 @@ from ..session import (
     state,
     Task,
 )
-from ..session.work import Severity
+from ..session.events import Severity
 from ..session.worker import Answer, CallSoon, Worker
 from ..stored.exports import export, Exported
 from ..table import Floats
@@ -409,7 +409,7 @@ class Host:
         """Pass the last known temperature to the session."""
         known = temperatures[np.isfinite(temperatures)]
         if len(known):
-            self.session.set_temperature(float(known[-1]))
+            self.session.statistics.temperature = float(known[-1])
 
     def _handle_events(self) -> None:
         """Show and log what the session reports."""

@@ -124,7 +124,7 @@ class Stream:
         """Set the temperature of the following messages [°C]; NaN is ignored."""
         if math.isfinite(temperature):
             self._temperature = temperature
-            self._session.set_temperature(temperature)
+            self._session.statistics.temperature = temperature
 
     @property
     def newest(self) -> Triple | None:

@@ -14,6 +14,7 @@ stores it or ~/undo discards it.
 from __future__ import annotations
 
 from collections.abc import Callable
+import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -21,19 +22,8 @@ import numpy as np
 from .guidance import next_action, Plan
 from .sensor import Sensor
 from .store import Store, writing_advice
-from .work import (
-    at_rest,
-    change_words,
-    Compute,
-    Files,
-    fit,
-    Found,
-    is_partial,
-    Part,
-    plan_for,
-    refined,
-    Task,
-)
+from .work import at_rest, change_words, fit, is_partial, plan_for, refined
+from .worker import Compute, Files, Found, Part, Task
 from ..calibrate import (
     ARBITRARY_HEADING,
     Calibration,
@@ -54,6 +44,9 @@ if TYPE_CHECKING:
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
 
+_AUTO_FIT_EVERY = 60.0
+"""Shortest time between two automatic fits [s]."""
+
 _NEXT_LATER = 'the next pose is on ~/poses after the computation that is running'
 """Advice while a fit or a refinement occupies the worker process."""
 
@@ -69,7 +62,7 @@ class Commands:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._refused = ''
+        self._refused, self._auto_fit_at = '', -math.inf
 
     # Poses
 
@@ -111,7 +104,18 @@ class Commands:
         calibration, words, _ = yield from self._fitted()
         return (yield from self._use(calibration, words, offered=offered))
 
-    def auto_fit(self, sensor: Sensor) -> Task:
+    def due(self) -> list[Task]:
+        """Return an automatic fit if one is due."""
+        session, now = self._session, self._session.clock()
+        sensor, settings = session.sensor, session.settings
+        if (settings.auto_fit and sensor.auto_fit_waits
+                and now - self._auto_fit_at >= _AUTO_FIT_EVERY and session.files.locked
+                and len(sensor.live.book.poses()) >= settings.auto_fit_poses):
+            sensor.auto_fit_waits, self._auto_fit_at = False, now
+            return [self._auto_fit(sensor)]
+        return []
+
+    def _auto_fit(self, sensor: Sensor) -> Task:
         """Fit the poses of a sensor; use the result if it differs by more than its uncertainty."""
         if self._session.sensor is not sensor:
             return ''
@@ -320,7 +324,6 @@ class Commands:
     # Checks
 
     def _rest(self) -> Dwell:
-        """Return the ongoing rest."""
         self._check_fresh()
         rest = self._session.sensor.live.detector.current()
         if rest is None:
@@ -341,7 +344,6 @@ class Commands:
                              'set header.stamp in the driver')
 
     def _not_still(self) -> InputError:
-        """Return the error for a sensor that is not at rest."""
         session = self._session
         least, length = session.settings.min_dwell, session.statistics.length_g(session.units)
         if abs(length - 1.0) > session.settings.still_norm_tolerance:

@@ -225,7 +225,6 @@ class Sensor:
         return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
-        """Return the state of the drift monitor after one more rest."""
         context = self._context(rest)
         if self._past is None or self.calibration is None or context is None:
             return self._past
@@ -310,3 +309,10 @@ def _only_levelled(before: Calibration | None, after: Calibration | None) -> boo
             and np.array_equal(before.model.vector, after.model.vector)
             and np.array_equal(before.covariance, after.covariance)
             and not np.array_equal(before.model.rotation, after.model.rotation))
+
+
+def title(calibration: Calibration) -> str:
+    """Return a short description of a calibration."""
+    return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
+            f'{calibration.quality.rms_after_mg:.3f} mg, '
+            f'{"levelled" if calibration.is_levelled else "not levelled"}')

@@ -20,26 +20,16 @@ from time import monotonic
 import numpy as np
 
 from .commands import Commands
+from .events import Event, Log, Mounting, Severity, ShowPoses, Still
 from .live_capture import Change
 from .reports import AGAIN, Reports
-from .sensor import Sensor
+from .sensor import Sensor, title
 from .sensor_files import SensorFiles
 from .settings import CalibratorSettings
 from .store import load, Loaded, Store, writing_advice
 from .stream import SILENT, StreamStatistics
-from .work import (
-    Compute,
-    Event,
-    Files,
-    Log,
-    Mounting,
-    plan_for,
-    Severity,
-    ShowPoses,
-    Still,
-    Task,
-    title,
-)
+from .work import plan_for
+from .worker import Compute, Files, Task
 from ..calibrate import Calibration, with_given_mounting
 from ..calibrate.mounting import mounting_of, mounting_words
 from ..compare import status
@@ -59,9 +49,6 @@ and 3 batches per second, these are less than 1 % of the messages.
 
 _LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
 """Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
-
-_AUTO_FIT_EVERY = 60.0
-"""Shortest time between two automatic fits [s]."""
 
 
 class Session:
@@ -119,7 +106,6 @@ class Session:
         self.computing = 0
         _check_frames(settings)
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
-        self._auto_fit_at = -math.inf
         self._largest = (_LARGEST_NATIVE if self.units.name == 'native'
                          else _LARGEST_G * self.units.per_g)
         self._events: list[Event] = []
@@ -160,7 +146,7 @@ class Session:
         self._report_still()
         self.reports.faults()
         self.reports.limits()
-        self._auto_fit()
+        self._events += self.commands.due()
 
     def close(self) -> None:
         """Unlock the files."""
@@ -215,12 +201,7 @@ class Session:
             if last != before:
                 self.reports.jump(last[0].seconds, since)
 
-    def set_temperature(self, temperature: float) -> None:
-        """Set the temperature of the following messages [°C]."""
-        self.statistics.temperature = temperature
-
     def _change(self, changes: Iterable[Change]) -> None:
-        """Process the changes that samples caused."""
         for change in changes:
             self._report_still()
             self._process(change)
@@ -265,7 +246,6 @@ class Session:
             self.files.take(self.name)
 
     def _switch_to(self, frame_id: str) -> None:
-        """Switch to another sensor."""
         self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
                  f'{self.frame_id!r}: switching to this sensor')
         self._change(self.sensor.live.interrupt(self.settings.auto_capture))
@@ -364,16 +344,7 @@ class Session:
         self._show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True
-        self._auto_fit()
-
-    def _auto_fit(self) -> None:
-        """Start an automatic fit if one is due."""
-        sensor, settings, now = self.sensor, self.settings, self.clock()
-        if (settings.auto_fit and sensor.auto_fit_waits
-                and now - self._auto_fit_at >= _AUTO_FIT_EVERY and self.files.locked
-                and len(sensor.live.book.poses()) >= settings.auto_fit_poses):
-            sensor.auto_fit_waits, self._auto_fit_at = False, now
-            self._events.append(self.commands.auto_fit(sensor))
+        self._events += self.commands.due()
 
     def _show_poses(self, *, store: bool, new_rest: bool = False) -> None:
         """Add a task that stores the poses, and draws them with the next pose."""

@@ -12,8 +12,9 @@ import numpy as np
 
 from .guidance import Progress
 from .health import Health
+from .sensor import title
 from .stream import Newest, SILENT
-from .work import is_partial, title
+from .work import is_partial
 from ..calibrate import Outside, outside
 from ..calibrate.mounting import mounting_words
 from ..messages.one_reading import Triple

@@ -1,15 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session asks for: the events for the node, and its computations with their texts."""
+"""The computations of a session, with their texts; most run in the worker process."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 import math
-from time import monotonic
-from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -24,7 +22,6 @@ from ..calibrate import (
     level,
     lies_in_cone,
     next_pose,
-    NextPose,
     PRIOR,
 )
 from ..calibrate.mounting import flat_direction
@@ -40,119 +37,6 @@ from ..refine.words import residual_words, verdict_words
 from ..table import Floats, Poses
 from ..text import counted, listed, now
 from ..units import MG, Units
-
-Severity = Literal['info', 'warning', 'error']
-
-
-class Step:
-    """
-    What a task waits for: the result of a function.
-
-    Parameters
-    ----------
-    function : callable, optional
-        The function. It does not use the session, and can raise AccelCalibError or OSError, which
-        are raised in the task. None: the task only waits until the steps before it are done.
-    *given
-        Its arguments.
-
-    """
-
-    def __init__(self, function: Callable[..., Any] | None = None, *given: Any) -> None:
-        self._function, self._given = function, given
-
-    def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; `call` is `worker.WorkerProcess.call`."""
-        return None if self._function is None else call(self._function, *self._given)
-
-
-class Files(Step):
-    """A function that uses files; other functions that use files and commands wait for it."""
-
-    def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; it does not need the worker process."""
-        return super().run(lambda function, *given: function(*given))
-
-
-class Compute(Step):
-    """A function that computes, in the worker process; commands and files do not wait for it."""
-
-
-Task = Generator[Step, Any, Any]
-"""
-Steps whose results are sent back, in the thread of the session; the returned value is the answer.
-
-An empty answer is not logged. A task can raise AccelCalibError.
-
-"""
-
-Found = TypeVar('Found')
-
-Part = Generator[Step, Any, Found]
-"""A part of a task, for ``yield from``."""
-
-
-@dataclass(frozen=True)
-class Log:
-    """A log line; if `once_in` is not 0, it is logged at most once in this time [s]."""
-
-    severity: Severity
-    words: str
-    once_in: float = 0.0
-
-
-@dataclass(frozen=True)
-class Still:
-    """A change of whether the sensor is still."""
-
-    still: bool
-
-
-@dataclass(frozen=True)
-class ShowPoses:
-    """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
-
-    up: Floats
-    asked: NextPose
-    frame_id: str
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
-
-    rotation: Floats
-    frame_id: str
-
-
-class LogFilter:
-    """
-    Decide which lines are logged: not empty, and not again within their `once_in`.
-
-    Parameters
-    ----------
-    clock : callable
-        Steady clock [s].
-
-    """
-
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self._clock = clock
-        self._last: dict[str, float] = {}
-
-    def passes(self, line: Log) -> bool:
-        """Return whether to log a line, and note it."""
-        if not line.once_in:
-            return bool(line.words)
-        kind, now = line.words[:20], self._clock()
-        if now - self._last.get(kind, -line.once_in) < line.once_in:
-            return False
-        self._last[kind] = now
-        return True
-
-
-Event = Log | Mounting | Still | ShowPoses | Task
-
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
@@ -394,10 +278,3 @@ def story(refinement: Refinement) -> str:
     if refinement.disturbed_poses:
         lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
     return '; '.join([*lines, *refinement.calibration.warnings, *refinement.advice])
-
-
-def title(calibration: Calibration) -> str:
-    """Return a short description of a calibration."""
-    return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
-            f'{calibration.quality.rms_after_mg:.3f} mg, '
-            f'{"levelled" if calibration.is_levelled else "not levelled"}')

@@ -27,7 +27,7 @@ if one of them changed the calibration.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from importlib import import_module
@@ -43,7 +43,6 @@ from traceback import format_exc
 from typing import Any, BinaryIO, cast, TypeVar
 
 from .store import writing_advice
-from .work import Files, Step, Task
 from ..errors import AccelCalibError, InputError
 
 Found = TypeVar('Found')
@@ -196,6 +195,51 @@ def _answer(call: Any) -> tuple[bool, Any]:
         return False, error
 
 
+class Step:
+    """
+    What a task waits for: the result of a function.
+
+    Parameters
+    ----------
+    function : callable, optional
+        The function. It does not use the session, and can raise AccelCalibError or OSError, which
+        are raised in the task. None: the task only waits until the steps before it are done.
+    *given
+        Its arguments.
+
+    """
+
+    def __init__(self, function: Callable[..., Any] | None = None, *given: Any) -> None:
+        self._function, self._given = function, given
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; `call` is `WorkerProcess.call`."""
+        return None if self._function is None else call(self._function, *self._given)
+
+
+class Files(Step):
+    """A function that uses files; other functions that use files and commands wait for it."""
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; it does not need the worker process."""
+        return super().run(lambda function, *given: function(*given))
+
+
+class Compute(Step):
+    """A function that computes, in the worker process; commands and files do not wait for it."""
+
+
+Task = Generator[Step, Any, Any]
+"""
+Steps whose results are sent back, in the thread of the session; the returned value is the answer.
+
+An empty answer is not logged. A task can raise AccelCalibError.
+
+"""
+
+Part = Generator[Step, Any, Found]
+"""A part of a task, for ``yield from``."""
+
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
 
@@ -262,7 +306,6 @@ class Worker:
                 return
 
     def _use_files(self, step: Files, task: Task, answer: Answer) -> None:
-        """Run a step that uses files."""
         def then(done: Future[Any]) -> None:
             self._resume(task, answer, done)
             self._advance()

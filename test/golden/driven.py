@@ -69,7 +69,7 @@ class _Driver:
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 9), np.nan)
                 rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
-                self.session.set_temperature(t)
+                self.session.statistics.temperature = t
                 self.session.push(rows, self.now)
             self._handle()
         self.session.tick()
