@@ -24,9 +24,9 @@ from .events import Event, Log, Mounting, Severity, ShowPoses, Still
 from .live_capture import Change
 from .reports import AGAIN, Reports
 from .sensor import Sensor, title
-from .sensor_files import SensorFiles
+from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
-from .store import load, Loaded, Store, writing_advice
+from .store import Store, writing_advice
 from .stream import SILENT, StreamStatistics
 from .work import plan_for
 from .worker import Compute, Files, Task

@@ -27,10 +27,9 @@ import stat
 import numpy as np
 
 from ..calibrate import Calibration, check_sensor
-from ..disk import check_regular, copy_atomically, remove_leftovers
+from ..disk import check_regular, copy_atomically
 from ..errors import (
     AccelCalibError,
-    crash_words,
     DamagedCalibrationError,
     FREE_SPACE,
     InputError,
@@ -310,71 +309,6 @@ class Store:
         return folder.is_dir() and os.access(folder, rights, effective_ids=True)
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """
-    The content of a store.
-
-    Parameters
-    ----------
-    calibration, poses
-        Usable calibration and poses; None without them.
-    problem : str
-        Reason why the calibration cannot be used; empty if it is usable or does not exist.
-    notes : tuple of str
-        Notes for the user.
-
-    """
-
-    calibration: Calibration | None
-    poses: Poses | None
-    problem: str = ''
-    notes: tuple[str, ...] = ()
-
-
-def load(store: Store) -> Loaded:
-    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
-    notes = _tidied(store)
-    calibration, poses, problem = None, None, ''
-    try:
-        calibration = store.load_calibration()
-    except Exception as error:  # the node starts in any case
-        problem = f'{_words(error)}; {_after(store.calibration, error)}'
-    if calibration is not None and calibration.stream not in ('', store.identity.topic):
-        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
-                     f'{store.identity.topic}')
-    try:
-        poses = store.load_poses()
-    except Exception as error:
-        notes.append(f'{_words(error)}; {_renamed(store.poses)}')
-    return Loaded(calibration, poses, problem, tuple(notes))
-
-
-def _tidied(store: Store) -> list[str]:
-    """Remove leftovers of writing; return log lines about what fails."""
-    try:
-        failed = [error for path in (store.calibration, store.poses)
-                  for error in remove_leftovers(path)]
-    except OSError as error:
-        return [f'the folder {store.calibration.parent} could not be tidied: {error}; '
-                f'{writing_advice(error)}']
-    return [f'the temporary file {error.filename} could not be removed: {error.strerror}; '
-            'remove it by hand' for error in failed]
-
-
-def _after(path: Path, error: Exception) -> str:
-    """Return what happens to a calibration that cannot be used; a damaged one is renamed."""
-    sound = isinstance(error, OSError | StoredCalibrationError)
-    if sound and not isinstance(error, DamagedCalibrationError):
-        return 'it is renamed when the next calibration is stored'
-    return _renamed(path)
-
-
-def _words(error: Exception) -> str:
-    """Return one line about an error, also about one that nobody expected."""
-    return str(error) if isinstance(error, AccelCalibError | OSError) else crash_words(error)
-
-
 def _exists(path: Path) -> bool:
     """Return whether something has this path, also a link to nothing; OSError if not known."""
     try:
@@ -394,14 +328,6 @@ def _check_sizes(poses: Poses, path: Path) -> None:
         if np.any(bad):
             raise InputError(f'{path}: row {int(np.argmax(bad)) + 1} has an impossible {key}, '
                              f'expected less than {LARGEST:g}', 'new poses start a new table')
-
-
-def _renamed(path: Path) -> str:
-    """Rename a file that cannot be used, and return a text about it."""
-    try:
-        return f'kept as {aside(path, "damaged")}'
-    except OSError as error:
-        return f'it could not be renamed ({error})'
 
 
 def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:

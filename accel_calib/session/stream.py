@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import islice
 import math
-from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +84,7 @@ class StreamStatistics:
 
     """
 
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+    def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self.messages = self.not_finite = self.foreign = self.implausible = 0
         self.stamp = self.temperature = self.spread = math.nan
