@@ -12,6 +12,7 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,19 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
         driver.done(task)
     assert driver.session.name == 'other'
     assert driver.session.sensor.calibration is None
+
+
+def test_an_automatic_fit_of_a_sensor_is_not_one_of_the_next(readings: Readings) -> None:
+    driver = Driver()
+    turned = readings(spread_directions(12))
+    driver.feed(turned)
+    driver.session.set_settings(replace(driver.session.settings, auto_fit=True))
+    task, = driver.session.commands.due()
+    driver.now += 3.0
+    driver.feed(turned[:200], 'other')
+    assert driver.done(task) == ''
+    assert driver.session.sensor.calibration is None
+    assert not driver.session.commands.due()
 
 
 def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings
