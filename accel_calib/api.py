@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, overload, TypeVar
@@ -23,10 +24,12 @@ from .compare import compare as compare_calibrations
 from .compare import Comparison
 from .effects import model_with, simulate_poses, simulate_recording
 from .errors import InputError
+from .finding import Finding
 from .geometry import spread_directions
 from .intake import nothing_still, poses_of
 from .logs import LogOptions, open_log, read_log
 from .logs import read_recording as read_whole_recording
+from .rating import rate, Rating
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration
@@ -62,14 +65,26 @@ class Calibration(calibrate.Calibration):
         Covariance of the values named by `parameters` [g²].
     quality : Quality
         Residuals and other figures over the poses used.
-    warnings : tuple of str
-        Warnings for the user.
+    noted : tuple of Finding
+        What was noted during the fit, when it was levelled, and when it was read.
+    rating : Rating
+        Whether it is good, and all findings about it.
     gyro : GyroBias or None
         Bias of the gyro at rest; None if the poses have no angular rates.
     noise : SampleNoise or None
         Noise of one sample at rest; None if it is not known.
 
     """
+
+    @cached_property
+    def rating(self) -> Rating:
+        """Return whether the calibration is good: ``name``, ``reason``, ``next``, ``findings``."""
+        return rate(self)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what is worth knowing, that which decides the rating first."""
+        return self.rating.findings
 
     def save(self, path: Source) -> None:
         """
@@ -539,7 +554,7 @@ def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> 
 
 def _asked(units: UnitName | None, calibration: calibrate.Calibration) -> UnitName | None:
     """Return the unit to read poses in: native for a native calibration, else recognised."""
-    return units or ('native' if calibration.units.name == 'native' else None)
+    return units or ('native' if calibration.units.is_native else None)
 
 
 def _in_units_of(calibration: calibrate.Calibration, table: Table, asked: UnitName | None

@@ -96,16 +96,3 @@ OVER_THE_SPHERE = spread_directions(300)
 def unit(vectors: Floats) -> Floats:
     """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-
-
-def random_directions(count: int, rng: np.random.Generator) -> Floats:
-    """
-    Return random directions, uniformly distributed over the sphere.
-
-    Returns
-    -------
-    (count, 3) array
-        Unit vectors.
-
-    """
-    return unit(rng.normal(size=(count, 3)))

@@ -294,7 +294,7 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     if len(poses) == 0:
         return
-    if units.name != 'native':
+    if not units.is_native:
         _check_readings(_median_length(poses.reading), units, source and f'{source}: ')
     if 'reference' in poses:
         _check_reference(_median_length(poses['reference']), units)
@@ -321,7 +321,7 @@ def _check_readings(length: float, units: Units, where: str) -> None:
 
 def _check_reference(length: float, units: Units) -> None:
     per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
-                    if units.name == 'native' else
+                    if units.is_native else
                     (units.per_g, f'in {units.name}, the unit of the readings'))
     if _is_likely(length, per_g):
         return

@@ -47,6 +47,16 @@ class Units:
         if not self.per_g > 0.0:
             raise ValueError(f'per_g is {self.per_g}, expected a positive number')
 
+    @property
+    def is_native(self) -> bool:
+        """Whether the scale is not known, and a fit estimates it."""
+        return self.name == 'native'
+
+    @property
+    def is_si(self) -> bool:
+        """Whether it is m/s², the unit of Imu messages."""
+        return self.name == 'm/s2'
+
     def to_g(self, reading: Floats) -> Floats:
         """Convert readings from this unit to g."""
         return reading / self.per_g

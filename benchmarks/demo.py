@@ -16,7 +16,6 @@ its processes after the other is stopped for a while, as by a machine that hangs
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 import contextlib
 import json
 import os
@@ -30,7 +29,7 @@ import time
 
 ROOT = Path(__file__).resolve().parents[1]
 
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import busy, Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 BETWEEN = 1.0
@@ -42,19 +41,6 @@ Made by `python benchmarks/demo.py {command} --markdown FILE`.
 {loops} busy loops ran beside each turn; one process after the other was stopped for {stop:g} s.
 
 Machine: {machine}."""
-
-
-@contextlib.contextmanager
-def busy(loops: int) -> Iterator[None]:
-    """Run this number of busy loops."""
-    processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
-                 for _ in range(loops)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 def family(parent: int) -> list[int]:

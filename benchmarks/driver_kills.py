@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass
 import multiprocessing
 import os
@@ -32,7 +32,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 
 import driver_kills_clients as clients  # noqa: E402
-from figures import processor, publish  # noqa: E402
+from figures import busy, processor, publish  # noqa: E402
 import numpy as np  # noqa: E402
 
 PARTIES = ('driver', 'calibrator', 'listener')
@@ -242,19 +242,6 @@ def trials(world: World, case: Case, count: int, seed: int) -> Iterator[Trial]:
             for name in PARTIES:
                 world.kill(name)
         yield found
-
-
-@contextmanager
-def busy(loops: int) -> Iterator[None]:
-    """Run busy loops beside."""
-    running = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
-               for _ in range(loops)]
-    try:
-        yield
-    finally:
-        for each in running:
-            each.kill()
-            each.wait()
 
 
 def run(case: Case, count: int, seed: int, folder: Path | None) -> Iterator[Trial]:

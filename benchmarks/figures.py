@@ -1,15 +1,18 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pages that the benchmarks write: tables of what is measured beside what is asked."""
+"""What benchmarks share: the pages with what is measured beside what is asked, and a load."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 import os
 from pathlib import Path
 import platform
+import subprocess
+import sys
 
 
 @dataclass(frozen=True)
@@ -61,3 +64,16 @@ def processor() -> str:
     except (OSError, StopIteration):
         name = platform.processor() or platform.machine()
     return f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}'
+
+
+@contextmanager
+def busy(loops: int) -> Iterator[None]:
+    """Run this number of busy loops."""
+    processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
+                 for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()

@@ -30,9 +30,10 @@ from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate.closed_form import closed_form  # noqa: E402
 from accel_calib.estimate.fit import estimate  # noqa: E402
 from accel_calib.estimate.outliers import start_of  # noqa: E402
-from accel_calib.geometry import random_directions, spread_directions  # noqa: E402
+from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
+from directions import random_directions  # noqa: E402
 from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 

@@ -14,9 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from accel_calib.calibrate import Calibration
-from accel_calib.geometry import random_directions, spread_directions
+from accel_calib.geometry import spread_directions
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import MG
+from directions import random_directions
 import numpy as np
 
 NOISE = 3e-4

@@ -33,9 +33,9 @@ from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
 from accel_calib.effects.simulate import path  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.geometry import random_directions  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
+from directions import random_directions  # noqa: E402
 from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import (  # noqa: E402

@@ -27,9 +27,10 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.compare import compared, monitor, rests_of  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
-from accel_calib.geometry import random_directions, spread_directions  # noqa: E402
+from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
+from directions import random_directions  # noqa: E402
 from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 

@@ -17,6 +17,7 @@ from importlib.util import find_spec
 import os
 from pathlib import Path
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -324,6 +325,26 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, domain: int) -> Itera
     made = Bench(tmp_path, domain)
     yield made
     made.close()
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the files of sensors."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    return tmp_path / 'home' / 'accel_calib'
+
+
+@pytest.fixture
+def in_time() -> Iterator[None]:
+    """End a test that hangs, such as one that reads a pipe."""
+    def end(*_: object) -> None:
+        raise AssertionError(f'not ready within {PATIENCE:g} s')
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(round(PATIENCE))
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture

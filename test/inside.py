@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from accel_calib.calibrate.checks import axes_of, fault_of, flat_warnings
+from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
 from accel_calib.calibrate.fleet_prior import posterior
 from accel_calib.calibrate.gate import sound_rows
 from accel_calib.calibrate.mounting import (
@@ -33,15 +33,13 @@ from accel_calib.calibrate.pose_planning import (
     unseen,
     words_of,
 )
-from accel_calib.capture.trend import oscillation
 from accel_calib.capture.window import rounding_left
-from accel_calib.cli.demo import HIDDEN as DEMO_CHOICES
-from accel_calib.cli.main import COMMANDS, main, parser
-from accel_calib.cli.options import plain as plain_json
-from accel_calib.cli.terminal import in_one_line, Output, shown
-from accel_calib.cli.watch import _Lines as WatchLines
-from accel_calib.cli.watch import _Screen as WatchScreen
-from accel_calib.cli.watch_view import changes, screen, state
+from accel_calib.cli.commands import COMMANDS
+from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
+from accel_calib.cli.frame import Output
+from accel_calib.cli.main import main, parser
+from accel_calib.cli.terminal import in_one_line, shown
+from accel_calib.cli.watch import changes, screen, state
 from accel_calib.compare.drift import change, is_over
 from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
 from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES
@@ -63,7 +61,6 @@ from accel_calib.effects import (
     model_with,
     MODELS,
     parameter_basis,
-    parameter_names,
     parse_effect,
     predict,
     reading_of,
@@ -76,7 +73,6 @@ from accel_calib.effects import (
 )
 from accel_calib.effects.terms import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
-from accel_calib.estimate.closed_form import along_quadrics
 from accel_calib.estimate.equations import equations, kinds, noise_of
 from accel_calib.estimate.geometry import distinct
 from accel_calib.estimate.mistakes import unseen_mistakes
@@ -91,7 +87,6 @@ from accel_calib.fleet.store import schema, write_parquet
 from accel_calib.geometry import (
     OVER_THE_SPHERE,
     quaternion_of,
-    random_directions,
     rotation_from_rpy,
     spread_directions,
     unit,
@@ -105,21 +100,17 @@ from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
 from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
 from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
-from accel_calib.live.messages import progress as live_progress
-from accel_calib.live.messages import text_of as live_text_of
 from accel_calib.live.server import PageServer, policy_hash
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.logs import are_samples, bag, bounded_bags, layout_with, open_bag, text
-from accel_calib.logs.ardupilot import is_dataflash, read_dataflash
+from accel_calib.logs.ardupilot import read_dataflash
 from accel_calib.logs.bag import open_samples, together
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.formats import named as format_named
 from accel_calib.logs.formats import recognise, record_instead
 from accel_calib.logs.names import meaning, unit_of
-from accel_calib.logs.names import UNITS as LOG_UNITS
-from accel_calib.logs.names import WORDS as LOG_WORDS
-from accel_calib.logs.px4 import is_ulg, read_ulg
 from accel_calib.logs.px4 import MAGIC as ULG_MAGIC
+from accel_calib.logs.px4 import read_ulg
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
@@ -136,30 +127,24 @@ from accel_calib.refine.curves import (
     Walk,
     walk_beside,
 )
-from accel_calib.refine.linear import _MOST_UNUSUAL as MOST_UNUSUAL
 from accel_calib.refine.linear import _RARE as RARE
-from accel_calib.refine.linear import _USUAL as USUAL
 from accel_calib.refine.linear import Block, Linear, linearised, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
 from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
-from accel_calib.refine.plan import _Predictions as Predictions
-from accel_calib.refine.records import attitude_words, percent
+from accel_calib.refine.records import attitude_words
 from accel_calib.refine.records import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.rivals import probabilities
 from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
 from accel_calib.refine.state import beginning, fitted_state, sampled
-from accel_calib.refine.state import MOST as MOST_SAMPLED_POSES
-from accel_calib.refine.words import advice_for, chance, values_of, verdict_words
-from accel_calib.report.charts import equal_area
-from accel_calib.report.drawings import all_drawings, curve_parts, recorded, variables_of
+from accel_calib.refine.words import advice_for, values_of, verdict_words
+from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page
 from accel_calib.report.page import page as refinement_page
 from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
 from accel_calib.report.sections import linear_figures
 from accel_calib.report.sheet import snippets
-from accel_calib.report.sheet import STYLE as PAGE_STYLE
 from accel_calib.ros.domain import own_domain
 from accel_calib.session import store as session_store
 from accel_calib.session import worker
@@ -168,7 +153,7 @@ from accel_calib.session.health import figures
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor
 from accel_calib.session.sensor_files import load as load_store
-from accel_calib.session.sensor_files import Lock, StoreInUseError
+from accel_calib.session.sensor_files import Lock
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
 from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
 from accel_calib.session.store import Store as SensorStore
@@ -179,15 +164,13 @@ from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import _values_in as values_in
 from accel_calib.stored.calibration_yaml import (
     format_calibration,
-    OTHER_CORRECTION,
     parse_calibration,
 )
 from accel_calib.stored.exports import export, identifier
 from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
 from accel_calib.stored.exports import Options as ExportOptions
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
-from accel_calib.stored.plan_table import read_plan, write_plan
-from accel_calib.text import with_sd
+from accel_calib.stored.plan_table import write_plan
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""

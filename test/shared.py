@@ -1,13 +1,16 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: real recordings, a simulated sensor, and tasks of a session."""
+"""Helpers of several tests: recordings, a sensor, the command line, and tasks of a session."""
 
+import json
 from pathlib import Path
 from typing import Any
 
+from accel_calib.geometry import unit
 from accel_calib.session import Step, Task
-from inside import Model, model_with
+from accel_calib.table import Floats
+from inside import main, Model, model_with
 import numpy as np
 import pytest
 
@@ -30,6 +33,22 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
                        for name in names})
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Floats:
+    """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
+    return unit(rng.normal(size=(count, 3)))
+
+
+def run(*arguments: object) -> int:
+    """Run a command, and return the exit status."""
+    return main([str(argument) for argument in arguments])
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any]:
+    """Run a command, and return the exit status and the JSON on standard output."""
+    status = run(*arguments, '--json', '-')
+    return status, json.loads(capsys.readouterr().out)
 
 
 def result(step: Step) -> Any:

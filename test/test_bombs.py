@@ -6,11 +6,9 @@
 from __future__ import annotations
 
 import bz2
-from collections.abc import Iterator
 import os
 from pathlib import Path
 import shutil
-import signal
 import socket
 import sqlite3
 import struct
@@ -37,6 +35,8 @@ try:
 except ImportError:
     from backports import zstd
 
+pytestmark = pytest.mark.usefixtures('in_time')
+
 BOMB_SIZE = 1 << 31
 ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 MOST_BYTES = 150e6
@@ -46,19 +46,6 @@ HANG_S = 600
 
 RAWS = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
         for topic, stamp, each in messages()]
-
-
-@pytest.fixture(autouse=True)
-def _not_without_end() -> Iterator[None]:
-    """Fail a test that hangs."""
-    def late(*_: Any) -> None:
-        raise TimeoutError(f'the test takes more than {HANG_S} s')
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(HANG_S)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(scope='module')

@@ -6,17 +6,13 @@
 import json
 
 from accel_calib.stored import read_calibration
-from inside import are_samples, main
+from inside import are_samples
 import numpy as np
 import pytest
-from shared import data
+from shared import data, run
 
 OFFSET = (0.02, -0.01, 0.03)
 EFFECTS = ('--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005')
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 def calibrated(capsys, *arguments):

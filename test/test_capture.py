@@ -105,13 +105,6 @@ def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
     assert np.all(poses.noise[:2] < kept.noise[:2])
 
 
-@pytest.mark.parametrize(('angle', 'poses'), [(0.1, 6), (0.01, 8)])
-def test_whether_a_pose_is_repeated_depends_on_min_pose_angle(angle, poses):
-    found = capture(visited(AGAIN), G, CaptureSettings(repeated='merge', min_pose_angle=angle))
-    assert len(found.poses) == poses
-    assert found.samples == capture(visited(AGAIN), G).samples
-
-
 def test_a_number_that_is_not_finite_is_refused_with_its_row():
     samples = visited(FACES)
     reading = samples.reading.copy()

@@ -10,9 +10,10 @@ import subprocess
 import sys
 
 from accel_calib.logs import read_poses
-from inside import main, parse_effect, parser, plain_json, rotation_from_rpy
+from inside import main, parse_effect, parser, rotation_from_rpy
 import numpy as np
 import pytest
+from shared import run, run_json
 
 ROOT = Path(__file__).parents[1]
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
@@ -21,15 +22,6 @@ FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_s
             'poses_used', 'poses_rejected', 'rms_before_mg', 'rms_after_mg', 'max_after_percent',
             'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings',
             'uncertainty_mg', 'identifiability', 'next_pose'}
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def run_json(capsys, *arguments):
-    status = run(*arguments, '--json', '-')
-    return status, json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture
@@ -179,6 +171,18 @@ def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
     assert printed.err.count('\n') == 1
 
 
+@pytest.mark.parametrize('arguments', [
+    ('fit', 'no.csv'), ('calibrate', 'no.csv'), ('refine', 'no.csv'), ('history', 'no.yaml'),
+    ('verify', 'no.csv', '-c', 'no.yaml'), ('compare', 'no.yaml'), ('noise', 'no.csv'),
+    ('capture', 'no.csv', '-o', 'x.csv'), ('export', 'no.yaml', '--to', 'c')], ids=' '.join)
+def test_an_error_of_every_command_is_in_the_json(arguments, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, result = run_json(capsys, *arguments)
+    assert status == 2
+    assert {'error', 'advice'} <= set(result) <= {'error', 'advice', 'file'}
+    assert result['advice']
+
+
 def bad_table(folder, text):
     path = folder / 'bad.csv'
     path.write_text(text)
@@ -228,14 +232,6 @@ def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, ca
     assert sorted(tmp_path.iterdir()) == there
 
 
-def test_a_recording_that_never_rests_is_refused(tmp_path, capsys):
-    path = tmp_path / 'r.csv'
-    run('simulate', '-o', path, '--recording', '--dwell', 0.05, '--turn', 2, '--poses', 10)
-    capsys.readouterr()
-    assert run('capture', path, '-o', tmp_path / 'p.csv') == 2
-    assert 'no still stretch' in capsys.readouterr().err
-
-
 def commands():
     return list(parser()._subparsers._group_actions[0].choices)
 
@@ -269,11 +265,6 @@ def test_only_what_is_used_is_imported(arguments, without, poses):
     assert ('noise floor' in done.stdout) is (arguments[0] == 'fit')
     assert not set(without) & set(done.stderr.split())
     assert main.__module__ in done.stderr.split()
-
-
-def test_json_holds_no_nan():
-    assert plain_json({'a': np.array([1.0, np.nan]), 'b': (np.inf, None)}) == {
-        'a': [1.0, None], 'b': [None, None]}
 
 
 def test_files_of_the_current_folder_are_never_run(tmp_path):

@@ -8,10 +8,10 @@ from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import closed_form, faces, fit_12
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import MODELS, predict, random_directions, spread_directions
+from inside import MODELS, predict, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 NAMES = ('4', '7', '10')
 

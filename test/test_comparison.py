@@ -17,7 +17,6 @@ from inside import (
     Model,
     model_with,
     PARAMETER_NAMES,
-    random_directions,
     rotation_free,
     rotation_from_rpy,
     Runs,
@@ -26,7 +25,7 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 
@@ -91,15 +90,6 @@ def test_a_change_of_1_mg_in_one_run_is_found_and_the_run_is_named(axis):
     assert found.runs[3].largest_mg == pytest.approx(1.0, abs=0.6)
 
 
-def test_of_two_runs_that_differ_neither_is_named():
-    rng = np.random.default_rng(7)
-    model = sensor(rng)
-    found = compare(runs_of(model, rng, 1, 24)
-                    + runs_of(with_offset(model, 0, 2e-3), rng, 1, 24))
-    assert not found.agree
-    assert found.outlier is None
-
-
 def test_rotation_free_parameters_are_those_of_any_axes():
     rng = np.random.default_rng(3)
     poses = poses_of(sensor(rng), rng, 20)
@@ -159,14 +149,6 @@ def test_a_model_that_omits_an_existing_effect_does_not_agree_and_a_note_names_i
     assert any('run 1 (model 7) omits parameters of model 10' in note for note in found.notes)
 
 
-def test_smaller_models_agree_where_they_are_right():
-    rng = np.random.default_rng(6)
-    model = sensor(rng, 'offset', 'gain')
-    found = compare([run for name in ('4', '7', '10') for run in runs_of(model, rng, 1, 24, name)])
-    assert found.agree
-    assert found.dof == 2 * 9
-
-
 def test_runs_with_different_models_by_auto_agree():
     alarms, models = 0, set()
     for seed in range(10):
@@ -210,14 +192,6 @@ def test_squared_differences_are_those_of_all_contrasts(exact):
                                rtol=1e-4)
 
 
-def test_exact_values_agree_only_if_they_are_equal():
-    exact = np.zeros((3, 2, 2))
-    values = np.array([[0.01, 0.02]] * 3)
-    assert Runs(values, exact, np.inf).p_value == 1.0
-    values[2, 0] += 1e-6
-    assert Runs(values, exact, np.inf).p_value == 0.0
-
-
 def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model():
     rng = np.random.default_rng(5)
     small, large = model_with({'offset': [0.01, 0.0, 0.0], 'gain': 0.002}), sensor(rng)
@@ -228,34 +202,6 @@ def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model(
     assert [each.stated_sd[0] > 0.0 for each in pair.parameters] == [True] * 9
     assert all('model 10' in note for note in pair.notes if 'omits' in note)
     assert compare(calibrations[:2]).parameters[6].stated_sd[0] == 0.0
-
-
-def test_metres_and_g_are_converted():
-    rng = np.random.default_rng(8)
-    model = sensor(rng)
-    first, second = poses_of(model, rng, 20), poses_of(model, rng, 20)
-    units = units_of('m/s2')
-    second = second.with_columns(reading=units.from_g(second.reading),
-                                 std=units.from_g(second['std']))
-    found = compare([fit_poses(first, G), fit_poses(second, units)])
-    assert found.agree
-    assert found.parameters[0].values[1] == pytest.approx(model.values['offset'][0], abs=1e-3)
-
-
-def test_native_runs_agree_although_their_scales_differ():
-    rng = np.random.default_rng(1009)
-    model, counts = sensor(rng), Units('native', 4060.0)
-
-    def run(change=0.0):
-        poses = poses_of(with_offset(model, 1, change), rng, 20)
-        poses = poses.with_columns(reading=counts.from_g(poses.reading) + 33000.0,
-                                   std=counts.from_g(poses['std']))
-        return fit_poses(poses, units_of('native'), model='10')
-
-    runs = [run() for _ in range(3)]
-    assert len({one.units.per_g for one in runs}) == 3
-    assert compare(runs).agree
-    assert compare([*runs, run(2e-3)]).outlier == 3
 
 
 def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
@@ -275,29 +221,6 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
     found = compare([cold[0], warm[0]])
     assert not found.agree
     assert any('taken at 1' in note and 'temperature' in note for note in found.notes)
-
-
-def test_shared_poses_cause_a_note():
-    rng = np.random.default_rng(11)
-    model = sensor(rng)
-    poses = [poses_of(model, rng, 14) for _ in range(2)]
-    runs = [fit_poses(table, G, model=name) for table, name in
-            ((poses[0], '10'), (poses[0], '7'), (poses[1], '10'))]
-    notes = compare(runs).notes
-    assert [note for note in notes if 'share' in note] == [
-        'runs 1 and 2 share all their poses: they are not independent, so their agreement means '
-        'little']
-
-
-def test_levelled_runs_are_compared_in_the_direction_of_up():
-    rng = np.random.default_rng(12)
-    model = sensor(rng)
-    runs = runs_of(model, rng, 2, 20)
-    assert compare(runs).tilt_deg is None
-    flat = [np.array([0.0, 0.0, 1.0]), np.array([0.0, np.sin(np.radians(2.0)), 1.0])]
-    levelled = [level(run, run.predict(up[np.newaxis])[0], 'ros')
-                for run, up in zip(runs, flat, strict=True)]
-    assert compare(levelled).tilt_deg == pytest.approx(2.0, abs=0.05)
 
 
 @pytest.mark.parametrize(('change', 'message'), [

@@ -3,8 +3,6 @@
 
 """Empirical curves: their names, their form, the search for them, and their storage."""
 
-from dataclasses import replace
-from pathlib import Path
 
 from accel_calib.effects import (
     CARRIERS,
@@ -27,19 +25,16 @@ from inside import (
     is_curve,
     Model,
     parameter_basis,
-    parameter_names,
     parse_calibration,
     predict,
-    random_directions,
     simulate_poses,
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 COUNT = 100
 G = units_of('g')
-OLD = Path(__file__).parent / 'data' / 'calibration_1_refined.yaml'
 CURVES = {
     'empirical-offset.x-temperature-2-3': [4e-3, -2e-3, 15.0, 35.0],
     'empirical-gain-time-1-4': [*np.linspace(-4e-3, 5e-3, 6), 0.0, 3000.0],
@@ -228,21 +223,3 @@ def test_a_stored_curve_with_an_impossible_name_is_refused(described):
     text = format_calibration(calibration).replace(name, name.replace('temperature', 'weather'))
     with pytest.raises(StoredCalibrationError, match='is damaged .* expected a whole calibration'):
         parse_calibration(text, 'calibration.yaml')
-
-
-def test_parameters_of_a_curve_belong_to_it():
-    names = parameter_names(('offset', 'empirical-gain.z-time-1-2'))
-    assert names[3:] == tuple(f'empirical-gain.z-time-1-2.{part}'
-                              for part in ('z_1', 'z_2', 'low', 'high'))
-
-
-def test_a_calibration_of_earlier_releases_is_read_as_before():
-    text = OLD.read_text(encoding='utf-8')
-    calibration = parse_calibration(text, OLD.name)
-    assert not any(is_curve(name) for name in calibration.model.values)
-    assert calibration.model.lags == {}
-    again = parse_calibration(format_calibration(calibration), 'again.yaml')
-    np.testing.assert_array_equal(again.model.vector, calibration.model.vector)
-    np.testing.assert_array_equal(again.covariance, calibration.covariance)
-    assert format_calibration(replace(again, date=calibration.date)) == format_calibration(
-        calibration)

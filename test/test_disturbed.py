@@ -91,18 +91,6 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, measured, apart):
         assert found.quality.chi2_per_dof == pytest.approx(once.quality.chi2_per_dof)
 
 
-def test_copies_of_a_pose_are_used_and_named():
-    poses = knocked(3, 18, 0)
-    found = fit_poses(with_copies(poses, [4, 4, 9]), G)
-    assert len(found.used_poses) == len(found.poses) == 21
-    assert 'equal rows count as one pose: rows 5, 19, 20; rows 10, 21' in found.warnings
-
-
-def test_copies_of_a_knocked_pose_are_left_out_with_it():
-    poses = knocked(4, 18, 1)
-    assert left_out(with_copies(poses, [0, 0, 0, 0, 0, 0])) == {1, *range(19, 25)}
-
-
 def test_readings_that_were_measured_again_are_not_copies():
     poses = knocked(5, 18, 0)
     again = with_copies(poses, range(18))

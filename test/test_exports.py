@@ -12,6 +12,7 @@ import subprocess
 
 from accel_calib.calibrate import Calibration, GyroBias, Quality
 from accel_calib.errors import DamagedCalibrationError, InputError
+from accel_calib.finding import has
 from accel_calib.units import Units, units_of
 from inside import (
     export,
@@ -21,7 +22,6 @@ from inside import (
     identifier,
     Model,
     model_with,
-    OTHER_CORRECTION,
     parse_calibration,
     rotation_from_rpy,
     simulate_poses,
@@ -30,6 +30,7 @@ from inside import (
 )
 import numpy as np
 import pytest
+from shared import run
 import yaml
 
 AFFINE = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
@@ -490,11 +491,12 @@ def test_a_stored_correction_that_was_edited_is_reported_and_not_used():
     edited = text.replace(f'[{first},', '[1.5,', 1)
     assert edited != text
     found = parse_calibration(edited, 'c.yaml')
-    assert OTHER_CORRECTION in found.warnings
+    assert has(found.noted, 'correction_in_file')
     np.testing.assert_array_equal(found.matrix, made.matrix)
-    assert OTHER_CORRECTION not in parse_calibration(format_calibration(found), 'c.yaml').warnings
+    again = parse_calibration(format_calibration(found), 'c.yaml')
+    assert not has(again.noted, 'correction_in_file')
     changed = text.replace('residual', 'residual ', 1).replace('sensor: imu_link', 'sensor: other')
-    assert OTHER_CORRECTION not in parse_calibration(changed, 'c.yaml').warnings
+    assert not has(parse_calibration(changed, 'c.yaml').noted, 'correction_in_file')
 
 
 @pytest.mark.parametrize(('old', 'new'), [
@@ -505,12 +507,6 @@ def test_a_damaged_stored_correction_is_refused(old, new):
     assert old in text
     with pytest.raises(DamagedCalibrationError, match='correction'):
         parse_calibration(text.replace(old, new, 1), 'c.yaml')
-
-
-def run(*arguments):
-    from inside import main
-
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture

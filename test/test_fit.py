@@ -4,14 +4,14 @@
 """From poses to a calibration: known sensors are recovered within the stated uncertainty."""
 
 from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
-from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import lower_triangular, sensing_axes
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
-from inside import predict, random_directions, rotation_from_rpy, simulate_poses, spread_directions
+from inside import predict, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 
@@ -46,11 +46,6 @@ def test_auto_takes_the_model_that_the_sensor_has(model):
                '10': ('offset', 'axis_gain', 'cross_axis')}[model]
     names = [fit_poses(simulated(seed, 20, *effects)[1], G).name for seed in range(12)]
     assert names.count(model) >= 10
-
-
-def test_auto_states_the_reason_for_its_choice():
-    calibration = fit_poses(simulated(1, 20)[1], G)
-    assert 'model 10 reduces the residual of model 7 from' in calibration.reason
 
 
 @pytest.mark.parametrize('units', [units_of('m/s2'), units_of('m/s2', 9.78), G])
@@ -122,14 +117,6 @@ def test_clean_poses_are_all_kept():
     assert sum(kept) >= 19
 
 
-def test_algebraic_keeps_every_row():
-    _, poses = simulated(1, 24)
-    reading = poses.reading.copy()
-    reading[3] *= 1.1
-    calibration = fit_poses(poses.with_columns(reading=reading), G, method='algebraic')
-    assert calibration.rejected == ()
-
-
 def test_noisy_poses_have_less_weight():
     model, poses = simulated(8, 30)
     rng = np.random.default_rng(8)
@@ -175,15 +162,6 @@ def test_noise_floor_is_the_residual_of_the_correct_model():
     assert np.sqrt(np.mean(gaps)) == pytest.approx(np.sqrt(np.mean(floors)), rel=0.1)
 
 
-def test_verify_on_fresh_poses_finds_the_noise():
-    model, poses = simulated(11, 36)
-    fresh = simulate_poses(model, random_directions(200, np.random.default_rng(1)),
-                           np.random.default_rng(2))
-    found = verify(fit_poses(poses, G), fresh)
-    assert found.rms_after_mg < 1.2 * found.noise_floor_mg
-    assert found.rms_before_mg > 10.0
-
-
 def cone(degrees, count=12):
     rng = np.random.default_rng(3)
     z = rng.uniform(np.cos(np.radians(degrees)), 1.0, count)
@@ -210,32 +188,6 @@ def test_poses_that_do_not_determine_the_model_are_refused_with_advice(
     with pytest.raises(RefusedFitError, match=message) as refusal:
         fit_poses(poses, units_of(units), model='10')
     assert 'turn the sensor so that' in refusal.value.advice
-
-
-@pytest.mark.parametrize('directions', [cone(45), RING, SAME, FACES[:3]])
-def test_poses_in_counts_that_do_not_determine_the_model_are_refused(directions):
-    rng = np.random.default_rng(12)
-    poses = simulate_poses(sensor(rng), directions, rng)
-    poses = poses.with_columns(reading=poses.reading * 400 + 2000, std=poses['std'] * 400)
-    with pytest.raises(RefusedFitError):
-        fit_poses(poses, units_of('native'), model='10')
-
-
-def test_six_faces_are_offered_the_smaller_model():
-    rng = np.random.default_rng(13)
-    poses = simulate_poses(sensor(rng), np.repeat(FACES, 2, axis=0), rng)
-    with pytest.raises(RefusedFitError, match='or use model 7, which these poses determine'):
-        fit_poses(poses, G, model='10')
-    assert fit_poses(poses, G).name in ('4', '7')
-
-
-@pytest.mark.parametrize(('scale', 'units', 'message'), [
-    (16384.0, 'm/s2', 'native'), (1.0, 'm/s2', 'readings to g'),
-    (9.81, 'g', 'readings to m/s2')])
-def test_readings_clearly_in_another_unit_are_refused(scale, units, message):
-    poses = simulated(14, 20)[1]
-    with pytest.raises(InputError, match=message):
-        fit_poses(poses.with_columns(reading=poses.reading * scale), units_of(units))
 
 
 def placed(seed, degrees, count=12, **settings):
@@ -286,13 +238,6 @@ def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
 def test_well_placed_orientations_are_used(noise_g):
     names = [fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name for seed in range(10)]
     assert names == ['12'] * 10
-
-
-def test_six_faces_alone_warn_of_their_placement():
-    calibration = fit_poses(placed(1, 2.0, 6)[1], G)
-    assert calibration.name == '12'
-    assert any('from the known orientations' in text for text in calibration.warnings)
-    assert not fit_poses(placed(1, 0.0, 6)[1], G).warnings
 
 
 def test_model_12_without_orientations_is_refused():

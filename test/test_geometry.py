@@ -8,31 +8,27 @@ from accel_calib.calibrate import fit_poses, next_pose
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import dilution, error_left_in, identifiability, poses_needed, rows_of
 from accel_calib.table import Poses
-from accel_calib.units import Units, units_of
+from accel_calib.units import units_of
 from inside import (
     determines,
     missing_poses,
     model_with,
     predict,
-    random_directions,
     refuse_if_unfit,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
+    unit,
 )
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 FACES = np.vstack([np.eye(3), -np.eye(3)])
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
 CROSS = ('cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz')
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def about(directions, count, degrees, rng):
@@ -53,7 +49,7 @@ def named(text):
     signs = dict.fromkeys('xyz', 0.0)
     for sign, axis in re.findall(r'([+-])([xyz])', re.findall(r'\(([^)]*)\)', text)[-1]):
         signs[axis] = float(f'{sign}1')
-    return unit(np.array(list(signs.values())))
+    return unit(np.array([list(signs.values())]))[0]
 
 
 def all_named(text):
@@ -71,19 +67,6 @@ def test_faces_alone_determine_all_but_the_cross_axis_gains(model):
     assert np.isinf(found.mean_dilution)
 
 
-@pytest.mark.parametrize('model', ['4', '7'])
-def test_faces_alone_determine_the_smaller_models(model):
-    found = identifiability(model, FACES)
-    assert found.undetermined == found.open_parameters == ()
-    assert found.dilution <= 1.01
-
-
-def test_poses_in_a_plane_do_not_determine_the_axis_across_it():
-    assert identifiability('4', RING).open_parameters == ('offset.z',)
-    assert identifiability('10', RING).open_parameters == (
-        'offset.z', 'axis_gain.z', 'cross_axis.xz', 'cross_axis.yz')
-
-
 @pytest.mark.parametrize('model', ['4', '7', '10', '12'])
 def test_undetermined_combinations_change_no_pose(model):
     directions = RING @ rotation_from_rpy(0.5, 0.4, 0.3).T
@@ -95,17 +78,6 @@ def test_undetermined_combinations_change_no_pose(model):
         vector = np.array([each.weights.get(name, 0.0) for name in names])
         assert np.linalg.norm(vector) == pytest.approx(1.0, abs=1e-2)
         np.testing.assert_allclose(rows @ vector, 0.0, atol=5e-3)
-
-
-def test_weak_combination_is_reported_with_its_weights():
-    found = identifiability('7', cone(45.0, np.random.default_rng(1)))
-    (open_,) = found.undetermined
-    assert {'axis_gain.x', 'axis_gain.y'} < set(open_.weights) <= set(found.deviations)
-    assert list(open_.weights)[:2] in (['offset.z', 'axis_gain.z'], ['axis_gain.z', 'offset.z'])
-    assert open_.weights['offset.z'] * open_.weights['axis_gain.z'] < -0.3
-    assert re.fullmatch(r'0\.\d\d \w+\.z - 0\.\d\d \w+\.z( [+-] 0\.\d\d axis_gain\.[xy])*',
-                        open_.words)
-    assert 50.0 < open_.deviation < 2.0 * found.dilution
 
 
 @pytest.mark.parametrize(('model', 'noisy'), [('10', 1.0), ('7', 3.0), ('12', 3.0)])
@@ -202,12 +174,6 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
 
 
-def test_known_faces_determine_model_12():
-    rng = np.random.default_rng(6)
-    poses = simulate_poses(sensor(rng), FACES, rng)
-    assert fit_poses(poses, G, model='12').name == '12'
-
-
 def test_noisy_poses_do_not_determine_a_model():
     directions = spread_directions(12)
     noise = np.where(np.arange(12) < 5, 300.0, 1.0)
@@ -236,14 +202,6 @@ def test_next_pose_has_words_and_a_direction():
     assert asked.words == 'turn the sensor so that the left side points up (+y)'
 
 
-@pytest.mark.parametrize('count', [1, 5, 40])
-def test_no_orientation_is_suggested_twice(count):
-    for face in FACES:
-        tilted = about(face[np.newaxis], count, 2.0, np.random.default_rng(count))
-        asked = next_pose(tilted)
-        assert np.max(tilted @ asked.direction) < np.cos(np.radians(30.0))
-
-
 def follow(count, model='10', noise=None):
     """Return the suggested poses, at most so many."""
     directions = np.zeros((0, 3))
@@ -255,56 +213,8 @@ def follow(count, model='10', noise=None):
     return directions
 
 
-@pytest.mark.parametrize('model', ['4', '7', '9', '10'])
-def test_planning_ends_when_another_pose_no_longer_helps(model):
-    directions = follow(40, model)
-    assert 12 < len(directions) < 22
-    found = identifiability(model, directions)
-    assert found.dilution < 1.5
-    asked = next_pose(directions, model)
-    assert asked.words == (f'more poses no longer help: {len(directions)} poses determine |a| to '
-                           f'within {found.mean_dilution:.2g} times the noise of a pose')
-    assert asked.error == pytest.approx(found.mean_dilution)
-
-
-def test_the_accuracy_that_poses_allow_is_stated_in_mg():
-    directions = follow(40)
-    expected = identifiability('10', directions).mean_dilution * 0.4
-    words = next_pose(directions, noise_g=0.0004).words
-    assert words.endswith(f'determine |a| to within {expected:.2g} mg')
-
-
-def test_poses_without_a_spread_never_seem_enough():
-    rng = np.random.default_rng(8)
-    for directions in (cone(30.0, rng, 200), about(FACES, 200, 0.3, rng), np.repeat(RING, 9, 0)):
-        assert next_pose(directions).direction is not None
-
-
 def test_planned_poses_are_far_fewer_than_random_poses():
     assert identifiability('10', follow(12)).mean_dilution < 0.95
     at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
                  .mean_dilution for seed in range(50)]
     assert np.median(at_random) > 1.4
-
-
-def test_a_noisy_pose_does_not_count_for_its_direction():
-    directions = spread_directions(14)
-    noise = np.where(directions[:, 2] > 0.6, 30.0, 1.0)
-    assert next_pose(directions, noise=noise).direction[2] > 0.5
-
-
-def test_model_12_asks_for_the_six_faces():
-    directions = follow(40, '12')
-    assert sorted(map(tuple, directions)) == sorted(map(tuple, FACES))
-
-
-def test_next_pose_in_counts_is_that_in_g():
-    rng = np.random.default_rng(9)
-    poses = simulate_poses(sensor(rng), random_directions(8, rng), rng)
-    counts = Units('native', 4000.0)
-    native = poses.with_columns(reading=counts.from_g(poses.reading) + 9000.0)
-    with pytest.raises(RefusedFitError) as in_g:
-        fit_poses(poses, G, model='10')
-    with pytest.raises(RefusedFitError) as in_counts:
-        fit_poses(native.with_columns(std=poses['std'] * 4000.0), units_of('native'), model='10')
-    assert in_counts.value.advice == in_g.value.advice

@@ -13,7 +13,6 @@ import re
 import socket
 from threading import Event, Thread
 import time
-from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings, Log
@@ -25,8 +24,6 @@ from inside import (
     LIVE_COMMANDS,
     live_log,
     LIVE_PERIOD,
-    live_progress,
-    live_text_of,
     model_with,
     PAGE_FOLDER,
     PageServer,
@@ -334,13 +331,19 @@ def test_viewers_without_the_token_do_not_keep_its_owner_out(bench: Bench) -> No
     assert bench.viewer(token='').code == 1013
 
 
+def open_stream(connection: socket.socket, port: int) -> None:
+    """Ask for the stream as a viewer does, without a hello."""
+    connection.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n'
+                        'Upgrade: websocket\r\nConnection: Upgrade\r\n'
+                        'Sec-WebSocket-Version: 13\r\n'
+                        'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n').encode())
+    assert b'101' in connection.recv(64)
+
+
 def test_connections_that_say_nothing_do_not_keep_anybody_out(bench: Bench) -> None:
     silent = [socket.create_connection(('127.0.0.1', bench.port)) for _ in range(40)]
     for each in silent:
-        each.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\n'
-                      'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
-                      'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n').encode())
-        assert b'101' in each.recv(100)
+        open_stream(each, bench.port)
     assert bench.viewer().got[0]['may']
     for each in silent:
         each.close()
@@ -371,10 +374,7 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
     with socket.socket() as stuck:
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stuck.connect(('127.0.0.1', bench.port))
-        stuck.sendall(f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\nUpgrade: websocket'
-                      '\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
-                      'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n'.encode())
-        assert b'101' in stuck.recv(64)
+        open_stream(stuck, bench.port)
         stuck.sendall(masked(json.dumps({'hello': {'token': '', 'seen': 0}}).encode()))
         wait(lambda: len(bench.host.server.viewers) == 2)
         for number in range(300):  # more than the buffers of a connection hold
@@ -394,9 +394,7 @@ def masked(text: bytes) -> bytes:
 def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_FOR_A_HELLO, 0.3)
     with socket.create_connection(('127.0.0.1', bench.port)) as silent:
-        silent.sendall(f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\nUpgrade: websocke'
-                       't\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
-                       'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n'.encode())
+        open_stream(silent, bench.port)
         received = b''
         while part := silent.recv(4096):
             received += part
@@ -461,15 +459,6 @@ def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Pa
     finally:
         bench.source.played.set()
         bench.close()
-
-
-def test_numbers_that_are_not_known_are_null() -> None:
-    from accel_calib.session import Progress
-    now = Progress(False, float('nan'), 0.0, 1.0, 0, 0, 0.0, float('inf'), '', ())
-    text = live_text_of(live_progress(1.0, now))
-    found: dict[str, Any] = json.loads(text)
-    assert [found[key] for key in ('stillness', 'accuracy_mg', 'raw', 'up')] == [
-        None, None, None, []]
 
 
 def test_the_link_names_a_reachable_address() -> None:

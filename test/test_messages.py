@@ -22,14 +22,12 @@ from accel_calib.logs import (
     renamed,
     samples_of,
 )
-from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
+from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
     frame_ids,
-    layout_with,
     Model,
     predict,
-    random_directions,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
@@ -38,14 +36,11 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import sensor
+from shared import random_directions, sensor
 
 UNITS = units_of('m/s2')
 NAMES = ['', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'übung', 'x' * 300]
 COVARIANCES = ['absent', 'unknown', 'known', 'full', 'other']
-EFFECTS = {'quadratic': [1e-3, -2e-3, 1e-3], 'gain_temperature': [3e-4, -2e-4, 1e-4],
-           'offset_temperature': [1e-3, 2e-3, -1e-3], 'lever_arm': [0.1, -0.05, 0.02],
-           'warm_up': [0.01, 0.005, -0.01, 900.0, 600.0]}
 
 
 @pytest.fixture
@@ -100,14 +95,6 @@ def test_an_orientation_marked_as_missing_does_not_change(levelled):
     fields[:, ORIENTATION_COVARIANCE.start] = -1.0
     kept = np.r_[ORIENTATION, ORIENTATION_COVARIANCE]
     np.testing.assert_array_equal(corrected(levelled, fields)[:, kept], fields[:, kept])
-
-
-def test_a_covariance_with_nan_becomes_unknown_and_the_others_stay(levelled):
-    fields = messages()
-    fields[:, ACCELERATION_COVARIANCE.start + 4] = np.nan
-    found = corrected(levelled, fields)
-    np.testing.assert_array_equal(found[:, ACCELERATION_COVARIANCE], 0.0)
-    assert np.all(np.isfinite(found))
 
 
 def test_corrected_messages_have_the_frame_they_are_in(calibration, levelled):
@@ -247,41 +234,6 @@ def every(data):
     return doubles_at(joined([data], 37, 'imu'), slice(0, 37))
 
 
-def with_effects(calibration, *, effects, turned):
-    """Return a calibration, with effects and a mounting if requested."""
-    values = dict(calibration.model.values)
-    if effects:
-        values |= {name: np.array(each) for name, each in EFFECTS.items()}
-    rotation = rotation_from_rpy(0.3, -0.2, 1.0) if turned else np.eye(3)
-    root = np.random.default_rng(1).normal(size=(60, len(np.concatenate([*values.values()]))))
-    return replace(calibration, model=Model(values, rotation), covariance=root.T @ root * 1e-8)
-
-
-@pytest.mark.parametrize(('effects', 'turned', 'frame_id'), [
-    (False, False, 'imu_link'), (False, True, 'base_link'), (True, True, 'base_link')])
-def test_single_messages_and_arrays_are_corrected_equally(calibration, effects, turned,
-                                                          frame_id):
-    calibration = with_effects(calibration, effects=effects, turned=turned)
-    rng = np.random.default_rng(3)
-    rewriters = {}
-    for _ in range(100):
-        data = random_message(rng)
-        layout = layout_of(data)
-        rewriter = rewriters.setdefault(layout, Rewriter(layout, calibration, 1.0,
-                                                         STANDARD_GRAVITY, frame_id))
-        found = rewriter(data, 31.0)
-        context = {**samples_of(joined([data], 37, 'imu')), 'temperature': np.array([31.0])}
-        expected = corrected(calibration, every(data), context)
-        np.testing.assert_allclose(every(found)[:, :28], expected[:, :28], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(every(found)[:, 28:], expected[:, 28:], rtol=1e-9, atol=1e-15)
-        assert frame_ids(joined([found], 37, 'imu')) == [frame_id]
-        assert (found[4:12], layout_of(found)) == (data[4:12], layout_with(frame_id))
-        motion = motion_of(found, rewriter.layout, np.array([0.1, -0.2, 9.8]))
-        np.testing.assert_allclose(
-            doubles_at(joined([motion], 3, 'motion'), slice(0, 3)),
-            expected[:, ACCELERATION] - [0.1, -0.2, 9.8], atol=1e-11)
-
-
 def test_readings_in_g_become_m_per_s2(calibration):
     calibration = replace(calibration, units=units_of('g'))
     data = random_message(np.random.default_rng(8), 'imu')
@@ -377,13 +329,3 @@ def test_messages_as_arrays_equal_the_single_messages():
         rate = doubles[13:16]
         absent = doubles[16] == -1.0 or not np.isfinite(rate).all()
         np.testing.assert_array_equal(samples['rate'][k], np.full(3, np.nan) if absent else rate)
-
-
-def test_only_a_whole_little_endian_imu_has_a_layout():
-    data = random_message(np.random.default_rng(5))
-    assert layout_of(data) is not None
-    for other in (b'', data[:3], data[:15], data[:40], data[:-1], data + b'\0',
-                  swapped(data), b'\0\3' + data[2:], b'\0\7' + data[2:],
-                  data[:12] + struct.pack('<I', 0) + data[16:],
-                  data[:12] + struct.pack('<I', 2 ** 32 - 1) + data[16:]):
-        assert layout_of(other) is None

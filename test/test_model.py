@@ -9,19 +9,16 @@ from inside import (
     correct,
     force_slope,
     Model,
-    MODELS,
     parameter_basis,
-    parameter_names,
     parse_effect,
     predict,
-    random_directions,
     reading_of,
     rotation_from_rpy,
     with_linear_part,
-    with_vector,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 
 @pytest.fixture
@@ -148,14 +145,6 @@ def test_model_refuses_what_is_not_in_the_catalogue(values):
         Model(values)
 
 
-@pytest.mark.parametrize('name', MODELS)
-def test_vector_and_names_have_the_same_order(name):
-    names = parameter_names(MODELS[name])
-    model = with_vector(MODELS[name], np.arange(float(len(names))))
-    assert model.effects == MODELS[name]
-    np.testing.assert_array_equal(model.vector, np.arange(len(names)))
-
-
 @pytest.mark.parametrize(('text', 'values'), [
     ('offset_temperature=1', [1, 1, 1, 0, 0]), ('offset_temperature=1,2,3', [1, 2, 3, 0, 0]),
     ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0]),
@@ -167,25 +156,6 @@ def test_shape_that_is_not_stated_has_its_usual_value(text, values):
     np.testing.assert_array_equal(Model({name: stated}).vector, values)
     shown = EFFECTS[name].shown(found)
     assert list(shown) == list(EFFECTS[name].values[:len(stated)])
-
-
-def test_hysteresis_of_form_1_is_the_sign_of_the_motion():
-    context = {'previous': np.array([[0.6, 0.0, -0.8]])}
-    model = Model({'hysteresis': np.array([0.1, 0.2, 0.3, 1.0])})
-    np.testing.assert_allclose(predict(model, np.zeros((1, 3)), context), [[0.1, 0.0, -0.3]])
-
-
-@pytest.mark.parametrize('name', ['offset_temperature', 'gain_temperature', 'hysteresis'])
-def test_search_tries_the_usual_shape_first(name, context):
-    shapes = list(EFFECTS[name].shapes(context))
-    np.testing.assert_array_equal(shapes[0], EFFECTS[name].usual)
-    assert len(shapes) == (2 if name == 'hysteresis' else 41)
-    assert len({tuple(shape) for shape in shapes}) == len(shapes)
-
-
-def test_search_tries_no_lag_without_time():
-    shapes = list(EFFECTS['offset_temperature'].shapes({'temperature': np.arange(20.0)}))
-    np.testing.assert_array_equal(shapes, [[0.0, 0.0]])
 
 
 @pytest.mark.parametrize('of_sensor', [0.0, 1.0])

@@ -13,17 +13,10 @@ from accel_calib.capture import capture
 from accel_calib.compare import compared, Drift, monitor, rests_of, status
 from accel_calib.logs import read_recording
 from accel_calib.units import units_of
-from inside import (
-    DRIFT_MEMORY,
-    Model,
-    predict,
-    random_directions,
-    simulate_poses,
-    spread_directions,
-)
+from inside import DRIFT_MEMORY, Model, predict, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import data, sensor
+from shared import data, random_directions, sensor
 
 LEAST = 0.001
 NOISE = 0.0003

@@ -7,10 +7,11 @@ import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
-from inside import random_directions, refinement_page
+from inside import refinement_page
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
+from shared import random_directions
 
 NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
              0.005, 0.5, by_axis(ONE),

@@ -13,7 +13,7 @@ from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
-from accel_calib.noise import duration, noise_of, NoiseFigures, to_json
+from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
@@ -156,14 +156,6 @@ def test_white_noise_alone_shows_nothing_else_and_states_the_necessary_rest() ->
     assert 'h at rest' in found.needs['accelerometer', 'random_walk']
 
 
-def test_readings_in_m_s2_and_g_have_the_same_figures() -> None:
-    in_g = resting(4, 6000)
-    in_si = in_g.with_columns(reading=in_g.reading * STANDARD_GRAVITY)
-    one, two = noise_of(in_g, G), noise_of(in_si, units_of('m/s2'))
-    assert one.common('accelerometer', 'noise_density') == pytest.approx(
-        two.common('accelerometer', 'noise_density'), rel=1e-6)
-
-
 def test_figures_of_native_readings_stay_native() -> None:
     recording = resting(5, 6000)
     counts = recording.with_columns(reading=recording.reading * 16384.0)
@@ -292,13 +284,6 @@ def test_a_reading_that_is_not_finite_is_refused() -> None:
     reading[70, 2] = np.nan
     with pytest.raises(InputError, match='row 71'):
         noise_of(recording.with_columns(reading=reading), G)
-
-
-@pytest.mark.parametrize(('seconds', 'words'), [
-    (0.02, '20 ms'), (9.8, '9.8 s'), (90.0, '90 s'), (180.0, '3 min'), (2400.0, '40 min'),
-    (18_000.0, '5 h')])
-def test_durations_have_their_usual_unit(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
 
 
 @pytest.fixture(scope='module')

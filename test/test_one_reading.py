@@ -9,17 +9,10 @@ from accel_calib.calibrate import fit_poses
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
 from accel_calib.units import units_of
-from inside import (
-    Model,
-    OneReading,
-    random_directions,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-)
+from inside import Model, OneReading, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),

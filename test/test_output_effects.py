@@ -15,15 +15,13 @@ from inside import (
     grid_step,
     Model,
     off_grid,
-    random_directions,
-    rounding_left,
     simulate_recording,
     spread_directions,
     unclipped,
 )
 import numpy as np
 import pytest
-from shared import data, sensor
+from shared import data, random_directions, sensor
 
 G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
 COUNTS_PER_G = 4056.0
@@ -77,12 +75,6 @@ def test_a_clipped_stream_has_the_dwells_of_the_recording():
                                rtol=1e-9)
 
 
-@pytest.mark.parametrize('limit', [0.8, 0.9, 0.95, 1.0])
-@pytest.mark.parametrize('noise', [3e-4, 3e-3])
-def test_all_rests_of_a_clipped_sensor_are_captured(limit, noise):
-    assert len(capture(limited(simulated(0, noise), -limit, limit), G).poses) == 24
-
-
 @pytest.mark.parametrize('limit', [9.0, 9.6])
 def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
     poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -limit, limit), MPS2)
@@ -108,25 +100,10 @@ def test_counts_around_an_offset_are_clipped_at_different_limits():
     assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
 
 
-def test_a_single_clipped_pose_is_detected():
-    poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -9.8, 9.8), MPS2)
-    clip = clipped(poses)
-    assert clip is not None
-    assert clip.poses.tolist() == [17]
-
-
 def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
     poses = found(limited(simulated(3), -0.93, 0.93), G)
     too_small = Model({'offset': np.zeros(3)})
     assert unclipped(poses, too_small)[1] is not None
-
-
-@pytest.mark.parametrize('step', [None, 2e-4, 2e-3, 8e-3])
-def test_a_sensor_that_is_not_clipped_has_no_limit(step):
-    for seed in range(2):
-        recording = simulated(seed)
-        poses = found(recording if step is None else rounded(recording, step), G)
-        assert clipped(poses) is None
 
 
 @pytest.mark.parametrize(('step_mg', 'least'), [(2, 38), (8, 38), (20, 37)])
@@ -154,21 +131,6 @@ def test_a_grid_is_named_if_the_noise_is_clearly_less_than_a_step(ratio, relevan
     for seed in range(2):
         step = grid_step(found(rounded(simulated(seed, 1e-3), 1e-3 / ratio), G))
         assert step == (pytest.approx(1e-3 / ratio, rel=2e-3) if relevant else None)
-
-
-def test_readings_without_a_grid_have_no_step():
-    assert [grid_step(found(simulated(seed), G)) for seed in range(3)] == [None] * 3
-    assert grid_step(found(read_recording(data('mpu9150_imu0.csv')), MPS2)) is None
-
-
-@pytest.mark.parametrize('ratio', [0.0, 0.05, 0.1, 0.2, 0.25, 0.4, 1.0])
-def test_the_error_that_rounding_leaves_follows_from_the_variance_of_the_samples(ratio):
-    rng = np.random.default_rng(1)
-    true = rng.uniform(size=4000)
-    samples = np.round(true[:, np.newaxis] + ratio * rng.normal(size=(4000, 400)))
-    error = np.mean((samples.mean(axis=1) - true)**2)
-    stated = float(rounding_left(np.mean(np.var(samples, axis=1, ddof=1, keepdims=True))))
-    assert error == pytest.approx(stated + ratio**2 / 400.0, rel=0.1, abs=3e-4)
 
 
 @pytest.mark.parametrize('ratio', [0.03, 0.1, 0.2, 0.3])

@@ -3,13 +3,13 @@
 
 """Properties that hold for any sensor and any poses, tried on random cases."""
 
-import re
 
 import accel_calib as ac
-from accel_calib.calibrate import Calibration, fit_poses, NOT_LOCATED, outlook, UNCHECKED
+from accel_calib.calibrate import Calibration, fit_poses, outlook
 from accel_calib.effects import effect_named, EFFECTS, empirical_name, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import variance_factor
+from accel_calib.finding import has
 from accel_calib.rating import rate
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
@@ -19,13 +19,13 @@ from inside import (
     model_with,
     OVER_THE_SPHERE,
     predict,
-    random_directions,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 hypothesis = pytest.importorskip('hypothesis')
 st = pytest.importorskip('hypothesis.strategies')
@@ -280,8 +280,8 @@ def test_a_bad_row_does_not_move_the_result_silently(
 
 def is_warned(calibration):
     """Return whether a fit warns about rows that may be wrong, and is not rated GOOD."""
-    begins = (NOT_LOCATED, UNCHECKED)
-    return (any(line.startswith(begins) for line in calibration.warnings)
+    kinds = {each.kind for each in calibration.noted}
+    return (bool(kinds & {'outlier_not_certain', 'hardly_checked'})
             and rate(calibration).name != 'GOOD')
 
 
@@ -321,7 +321,7 @@ def test_clean_poses_have_no_doubt_about_an_outlier(model, errors, count, seed, 
     known = {'4': ['offset'], '7': ['offset', 'axis_gain'], '10': list(errors)}[model]
     poses = poses_of({name: errors[name] for name in known}, count, seed, angles)
     found = fit_poses(poses, G, model=model)
-    assert not any(line.startswith(NOT_LOCATED) for line in found.warnings)
+    assert not has(found.noted, 'outlier_not_certain')
 
 
 def test_a_good_row_that_is_left_out_is_named_beside_the_bad_row():
@@ -330,9 +330,9 @@ def test_a_good_row_that_is_left_out_is_named_beside_the_bad_row():
     poses = poses_of(errors, 11, 0, (0.3, 0.2, 0.1))
     poses.reading[5] *= 1.03
     found = fit_poses(poses, G, model='10')
-    doubt = next(line for line in found.warnings if line.startswith(NOT_LOCATED))
+    doubt = next(each for each in found.noted if each.kind == 'outlier_not_certain')
     assert rows_left_out(found) == {2}
-    assert '6' in re.findall(r'\d+', doubt)
+    assert 6 in doubt.rows
     assert rate(found).name != 'GOOD'
     assert error_of(found, model_with(errors)) <= SURE * uncertainty_g(found)
 
@@ -345,9 +345,8 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
     poses = simulate_poses(sensor, up, np.random.default_rng(seed), noise_g=1e-3)
     poses.reading[wrong] *= 1.0 + knock
     found = fit_poses(poses, G, model='7')
-    doubt = next(line for line in found.warnings if line.startswith(NOT_LOCATED))
-    assert 'row 16' in doubt
-    assert 'row 17' in doubt
+    doubt = next(each for each in found.noted if each.kind == 'outlier_not_certain')
+    assert {16, 17} <= {*doubt.rows}
     assert rate(found).name != 'GOOD'
     assert error_of(found, sensor) <= SURE * uncertainty_g(found)
 

@@ -13,15 +13,15 @@ from accel_calib.units import units_of
 import generator
 from inside import (
     format_calibration,
+    LARGEST_SAMPLE,
     model_with,
     parse_calibration,
-    random_directions,
     simulate_poses,
     spread_directions,
 )
 import numpy as np
 import pytest
-from shared import data, sensor
+from shared import data, random_directions, sensor
 
 MPS2, G = units_of('m/s2'), units_of('g')
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
@@ -191,6 +191,18 @@ def test_too_few_poses_are_refused():
     poses = simulate_poses(model_with({}), spread_directions(3), np.random.default_rng(1))
     with pytest.raises(RefusedFitError, match='found 3 sound poses, expected at least 4'):
         refine(poses, G)
+
+
+def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
+    monkeypatch.setattr(*LARGEST_SAMPLE, 400)
+    rng = np.random.default_rng(4)
+    truth = model_with({'offset': np.array([0.03, -0.02, 0.04]),
+                        'quadratic': np.array([2e-3, -1e-3, 3e-3])})
+    found = refine(simulate_poses(truth, random_directions(1000, rng), rng), G)
+    assert 'quadratic' in names(found)
+    assert 'uses 400 of 1000 poses' in found.calibration.warnings[0]
+    np.testing.assert_allclose(found.calibration.model.values['quadratic'],
+                               truth.values['quadratic'], atol=5e-4)
 
 
 def test_base_may_be_a_stored_calibration(taken):

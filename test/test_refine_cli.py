@@ -7,8 +7,8 @@ import json
 import sys
 
 from accel_calib.stored import read_calibration
-from inside import main
 import pytest
+from shared import run, run_json
 
 SENSOR = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
           '--effect', 'cross_axis=0.004,0.002,-0.003']
@@ -17,15 +17,6 @@ KEYS = {'file', 'verdict', 'noise_floor_mg', 'gap_mg', 'steps', 'remaining_gap_m
         'disturbed_poses', 'not_testable', 'advice'}
 STEP_KEYS = {'effect', 'rivals', 'parameters', 'gap_before_mg', 'gap_after_mg',
              'held_out_before_mg', 'held_out_after_mg', 'p_value', 'where'}
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def run_json(capsys, *arguments):
-    status = run(*arguments, '--json', '-')
-    return status, json.loads(capsys.readouterr().out)
 
 
 def simulated(path, *arguments):

@@ -14,18 +14,10 @@ from accel_calib.stored import write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
-from inside import (
-    advice_for,
-    main,
-    Model,
-    model_with,
-    random_directions,
-    search_effects,
-    simulate_poses,
-)
+from inside import advice_for, main, Model, model_with, search_effects, simulate_poses
 import numpy as np
 import pytest
-from shared import sensor
+from shared import random_directions, sensor
 
 G = units_of('g')
 TCO = {'offset_temperature': np.array([6e-4, -4e-4, 5e-4])}

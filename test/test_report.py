@@ -9,23 +9,17 @@ from accel_calib.refine import refine
 from accel_calib.units import Units
 from inside import (
     all_drawings,
-    chance,
     curve_parts,
-    equal_area,
-    low_passed,
     model_with,
-    random_directions,
-    rate_of,
-    recorded,
     refinement_page,
     simulate_poses,
     values_of,
-    variables_of,
     verdict_words,
 )
 import numpy as np
 from page_parser import parsed
 import pytest
+from shared import random_directions
 
 pytest.importorskip('matplotlib')
 
@@ -52,17 +46,6 @@ def warm():
 @pytest.fixture(scope='module')
 def text(warm):
     return refinement_page(warm, '<b onload="x">&.csv')
-
-
-def test_map_keeps_areas():
-    directions = random_directions(200_000, np.random.default_rng(0))
-    place = equal_area(directions)
-    radius = np.linalg.norm(place, axis=1)
-    assert np.max(radius) <= 1.0
-    # Uniform on the sphere is uniform on the disc: a share r² is within the radius r.
-    for r in (0.3, 0.6, 0.9):
-        assert np.mean(radius < r) == pytest.approx(r ** 2, abs=0.005)
-    np.testing.assert_allclose(equal_area(np.array([[0, 0, 1.0], [3.0, 0, 0]])), [[0, 0], [1, 0]])
 
 
 def test_page_is_complete_and_self_contained(text):
@@ -108,34 +91,6 @@ def test_no_gap_has_a_report_too():
     text = refinement_page(clean, 'poses.csv')
     assert 'No gap beyond the noise' in text
     assert 'Effects that were found' not in text
-
-
-def test_variables_are_those_of_the_effect(warm):
-    poses, force = warm.poses_g, warm.force
-    assert [v.label for v in variables_of('gain_temperature', poses, force)] == [
-        'temperature [°C]']
-    assert [v.label for v in variables_of('offset_wander', poses, force)] == [
-        'time since the first pose [min]']
-    assert len(variables_of('quadratic', poses, force)) == 3
-    assert len(variables_of('hysteresis', poses, force)) == 3
-    assert [v.label.split()[0] for v in recorded(poses)] == ['temperature', 'time']
-
-
-def test_variables_are_those_of_the_shape(warm):
-    poses, force = warm.poses_g, warm.force
-    assert [v.label for v in variables_of('temperature_rate', poses, force)] == [
-        'rate of temperature [°C/min]']
-    plain, lagged = (variables_of('offset_temperature', poses, force, np.array([lag, 0.0]))
-                     for lag in (0.0, 200.0))
-    assert [v.label for v in plain] == ['temperature [°C]']
-    assert [v.label for v in lagged] == ['temperature that acts on the offset [°C]']
-    expected = low_passed(poses['time'], poses['temperature'], 200.0,
-                          rate_of(poses['time'], poses['temperature']))
-    np.testing.assert_allclose(lagged[0].values, expected, atol=1e-9)
-    of_curves = [variables_of(f'empirical-{name}-1', poses, force, np.zeros(2))
-                 for name in ('offset.z-force', 'offset-force', 'gain.x-temperature')]
-    assert [v.label for v in of_curves[0]] == ['force along z [g]']
-    assert [len(found) for found in of_curves] == [1, 3, 1]
 
 
 @pytest.fixture(scope='module')
@@ -184,11 +139,3 @@ def test_page_describes_a_curve(bumpy):
     assert 'over temperature, with 95 % band' in text
     assert 'as a smooth function of temperature' in text
     assert dict(values_of(bumpy.steps[-1]))['low'].endswith('°C')
-
-
-def test_numbers_are_short(warm):
-    assert chance(0.0) == 'p < 1e-16'
-    assert chance(3.21e-4) == 'p = 0.0003'
-    values = dict(values_of(warm.steps[-1]))
-    assert set(values) == {'x', 'y', 'z'}
-    assert all(value.endswith(' mg/°C') for value in values.values())

@@ -8,15 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 import json
 
-from accel_calib.calibrate import (
-    fit_poses,
-    gyro_bias_of,
-    GyroBias,
-    level,
-    sample_noise_of,
-    SampleNoise,
-)
-from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from, select
+from accel_calib.calibrate import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of
+from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import read_poses, read_recording, write_table
 from accel_calib.refine import refine
@@ -114,22 +107,6 @@ def test_no_slope_is_found_where_there_is_none():
     assert np.mean(np.array(slopes) != 0.0) < 0.01
 
 
-def test_the_bias_is_not_extrapolated_over_temperature():
-    gyro = GyroBias(BIAS, 0.1 * BIAS ** 2, 24, 30.0, np.array([1e-4, 0.0, 0.0]), (20.0, 40.0))
-    np.testing.assert_allclose(gyro.at(30.0), BIAS)
-    np.testing.assert_allclose(gyro.at(20.0) - BIAS, [-1e-3, 0.0, 0.0])
-    np.testing.assert_array_equal(gyro.at(-40.0), gyro.at(20.0))
-    np.testing.assert_array_equal(gyro.at(80.0), gyro.at(40.0))
-    np.testing.assert_array_equal(gyro.at(np.nan), BIAS)
-
-
-def test_a_bias_without_temperatures_is_the_same_at_every_temperature():
-    gyro = found(rests(3))
-    assert gyro.temperatures == ()
-    assert np.isnan(gyro.temperature)
-    np.testing.assert_array_equal(gyro.at(60.0), gyro.bias)
-
-
 @pytest.mark.parametrize('rate', [0.01, 0.05, 0.3])
 @pytest.mark.parametrize('warmth', [None, np.linspace(20.0, 40.0, 24)])
 def test_a_rest_at_which_the_platform_turned_is_ignored(rate, warmth):
@@ -141,37 +118,6 @@ def test_a_rest_at_which_the_platform_turned_is_ignored(rate, warmth):
         assert gyro.rests < len(poses)
         assert np.all(np.abs(gyro.bias - without.bias) < gyro.sd)
         np.testing.assert_allclose(gyro.sd, without.sd, rtol=0.4)
-
-
-def test_one_of_six_rests_that_turned_does_not_matter():
-    for seed in range(12):
-        gyro = found(turned(rests(seed, 6), seed % 6, 0.05))
-        assert gyro.rests == 5
-        assert np.all(np.abs(gyro.bias - BIAS) < 5.0 * gyro.sd)
-
-
-def test_two_rests_that_disagree_are_uncertain():
-    sure, unsure = found(rests(4, 2)), found(turned(rests(4, 2), 1, 0.005))
-    assert np.all(np.abs(unsure.bias - BIAS) < 2.0 * unsure.sd)
-    assert unsure.sd[2] > 5.0 * sure.sd[2]
-
-
-@pytest.mark.parametrize('rate', [
-    np.zeros((12, 3)), np.full((12, 3), 32768.0),
-    np.random.default_rng(5).uniform(-0.9, 0.9, size=(12, 3))],
-    ids=['no gyro', 'counts', 'turntable'])
-def test_rates_that_are_no_gyro_at_rest_give_no_bias(rate):
-    assert gyro_bias_of(rests(5, 12).with_columns(rate=rate)) is None
-
-
-def test_poses_without_rates_or_a_single_rest_give_no_bias():
-    poses = rests(6)
-    without = Poses({'reading': poses.reading}, poses.row)
-    assert gyro_bias_of(without) is None
-    assert sample_noise_of(without) is None
-    assert gyro_bias_of(poses.take(slice(1))) is None
-    assert gyro_bias_of(poses.take(slice(0))) is None
-    assert sample_noise_of(poses.take(slice(0))) is None
 
 
 def test_noise_that_is_not_known_is_nan():
@@ -231,28 +177,6 @@ def test_a_recording_without_a_gyro_has_no_noise_of_the_rate():
     poses = capture(replace(samples, columns=columns), G).poses
     assert 'rate' not in poses
     assert 'rate_std' not in poses
-
-
-def dwell(start, rate_std, samples=100, **known) -> Dwell:
-    std = np.full(3, 0.003)
-    context = {'rate': BIAS, **known}
-    made = Dwell(start, start + 1.0, start + 0.5, np.array([0.0, 0.0, 1.0]), std, float(samples),
-                 samples, context, int(start))
-    return made if rate_std is None else replace(made, rate_std=np.full(3, rate_std))
-
-
-def test_merged_rests_have_the_noise_of_both():
-    both = [dwell(0.0, 0.003, 100), dwell(5.0, 0.006, 300)]
-    merged = select(both, CaptureSettings(repeated='merge'), G)
-    assert len(merged) == 1
-    np.testing.assert_allclose(merged[0].rate_std, np.sqrt((0.003 ** 2 + 3 * 0.006 ** 2) / 4))
-
-
-def test_a_table_has_the_noise_of_the_rate_if_all_its_rests_have_it():
-    assert 'rate_std' in poses_from([dwell(0.0, 0.003), dwell(5.0, 0.004)])
-    mixed = poses_from([dwell(0.0, 0.003), dwell(5.0, None)])
-    assert 'rate' in mixed
-    assert 'rate_std' not in mixed
 
 
 def test_a_negative_noise_of_the_rate_is_refused(tmp_path):
@@ -350,23 +274,6 @@ def test_bias_and_noise_are_read_as_they_were_written(known):
         np.testing.assert_array_equal(getattr(read.gyro, name), getattr(calibration.gyro, name))
     for name in ('force', 'rate'):
         np.testing.assert_array_equal(getattr(read.noise, name), getattr(calibration.noise, name))
-
-
-def test_noise_that_is_not_known_is_stored_as_null():
-    noise = SampleNoise(np.array([0.003, 0.002, 0.004]), np.full(3, np.nan))
-    text = format_calibration(replace(fitted(), noise=noise))
-    assert 'rate: [null, null, null]' in text
-    np.testing.assert_array_equal(parse_calibration(text, 'x.yaml').noise.rate, noise.rate)
-
-
-def test_a_file_without_bias_and_noise_is_read():
-    text = format_calibration(replace(fitted(), gyro=None, noise=None))
-    assert 'gyro_bias' not in text
-    assert '\nnoise:' not in text
-    read = parse_calibration(text, 'x.yaml')
-    assert read.gyro is None
-    assert read.noise is None
-    assert not read.warnings
 
 
 @pytest.mark.parametrize(('old', 'new', 'message'), [

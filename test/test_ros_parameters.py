@@ -11,7 +11,6 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from accel_calib.capture import CaptureSettings
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from inside import capture_settings, changed, default_of, expected
@@ -55,12 +54,6 @@ def test_parameter_file_holds_the_defaults() -> None:
     assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
 
 
-@pytest.mark.parametrize('settings', SETTINGS)
-def test_defaults_are_accepted_by_their_parameters(settings: Any) -> None:
-    values = {parameter.name: default_of(parameter) for parameter in fields(settings)}
-    assert changed(settings(), values) == settings()
-
-
 def test_parameters_accept_numbers_of_other_types() -> None:
     settings = changed(CalibratorSettings(), {'model': 10, 'min_dwell': 2, 'sensor': 7,
                                               'use_sim_time': True})
@@ -83,10 +76,6 @@ def test_lists_are_checked() -> None:
     assert settings.effects == []
     with pytest.raises(InputError, match='a list of 3 numbers'):
         changed(SimulatorSettings(), {'mounting': [1.0]})
-
-
-def test_capture_has_the_defaults_of_the_library_except_for_parked_robots() -> None:
-    assert capture_settings(CalibratorSettings()) == CaptureSettings(repeated='merge')
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:

@@ -142,7 +142,7 @@ def test_refused_calibrations_leave_the_one_in_use(bench: Any, stored: Stored) -
     bench.calibrator(calibration_file=path)
     bench.exchange(corrected, lambda: bench.imu([0, 0, 9.8]))
     other = stored('other.yaml', sensor='another').read_text()
-    for text, words in ((good.replace('version: 2', 'version: 999'), 'version 999'),
+    for text, words in ((good.replace('version: 3', 'version: 999'), 'version 999'),
                         (other, "belongs to sensor 'another'"), ('', 'it is empty'),
                         (good.replace('readings: m/s2', 'readings: native'), 'native')):
         path.write_text(text)

@@ -6,17 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 import os
 from pathlib import Path
 import struct
 from typing import Any
 
 from accel_calib.logs import layout_of
-from accel_calib.stored import read_calibration, write_calibration
+from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
-from inside import Model
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -88,19 +86,6 @@ def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored) 
     assert np.all(np.linalg.eigvalsh(added) > 0.0)
 
 
-def test_covariances_that_mean_absent_or_unknown_are_kept(bench: Any, stored: Stored) -> None:
-    heard = bench.listen(Imu, 'imu/data_calibrated')
-    bench.calibrator(calibration_file=stored(flat=FLAT))
-    absent = np.array([-1.0] + [0.0] * 8)
-    got = bench.exchange(heard, lambda: full(
-        bench, angular_velocity_covariance=absent, orientation_covariance=absent))
-    np.testing.assert_array_equal(got.angular_velocity_covariance, absent)
-    np.testing.assert_array_equal(got.orientation_covariance, absent)
-    np.testing.assert_array_equal(got.linear_acceleration_covariance, np.zeros(9))
-    assert got.orientation == Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
-    assert got.header.frame_id == 'imu_link_levelled'
-
-
 def test_without_rotation_messages_stay_in_the_frame_of_the_sensor(
         bench: Any, stored: Stored) -> None:
     path = stored(flat=FLAT)
@@ -114,19 +99,6 @@ def test_without_rotation_messages_stay_in_the_frame_of_the_sensor(
     np.testing.assert_array_equal(rate_of(got), RATE)
     np.testing.assert_array_equal(got.angular_velocity_covariance, KNOWN)
     assert got.orientation == Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
-
-
-def test_a_nan_in_a_covariance_makes_it_unknown_and_spoils_nothing_else(
-        bench: Any, stored: Stored) -> None:
-    heard = bench.listen(Imu, 'imu/data_calibrated')
-    bench.calibrator(calibration_file=stored(flat=FLAT))
-    damaged = KNOWN.copy()
-    damaged[4] = np.nan
-    got = bench.exchange(heard, lambda: full(
-        bench, angular_velocity_covariance=KNOWN, linear_acceleration_covariance=damaged))
-    np.testing.assert_array_equal(got.linear_acceleration_covariance, np.zeros(9))
-    assert np.all(np.isfinite(force_of(got)))
-    assert np.all(got.angular_velocity_covariance.reshape(3, 3).diagonal() > 0.0)
 
 
 def test_readings_in_g_are_published_in_metres_per_second_squared(
@@ -283,23 +255,6 @@ def test_messages_reach_the_session_even_if_nobody_listens(bench: Any, stored: S
         return values.get('messages', '0') != '0'
 
     bench.spin(counted)
-
-
-def test_calibrations_stored_with_effects_are_applied(bench: Any, stored: Stored) -> None:
-    path = stored(flat=FLAT)
-    calibration = read_calibration(path)
-    values = {**calibration.model.values, 'quadratic': np.array([1e-3, -2e-3, 1e-3]),
-              'lever_arm': np.array([0.1, -0.05, 0.02])}
-    size = len(np.concatenate([*values.values()]))
-    write_calibration(path, replace(
-        calibration, model=Model(values, calibration.model.rotation),
-        covariance=np.eye(size) * 1e-8))
-    heard = bench.listen(Imu, 'imu/data_calibrated')
-    bench.calibrator(calibration_file=path)
-    got = bench.exchange(heard, lambda: full(bench, linear_acceleration_covariance=KNOWN))
-    calibration = read_calibration(path)
-    np.testing.assert_allclose(force_of(got), calibration.apply(READING, rate=RATE), atol=1e-9)
-    assert not np.allclose(force_of(got), calibration.apply(READING), atol=1e-4)
 
 
 def test_messages_of_another_sensor_are_never_corrected(bench: Any, stored: Stored) -> None:

@@ -24,14 +24,10 @@ import pytest
 from shared import result
 from test_session import Driver
 
+pytestmark = pytest.mark.usefixtures('home')
+
 Stored = Callable[..., Path]
 Readings = Callable[..., Any]
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return tmp_path / 'home' / 'accel_calib'
 
 
 @pytest.fixture(scope='module')

@@ -20,13 +20,11 @@ from inside import (
     Identity,
     LARGEST_NUMBER_OF_STEPS,
     load_store,
-    Lock,
     Model,
     rotation_from_rpy,
     SensorStore,
     spread_directions,
     store_of,
-    StoreInUseError,
     StreamStatistics,
     writing_advice,
 )
@@ -36,6 +34,8 @@ from shared import answer_of
 
 GRAVITY = 9.80665
 RATE = 50.0
+
+pytestmark = pytest.mark.usefixtures('home')
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
@@ -85,12 +85,6 @@ class Driver:
 
     def finding(self, name: str) -> Any:
         return next(each for each in findings(state.health(self.session)) if each.name == name)
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return tmp_path / 'home' / 'accel_calib'
 
 
 @pytest.mark.parametrize(('one', 'other'), [
@@ -162,36 +156,6 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert second.finding('calibration').level == Level.OK
 
 
-def test_lock_ends_with_its_release(tmp_path: Path) -> None:
-    store = SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
-    lock = Lock(store)
-    with pytest.raises(StoreInUseError):
-        Lock(store)
-    lock.release()
-    Lock(store).release()
-
-
-@pytest.mark.parametrize('spoil', [
-    lambda text: text.replace('sensor: imu_link', 'sensor: 2001-99-99'),
-    lambda text: text[:len(text) // 2]])
-def test_damaged_calibration_is_renamed_and_the_poses_are_used(
-        spoil: Callable[[str], str], stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    driver = Driver(calibration_file=str(path))
-    driver.feed(readings(spread_directions(12)))
-    driver.session.close()
-    text = spoil(path.read_text())
-    path.write_text(text)
-    again = Driver(calibration_file=str(path))
-    again.feed(readings([[0, 0, 1]])[:10])
-    assert again.session.sensor.calibration is None
-    assert 'known.yaml.damaged1' in again.finding('calibration').words
-    assert path.with_name('known.yaml.damaged1').read_text() == text
-    assert len(again.session.sensor.live.book.poses()) == 12
-    assert again.done(again.session.commands.fit())
-    assert again.finding('calibration').level == Level.OK
-
-
 def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored: Stored,
                                                          readings: Readings) -> None:
     other = stored('use.yaml', sensor='another').read_text()
@@ -222,17 +186,6 @@ def test_poses_of_another_sensor_or_unit_are_renamed(tmp_path: Path, changes: An
 def _table(path: Path) -> Path:
     path.write_text('ax,ay,az\n0.1,0.2,9.8\n')
     return path
-
-
-def test_an_empty_store_is_no_problem(tmp_path: Path) -> None:
-    loaded = load_store(SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2'))
-    assert (loaded.calibration, loaded.poses, loaded.problem, loaded.notes) == (None, None, '', ())
-
-
-def test_calibration_in_native_units_is_refused_for_other_readings(stored: Stored) -> None:
-    store = SensorStore(stored(unit='native'), Identity('', '/imu'), 'm/s2')
-    with pytest.raises(StoredCalibrationError, match='for readings in native'):
-        store.load_calibration()
 
 
 def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:

@@ -16,7 +16,7 @@ PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
     ('errors', 'text', 'units'),
-    ('disk', 'table'),
+    ('disk', 'finding', 'table'),
     ('geometry',),
     ('effects',),
     ('logs',),
@@ -40,7 +40,8 @@ RANKS = {part: rank for rank, layer in enumerate(LAYERS) for part in layer}
 ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|srvs|interfaces)')
 
 MODULES = sorted(PACKAGE.rglob('*.py'))
-BASE = {f'accel_calib.{name}' for name in ('disk', 'errors', 'geometry', 'table', 'text', 'units')}
+BASE = {f'accel_calib.{name}' for name in (
+    'disk', 'errors', 'finding', 'geometry', 'table', 'text', 'units')}
 """Modules that tests import from directly."""
 
 FACES = {'accel_calib', *(f'accel_calib.{each.parent.name}'

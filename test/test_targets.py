@@ -9,12 +9,9 @@ import stat
 
 from accel_calib.disk import write_atomically
 from accel_calib.errors import InputError
-from inside import main, previous
+from inside import previous
 import pytest
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
+from shared import run
 
 
 @pytest.fixture(scope='module')

@@ -9,7 +9,7 @@ import pty
 import subprocess
 import sys
 
-from inside import COMMAND, in_one_line, main, Output, shown, with_sd
+from inside import COMMAND, in_one_line, main, Output, shown
 import numpy as np
 import pytest
 
@@ -70,14 +70,6 @@ def test_a_long_line_breaks_at_words_and_a_path_stays_whole(monkeypatch):
     lines = output.file.getvalue().splitlines()
     assert [line.strip() for line in lines] == [
         'the calibration with', '12.3 ± 0.4 mg at 31 °C is', 'stored in', path]
-
-
-@pytest.mark.parametrize(('value', 'sd', 'text'), [
-    (1.23456, 0.0123, '1.235 ± 0.012'), (-8.67e-19, 1e-3, '0.0000 ± 0.0010'),
-    (32768.123, 53.2, '32768 ± 53'), (-0.00001, 0.02, '0.000 ± 0.020'), (-1e-19, 0.0, '0'),
-    (5.25, 0.0, '5.25')])
-def test_a_value_has_as_many_digits_as_its_deviation_has_meaning(value, sd, text):
-    assert with_sd(value, sd) == text
 
 
 def test_parameters_that_the_model_lacks_are_absent(poses, printed):

@@ -12,13 +12,13 @@ from inside import (
     low_passed,
     Model,
     predict,
-    random_directions,
     rate_of,
     simulate_poses,
     ThermalStream,
 )
 import numpy as np
 import pytest
+from shared import random_directions
 
 KEY = 'temperature_of_offset'
 START = 1.7e9
@@ -58,13 +58,6 @@ def test_low_pass_of_a_ramp_falls_behind_by_slope_times_lag():
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_low_pass_of_a_jump_decays_with_the_lag():
-    time = np.array([0.0, 100.0, 100.0, 130.0, 160.0])
-    found = low_passed(time, np.array([20.0, 20.0, 30.0, 30.0, 30.0]), 30.0)
-    np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 30 - 10 / np.e, 30 - 10 / np.e ** 2],
-                               atol=1e-12)
-
-
 def test_low_pass_of_a_cubic_temperature_is_exact_with_its_rates():
     time = np.array([0.0, 7.0, 30.0, 31.0, 95.0, 400.0]) - 40.0
     a, b, c, lag = 2e-7, -3e-5, 0.01, 25.0
@@ -84,19 +77,6 @@ def test_order_of_the_rows_and_rows_without_values_do_not_matter():
     for function, of in ((rate_of, ()), (low_passed, (70.0,))):
         expected = np.append(function(time, warm, *of), [np.nan, np.nan])[mixed]
         np.testing.assert_allclose(function(*given, *of), expected, atol=1e-9)
-
-
-def test_equal_times_and_single_rows_have_no_rate_and_no_lag():
-    time, warm = np.full(4, 7.0), np.array([20.0, 22.0, 24.0, 26.0])
-    np.testing.assert_array_equal(rate_of(time, warm), 0.0)
-    for of_sensor in (False, True):
-        context = {'time': time[:1], 'temperature': warm[:1]}
-        assert acting_temperature(context, KEY, 100.0, of_sensor) == warm[:1]
-
-
-def test_rate_of_a_ramp_is_its_slope_also_beside_pauses_and_close_rows():
-    time = np.array([0.0, 10.0, 10.3, 25.0, 40.0, 7000.0, 7020.0, 7030.0])
-    np.testing.assert_allclose(rate_of(START + time, 0.01 * time), 0.01, rtol=5e-3)
 
 
 @pytest.mark.parametrize(('step', 'most'), [(0.01, 0.1), (0.06, 0.25)])
@@ -161,17 +141,6 @@ def test_stream_and_array_give_the_same_numbers():
                 assert stream.value[key] == pytest.approx(values[k], abs=1e-9), (key, k)
         else:
             assert all(np.isnan(values[k]) for values in expected.values())
-
-
-def test_stream_can_be_added_in_parts():
-    time, warm = samples()
-    whole = ThermalStream(LAGS, rate=True).add_all(time, warm)
-    stream = ThermalStream(LAGS, rate=True)
-    parts = [stream.add_all(*part) for part in zip(
-        np.split(time, [1, 700, 705, 2000]), np.split(warm, [1, 700, 705, 2000]), strict=True)]
-    for key, values in whole.items():
-        np.testing.assert_allclose(np.concatenate([part[key] for part in parts]), values,
-                                   atol=1e-9)
 
 
 def test_low_pass_of_a_stream_is_that_of_the_rows():

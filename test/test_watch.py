@@ -18,21 +18,10 @@ from typing import Any
 from accel_calib.calibrate import next_pose
 from accel_calib.errors import InputError
 from accel_calib.session import Progress
-from inside import (
-    changes,
-    COMMAND,
-    next_action,
-    screen,
-    state,
-    unit,
-    WatchLines,
-    WatchScreen,
-    words_of,
-)
+from inside import changes, COMMAND, next_action, screen, state, unit, words_of
 import numpy as np
 import pytest
 from rich.console import Console
-from rich.live import Live
 
 ROOT = Path(__file__).parent.parent
 NODE = '/left/calibrator'
@@ -110,18 +99,6 @@ def test_screen_shows_all_figures() -> None:
     assert f'{ENOUGH.accuracy * 1e3:.2g} mg expected' in drawn(screen(NODE, ENOUGH))
 
 
-def test_stillness_bar_reaches_its_line_at_the_limit() -> None:
-    bars = {stillness: row(drawn(screen(NODE, replace(MIDDLE, stillness=stillness))), 'stillness')
-            for stillness in (0.0, 0.5, 1.0, 1.5, 100.0)}
-    lengths = [bar.count('█') for bar in bars.values()]
-    width = lengths[-1] + 1
-    assert lengths == pytest.approx([0, width / 4, width / 2, width * 3 / 4 - 1, width - 1], abs=1)
-    assert len({bar.index('┃') for bar in bars.values()}) == 1
-    assert [next(part for part in ('░┃░', '█┃░', '█┃█') if part in bar)
-            for bar in bars.values()] == ['░┃░', '░┃░', '█┃░', '█┃█', '█┃█']
-    assert '█' not in row(drawn(screen(NODE, replace(MIDDLE, stillness=math.nan))), 'stillness')
-
-
 @pytest.mark.parametrize('signs', [
     np.array(signs, float) for signs in ((0, 0, 1), (1, -1, 0), (-1, 1, -1))], ids=str)
 def test_every_next_pose_is_shown_in_large_words(signs: Any) -> None:
@@ -164,40 +141,6 @@ def test_end_of_the_poses_is_clear() -> None:
     assert 'more poses no longer help' in line
     assert line.endswith(f'~/fit: ros2 service call {NODE}/fit std_srvs/srv/Trigger')
     assert list(state(NODE, ENOUGH))[-1] == f'ros2 service call {NODE}/fit std_srvs/srv/Trigger'
-
-
-def test_changes_are_one_line_each() -> None:
-    assert not list(changes(NODE, MIDDLE, replace(MIDDLE, stillness=0.7, dwell=0.8)))
-    assert list(changes(NODE, MIDDLE, replace(MIDDLE, still=False))) == ['moving']
-    assert list(changes(NODE, replace(MIDDLE, still=False), MIDDLE)) == ['still: hold it for 1 s']
-    line, = changes(NODE, STEPS[6], MIDDLE)
-    assert line == ('captured pose 7 of about 12; coverage 35%; accuracy not determined by these '
-                    f'poses; next: {MIDDLE.advice}')
-    line, = changes(NODE, STEPS[8], MIDDLE)  # ~/undo_pose
-    assert line.startswith('poses: 7 of about 12; ')
-    assert len(list(changes(NODE, None, MIDDLE))) == 2
-
-
-def test_lines_have_no_control_codes_and_report_problems_once(
-        capsys: pytest.CaptureFixture[str]) -> None:
-    lines = WatchLines()
-    lines.show(NODE, None, '')
-    for problem in ('', 'no message; do this', 'no message; do this', ''):
-        lines.show(NODE, MIDDLE, problem)
-    printed = capsys.readouterr().out
-    assert printed.splitlines()[2:] == ['no message; do this',
-                                        f'messages from {NODE} arrive again']
-    assert all(line.isprintable() for line in printed.splitlines())
-
-
-@pytest.mark.parametrize('bell', [True, False])
-def test_bell_rings_for_each_captured_pose(bell: bool) -> None:
-    file = io.StringIO()
-    console = Console(file=file, force_terminal=True, width=80, height=24)
-    shown = WatchScreen(Live(console=console, auto_refresh=False), bell)
-    for progress in (None, MIDDLE, MIDDLE, STEPS[8], STEPS[8], MIDDLE, STEPS[8]):
-        shown.show(NODE, progress, '')
-    assert file.getvalue().count('\a') == (2 if bell else 0)
 
 
 def test_missing_ros_is_one_line(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from dataclasses import replace
 import os
 from pathlib import Path
 
-from accel_calib.calibrate import Calibration, EDITED, Rejected
+from accel_calib.calibrate import Calibration, Rejected
 from accel_calib.errors import DamagedCalibrationError, InputError, StoredCalibrationError
+from accel_calib.finding import has
 from accel_calib.stored import read_calibration, write_calibration
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
@@ -33,11 +34,6 @@ MOST_EVENTS = 100
 """Number of YAML events after which the longest bomb must be refused."""
 
 FIRST = 'format: accel_calib calibration\n'
-
-
-def test_intact_files_have_no_warning_about_damage() -> None:
-    for text in intact():
-        assert EDITED not in parse_calibration(text, 'x.yaml').warnings
 
 
 # Bombs
@@ -169,7 +165,7 @@ def test_content_that_is_not_a_calibration_is_refused(data: bytes, words: str, t
 def test_other_line_ends_do_not_count_as_damage(ending: str, tmp_path: Path) -> None:
     path = tmp_path / 'c.yaml'
     path.write_bytes(intact()[-1].replace('\n', ending).encode())
-    assert EDITED not in read_calibration(path).warnings
+    assert not has(read_calibration(path).noted, 'edited')
 
 
 # What a changed file may not hide
@@ -188,8 +184,8 @@ def test_an_unknown_key_in_a_changed_file_is_refused(old: str, new: str, words: 
 
 
 def test_the_checksum_is_also_checked_if_the_version_was_changed() -> None:
-    text = intact()[-1].replace('version: 2', 'version: 1', 1)
-    assert EDITED in parse_calibration(text, 'x.yaml').warnings
+    text = intact()[-1].replace('version: 3', 'version: 1', 1)
+    assert has(parse_calibration(text, 'x.yaml').noted, 'edited')
 
 
 def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:
@@ -204,7 +200,7 @@ def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:
     ('count: [', 'count: [-1.0, ', 'count has shape|count holds'),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
     ('rejected: []', 'rejected: [1]', 'rejected is 1, expected names'),
-    ('warnings: [', 'warnings: [1, ', 'warning is 1, expected text')])
+    ('findings: [', 'findings: [1, ', 'finding is 1, expected names')])
 def test_a_value_of_another_kind_is_named(old: str, new: str, words: str) -> None:
     texts = [text for text in intact() if old in text]
     assert texts
@@ -226,7 +222,7 @@ def test_text_of_any_form_is_stored_as_it_is(value: str) -> None:
     calibration = replace(parse_calibration(intact()[0], 'x.yaml'), sensor=value, reason=value)
     found = parse_calibration(format_calibration(calibration), 'x.yaml')
     assert (found.sensor, found.reason) == (value, value)
-    assert EDITED not in found.warnings
+    assert not has(found.noted, 'edited')
 
 
 def test_a_number_is_read_as_yaml_reads_it() -> None:

@@ -17,14 +17,12 @@ from .calibration import (
     Calibration,
     check_sensor,
     converted,
-    EDITED,
     Quality,
     Rejected,
+    RejectedKind,
 )
-from .checks import FLAT
 from .context import joined_ranges, of_samples, Outside, outside, thermal_stream, USES_LIMIT
 from .fit import (
-    ARBITRARY_HEADING,
     fit_poses,
     level,
     level_by_rows,
@@ -37,7 +35,7 @@ from .gate import gated
 from .mounting import flat_direction, FrameName, FRAMES
 from .partial import carried_words, fit_partial, mounting_only
 from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
-from .quality import in_g, NOT_LOCATED, UNCHECKED, Verification, verify, with_history
+from .quality import in_g, Verification, verify, with_history
 from .rest_noise import (
     gyro_bias_of,
     GyroBias,
@@ -48,12 +46,12 @@ from .rest_noise import (
 from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
 from ..table import check_units
 
-__all__ = ['ARBITRARY_HEADING', 'EDITED', 'FLAT', 'FRAMES', 'METHODS', 'MODEL_NAMES',
-           'NOT_LOCATED', 'PRIOR', 'STORED_METHODS', 'UNCHECKED', 'USES_LIMIT', 'Calibration',
-           'FleetPrior', 'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside',
-           'Quality', 'Rejected', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
-           'check_units', 'converted', 'directions_of', 'fit_partial', 'fit_poses',
-           'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges',
-           'level', 'level_by_rows', 'lies_in_cone', 'mounting_only', 'next_pose', 'of_samples',
-           'outlook', 'outside', 'sample_noise_of', 'set_heading', 'thermal_stream', 'verify',
-           'with_given_mounting', 'with_history', 'with_rest_noise']
+__all__ = ['FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT',
+           'Calibration', 'FleetPrior', 'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook',
+           'Outside', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise', 'Verification',
+           'carried_words', 'check_sensor', 'check_units', 'converted', 'directions_of',
+           'fit_partial', 'fit_poses', 'fit_with_fleet', 'flat_direction', 'gated',
+           'gyro_bias_of', 'in_g', 'joined_ranges', 'level', 'level_by_rows', 'lies_in_cone',
+           'mounting_only', 'next_pose', 'of_samples', 'outlook', 'outside', 'sample_noise_of',
+           'set_heading', 'thermal_stream', 'verify', 'with_given_mounting', 'with_history',
+           'with_rest_noise']

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,12 +19,10 @@ from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import AXES, Context, correct, force_slope, Model, parameter_names, predict
 from ..errors import InputError, StoredCalibrationError
+from ..finding import Finding
 from ..table import Floats, Poses, Table
 from ..text import table, with_sd
 from ..units import STANDARD_GRAVITY, UnitName, Units
-
-EDITED = 'the file was edited by hand since it was stored'
-"""Warning of a calibration whose file does not match its checksum."""
 
 _IN_READING_UNITS = ('reading', 'std', 'reference')
 
@@ -65,12 +63,16 @@ class Quality:
     coverage: float
 
 
+RejectedKind = Literal['implausible', 'doubtful', 'outlier', 'clipped']
+
+
 @dataclass(frozen=True)
 class Rejected:
-    """A pose that the fit does not use: its row, 1-based, and the reason."""
+    """A pose that the fit does not use: its row, 1-based, the reason, and the kind of it."""
 
     row: int
     reason: str
+    kind: RejectedKind = 'implausible'
 
 
 @dataclass(frozen=True, repr=False)
@@ -105,8 +107,8 @@ class Calibration:
         Poses that the fit does not use.
     reason : str
         Reason for the choice of the model.
-    warnings : tuple of str
-        Warnings for the user.
+    noted : tuple of Finding
+        What was noted during the fit, when it was levelled, and when it was read.
     stream : str
         Topic of the messages, with namespace; empty for recordings.
     gyro : GyroBias or None
@@ -128,7 +130,7 @@ class Calibration:
     poses: Poses
     rejected: tuple[Rejected, ...]
     reason: str
-    warnings: tuple[str, ...]
+    noted: tuple[Finding, ...]
     stream: str = ''
     gyro: GyroBias | None = None
     noise: SampleNoise | None = None
@@ -161,6 +163,11 @@ class Calibration:
         return table(head, rows) + lines
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return the findings as lines of text."""
+        return tuple(each.words for each in self.noted)
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the values, in the order of `covariance`."""
         return parameter_names(self.model.effects)
@@ -168,7 +175,7 @@ class Calibration:
     @property
     def force_per_g(self) -> float:
         """Corrected force per g: 1 for native readings, whose corrected force is in g."""
-        return 1.0 if self.units.name == 'native' else self.units.per_g
+        return 1.0 if self.units.is_native else self.units.per_g
 
     @property
     def offset(self) -> Floats:
@@ -251,9 +258,9 @@ class Calibration:
 
         """
         own = self.units
-        if table.units or own.name == 'native' or not len(table):
+        if table.units or own.is_native or not len(table):
             return self.in_units(table.units or own.name)
-        other = self.in_units('g' if own.name == 'm/s2' else 'm/s2')
+        other = self.in_units('g' if own.is_si else 'm/s2')
         with np.errstate(over='ignore'):
             length = float(np.median(np.linalg.norm(table.reading, axis=1)))
         border = float(np.sqrt(own.per_g * other.units.per_g))

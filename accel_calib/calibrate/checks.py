@@ -18,6 +18,7 @@ same reading.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import permutations, product
 from typing import TYPE_CHECKING
 
@@ -26,13 +27,11 @@ import numpy as np
 from .mounting import flat_direction
 from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_12
+from ..finding import Finding, Level
 from ..table import Floats
 
 if TYPE_CHECKING:
     from .calibration import Calibration
-
-FLAT = 'the flat pose'
-"""Start of the warning about a flat pose."""
 
 _AXES = 'xyz'
 _NEAR = 25.0
@@ -47,39 +46,37 @@ _LEAST_SPREAD = 0.1
 _ADVICE = 'check the wiring, the driver and the signs of ref_x,ref_y,ref_z'
 
 
-def wiring_warnings(calibration: Calibration) -> tuple[str, ...]:
+def wiring(calibration: Calibration) -> Iterator[Finding]:
     """
-    Return a warning if known orientations reveal a wiring fault.
+    Yield a finding if known orientations reveal a wiring fault.
 
     Parameters
     ----------
     calibration : Calibration
         The calibration, with its poses.
 
-    Returns
-    -------
-    tuple of str
-        One warning, or none.
-
     """
     poses, name = calibration.poses, calibration.name
     if 'reference' not in poses:
-        return ()
+        return
     mat_q = axes_of(poses.reading, poses['reference'])
     found = None if mat_q is None else fault_of(mat_q)
     if mat_q is None or found is None:
-        return ()
+        return
+    level: Level = 'USABLE'
     mirrored = np.linalg.det(mat_q) < 0.0
     if name == '12':
-        effect = 'model 12 corrects it'
+        level, effect = 'USABLE' if mirrored else 'GOOD', 'model 12 corrects it'
     elif mirrored:
+        level = 'BAD'
         effect = f'model {name} does not correct it, because |force| = 1 g does not reveal it'
-    elif np.array_equal(calibration.model.rotation, np.eye(3)):
+    elif not calibration.is_levelled:
         effect = f'model {name} does not correct it'
     else:
-        effect = 'the mounting corrects it'
+        level, effect = 'GOOD', 'the mounting corrects it'
     advice = _ADVICE if mirrored else f'if it is not mounted this way, {_ADVICE}'
-    return (f'according to the known orientations, {found}; {effect}; {advice}',)
+    yield Finding('wiring', f'according to the known orientations, {found}; {effect}', advice,
+                  level)
 
 
 def axes_of(reading: Floats, reference: Floats) -> Floats | None:
@@ -194,9 +191,9 @@ def _turn(rotation: Floats) -> str:
     return f'{angle:.0f}° about ({", ".join(f"{part:.2g}" for part in axis)})'
 
 
-def flat_warnings(rotation: Floats, frame: str) -> tuple[str, ...]:
+def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
     """
-    Return a warning if a flat pose indicates a wiring fault.
+    Yield a finding if a flat pose indicates a wiring fault.
 
     Parameters
     ----------
@@ -205,25 +202,21 @@ def flat_warnings(rotation: Floats, frame: str) -> tuple[str, ...]:
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
 
-    Returns
-    -------
-    tuple of str
-        One warning, or none if the expected axis reads about 1 g.
-
     """
     expected = flat_direction(frame)
     force = rotation @ expected
     off = np.degrees(np.arccos(np.clip(force @ expected, -1.0, 1.0)))
     if off <= _ON_ITS_SIDE:
-        return ()
+        return
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{_AXES[face]}'
     own = f'{"-" if expected[2] < 0.0 else "+"}z'
-    begin = (f'{FLAT} reads {force[face]:+.2f} g on {_AXES[face]}, where a sensor that lies flat '
-             f'reads 1 g on {own}: ')
     if face == 2:
-        return (f'{begin}it is mounted upside down, or z (or every axis) has the wrong sign; one '
-                'flat pose cannot distinguish them; if it is not upside down, correct the sign, '
-                'because a rotation does not',)
-    return (f'{begin}it is mounted with {seen} up, or {_AXES[face]} and z are swapped; one flat '
-            'pose cannot distinguish them; if it lies flat, correct the wiring or the driver',)
+        causes = 'it is mounted upside down, or z (or every axis) has the wrong sign'
+        advice = 'if it is not upside down, correct the sign, because a rotation does not'
+    else:
+        causes = f'it is mounted with {seen} up, or {_AXES[face]} and z are swapped'
+        advice = 'if it lies flat, correct the wiring or the driver'
+    yield Finding('flat_pose', f'the flat pose reads {force[face]:+.2f} g on {_AXES[face]}, where '
+                  f'a sensor that lies flat reads 1 g on {own}: {causes}; one flat pose cannot '
+                  'distinguish them', advice, 'USABLE')

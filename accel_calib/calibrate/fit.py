@@ -5,7 +5,7 @@
 From poses of known or unknown orientation to a levelled Calibration: the entry point.
 
 `mounting` computes ΔR from a flat pose, or from a pose with the nose down; here it becomes part of
-a calibration, with the warnings about it.
+a calibration, with the findings about it.
 
 """
 
@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from .calibration import Calibration, Rejected
-from .checks import FLAT, flat_warnings, wiring_warnings
+from .checks import doubts_about_flat, wiring
 from .gate import gated, sound_rows, sure_rows
 from .known_orientation import fit_known
 from .mounting import FrameName, heading_is_arbitrary, mounting, with_heading, with_heading_of
@@ -24,6 +24,7 @@ from .rest_noise import with_rest_noise
 from .unknown_orientation import fit_unknown, Method, METHODS
 from ..effects import Context, Model, sensor_force
 from ..errors import InputError, RefusedFitError
+from ..finding import Finding, without
 from ..table import check_units, Floats, Poses
 from ..text import listed
 from ..units import Units
@@ -77,7 +78,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     return with_rest_noise(gated(replace(
         calibration, sensor=sensor or poses.sensor, date=date,
         poses=_all_poses(poses, calibration.poses), rejected=tuple(left_out),
-        warnings=(*wiring_warnings(calibration), *calibration.warnings))), poses)
+        noted=(*wiring(calibration), *calibration.noted))), poses)
 
 
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
@@ -140,10 +141,10 @@ def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units
         without = every
     if without is not every and (model != 'auto' or without.name == every.name):
         return without, (*rejected, *doubts)
-    rows = listed('row', [each.row for each in doubts])
-    return replace(every, warnings=(
-        *every.warnings, f'the sensor may have moved during the poses of {rows}, and the fit '
-        'needs them: capture them again')), rejected
+    rows = tuple(each.row for each in doubts)
+    return replace(every, noted=(*every.noted, Finding(
+        'doubtful', f'the sensor may have moved during the poses of {listed("row", rows)}, and '
+        'the fit needs them', 'capture them again', 'USABLE', rows))), rejected
 
 
 def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
@@ -159,13 +160,10 @@ def _all_poses(poses: Poses, fitted: Poses) -> Poses:
 
 _SAME_TILT = np.cos(np.radians(10.0))
 
-_HEADING = 'the heading of the mounting'
-
-ARBITRARY_HEADING = (
-    f'{_HEADING} is arbitrary, because an axis of the sensor that defines it is within 10° of the '
-    'vertical: take a second pose with the nose of the robot down (~/set_heading or --nose-down), '
-    'or give the mounting (mounting_rpy or base_frame)')
-"""Warning of a levelled calibration without a known heading near the singular direction."""
+_ARBITRARY_HEADING = Finding(
+    'heading', 'the heading of the mounting is arbitrary, because an axis of the sensor that '
+    'defines it is within 10° of the vertical', 'take a second pose with the nose of the robot '
+    'down (~/set_heading or --nose-down), or give the mounting (mounting_rpy or base_frame)')
 
 
 def level(calibration: Calibration, reading: Floats, frame: FrameName,
@@ -187,7 +185,7 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     Returns
     -------
     Calibration
-        The calibration with ΔR of this pose, and a warning if the wiring may be wrong.
+        The calibration with ΔR of this pose, and a finding if the wiring may be wrong.
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
@@ -195,11 +193,11 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     arbitrary = not kept and heading_is_arbitrary(rotation, frame)
     if kept:
         rotation = with_heading_of(calibration.rotation, rotation)
-    others = [warning for warning in calibration.warnings
-              if not warning.startswith((FLAT, _HEADING))]
-    return replace(calibration, model=Model(calibration.model.values, rotation), frame=frame,
-                   warnings=(*others, *flat_warnings(rotation, frame),
-                             *((ARBITRARY_HEADING,) if arbitrary else ())))
+    others = without(calibration.noted, 'flat_pose', 'heading')
+    levelled = replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
+    return replace(levelled, noted=(
+        *wiring(levelled), *without(others, 'wiring'), *doubts_about_flat(rotation, frame),
+        *((_ARBITRARY_HEADING,) if arbitrary else ())))
 
 
 def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
@@ -234,8 +232,9 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
 
 def with_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
     """Return a calibration with another ΔR, whose heading is known."""
-    return replace(calibration, model=Model(calibration.model.values, rotation), warnings=tuple(
-        line for line in calibration.warnings if not line.startswith(_HEADING)))
+    turned = replace(calibration, model=Model(calibration.model.values, rotation))
+    return replace(turned, noted=(*wiring(turned),
+                                  *without(turned.noted, 'wiring', 'heading')))
 
 
 def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:

@@ -31,15 +31,16 @@ import numpy as np
 
 from .calibration import Calibration
 from .gate import gated
-from .partial import partial_warnings, typical_spread, usable, without_knocked
+from .partial import partial_findings, typical_spread, usable, without_knocked
 from .pose_planning import determines
 from .quality import in_g, quality_of
 from .rest_noise import with_rest_noise
-from .unknown_orientation import copy_warning, FLEET, only_norm, rejected_by
+from .unknown_orientation import copies, FLEET, only_norm, rejected_by
 from ..errors import RefusedFitError
 from ..estimate.fit import Prior
 from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
+from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses
 from ..text import counted
@@ -54,8 +55,8 @@ _UNLIKE = {1.0: 0.008, 4.0: 0.002}
 _LARGEST_NOISE_G = 0.02
 """Largest error of poses that is tried [g]; larger ones are knocked poses, not noise."""
 
-_UNLIKE_WORDS = ('the sensor is unlike the fleet, so the typical values of the fleet are not '
-                 'used: take more poses')
+_UNLIKE_FLEET = Finding('unlike_fleet', 'the sensor is unlike the fleet, so the typical values of '
+                        'the fleet are not used', 'take more poses')
 
 
 @dataclass(frozen=True)
@@ -134,12 +135,12 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
         '10', FLEET, fit.model, units, sensor or poses.sensor, 'ros', date, fit.covariance,
         quality_of(fit, units, unit(sound.reading)[kept]), poses,
         tuple(sorted((*rejected, *out), key=lambda each: each.row)), _reason(fleet, len(kept)),
-        (*(_UNLIKE_WORDS,) * unlike, *copy_warning(original, poses_g), *partial_warnings(fit)))
+        (*(_UNLIKE_FLEET,) * unlike, *copies(original, poses_g), *partial_findings(fit)))
     return with_rest_noise(gated(calibration), poses)
 
 
 def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
-              ) -> tuple[Floats, Floats, tuple[str, ...]]:
+              ) -> tuple[Floats, Floats, tuple[Finding, ...]]:
     """
     Return fitted values with the typical values of a fleet included.
 
@@ -156,8 +157,8 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
 
     Returns
     -------
-    (p,) array, (p, p) array, tuple of str
-        The values, their covariance, and a warning if the sensor is unlike the fleet.
+    (p,) array, (p, p) array, tuple of Finding
+        The values, their covariance, and a finding if the sensor is unlike the fleet.
 
     """
     count = len(fleet.prior.mean)
@@ -175,7 +176,7 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
     spread, unlike = found
     gain = np.linalg.solve(spread, covariance[:count]).T
     left = covariance - gain @ covariance[:count]
-    return values + gain @ away, (left + left.T) / 2.0, (_UNLIKE_WORDS,) * unlike
+    return values + gain @ away, (left + left.T) / 2.0, (_UNLIKE_FLEET,) * unlike
 
 
 def _priors(fleet: Prior) -> list[tuple[Prior, float, bool]]:

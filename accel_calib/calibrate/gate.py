@@ -25,10 +25,10 @@ from dataclasses import replace
 import numpy as np
 
 from .calibration import Calibration, Rejected
-from .quality import NOT_LOCATED
 from .unknown_orientation import PRIOR
 from ..effects import LADDER, Model, times
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
+from ..finding import Finding, without
 from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
@@ -54,7 +54,6 @@ _NATIVE_SPREADS = 20.0
 """Largest reading of an accelerometer at rest: |reading| [g]; for native units the distance from
 the median, relative to the median of these distances."""
 
-_UNCERTAIN = 'the uncertainty of |a| is up to'
 _CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
 
 
@@ -89,7 +88,7 @@ def gated(calibration: Calibration) -> Calibration:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
             f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
-    return _with_warning(calibration)
+    return _with_uncertainty(calibration)
 
 
 def _check_numbers(calibration: Calibration) -> None:
@@ -134,7 +133,7 @@ def _check_gain(calibration: Calibration) -> None:
                               f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     offset = float(np.linalg.norm(vec_v))
-    if calibration.units.name != 'native' and not offset <= LARGEST_OFFSET_G:
+    if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
 
@@ -197,7 +196,7 @@ def deviations_g(calibration: Calibration, up: Floats) -> Floats:
     return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
 
 
-def _with_warning(calibration: Calibration) -> Calibration:
+def _with_uncertainty(calibration: Calibration) -> Calibration:
     if calibration.method == PRIOR:
         return calibration
     uncertain = uncertainty_g(calibration)
@@ -205,13 +204,14 @@ def _with_warning(calibration: Calibration) -> Calibration:
         raise RefusedFitError(
             f'the poses do not determine the calibration: the uncertainty of |a| is up to '
             f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
-            next((line for line in calibration.warnings if line.startswith(NOT_LOCATED)),
-                 TAKE_ALL_SIDES))
-    others = tuple(line for line in calibration.warnings if not line.startswith(_UNCERTAIN))
+            next((each.words for each in calibration.noted
+                  if each.kind == 'outlier_not_certain'), TAKE_ALL_SIDES))
+    others = without(calibration.noted, 'uncertainty')
     if uncertain < _WARN_UNCERTAINTY_G:
-        return replace(calibration, warnings=others)
-    return replace(calibration, warnings=(*others, f'{_UNCERTAIN} {uncertain * MG:.2g} mg: take '
-                                          'more poses, spread over the sphere'))
+        return replace(calibration, noted=others)
+    return replace(calibration, noted=(*others, Finding(
+        'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
+        'take more poses, spread over the sphere')))
 
 
 def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -238,7 +238,7 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
         centre = np.median(poses.reading, axis=0)
         away = np.linalg.norm(poses.reading - centre, axis=1)
     scale = units.per_g
-    if units.name == 'native':
+    if units.is_native:
         scale = float(np.median(away)) * _NATIVE_SPREADS / _LARGEST_REST_G
         length = away
     wild = ~(length <= _LARGEST_REST_G * scale)
@@ -256,7 +256,8 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
         return poses, ()
     doubtful = poses['doubtful'] > 0.0
     return poses.take(~doubtful), tuple(
-        Rejected(int(row), 'doubtful: the sensor may have moved') for row in poses.row[doubtful])
+        Rejected(int(row), 'doubtful: the sensor may have moved', 'doubtful')
+        for row in poses.row[doubtful])
 
 
 def _why(poses: Poses, index: int, wild: bool) -> str:

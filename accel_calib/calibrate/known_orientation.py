@@ -16,13 +16,14 @@ then determine only the rotation of the axes, ΔR.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from .calibration import Calibration, Rejected
 from .pose_planning import determines, refuse_if_unfit
-from .quality import fit_warnings, in_g, quality_of, rival_warnings
+from .quality import fit_findings, in_g, quality_of, rival_findings
 from .unknown_orientation import (
     calibration_of,
     directions_of,
@@ -36,6 +37,7 @@ from ..estimate.closed_form import faces, fit_12
 from ..estimate.fit import estimate, Fit
 from ..estimate.mistakes import covariance_with, rivals
 from ..estimate.outliers import outliers
+from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses
 from ..units import MG, Units
@@ -48,7 +50,7 @@ _LEAST_RATIO = 4.0
 
 _WARN_DEGREES = 0.2
 _WARN_CHI2 = 4.0
-"""Residuals above both limits cause a warning about the placement."""
+"""Residuals above both limits cause a finding about the placement."""
 
 _ROUNDS = 20
 _SMALL_ANGLE = 1e-6
@@ -61,7 +63,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         by_norm = _unless_placed_well(poses, units)
         if by_norm is not None:
             return by_norm
-    if units.name == 'native':
+    if units.is_native:
         mat_x = fit_12(poses.reading, poses['reference'])[0]
         units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
     refuse_if_unfit('12', unit(poses['reference']))
@@ -71,8 +73,8 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     unlike = rivals(fit, kept, in_g(poses, units), lambda others: estimate(fit.model, others))
     return Calibration('12', method, fit.model, units, '', 'ros', '', covariance_with(fit, unlike),
                        quality, poses, rejected, reason,
-                       (*rival_warnings(unlike, poses.row), *fit_warnings(fit, 0.0),
-                        *_placement_warning(fit)))
+                       (*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0),
+                        *_placement(fit)))
 
 
 def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
@@ -90,7 +92,7 @@ def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
         off = fit.equations.of_poses(fit.residual)[out] * MG
         rejected = (*rejected, *(
             Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of '
-                     'the other poses')
+                     'the other poses', 'outlier')
             for row, error in zip(fit.poses_g.row[out], off, strict=True)))
         fit = estimate(fit.model, left)
     return fit, rejected
@@ -105,7 +107,7 @@ def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
         raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
                               'but model 12 needs known orientations', 'add these columns, use '
                               'only the six faces (--rows), or use model 10')
-    force = faces_up * (1.0 if units.name == 'native' else units.per_g)
+    force = faces_up * (1.0 if units.is_native else units.per_g)
     return poses.with_columns(reference=force), 'the poses are the six faces'
 
 
@@ -135,20 +137,20 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
              'determine only the rotation of the axes')
     by_norm = calibration_of(found, poses, units, 'ml')
     return replace(by_norm, model=replace(by_norm.model, rotation=rotation), reason=words,
-                   warnings=(words, *by_norm.warnings))
+                   noted=(Finding('placement', words), *by_norm.noted))
 
 
-def _placement_warning(fit: Fit) -> tuple[str, ...]:
-    """Return a warning about placement errors that |force| = 1 g cannot detect in these poses."""
+def _placement(fit: Fit) -> Iterator[Finding]:
+    """Yield a finding about placement errors that |force| = 1 g cannot detect in these poses."""
     if fit.dof == 0:
-        return ()
+        return
     off = fit.equations.of_poses(fit.residual)
     angle = np.degrees(np.sqrt(3.0 * np.sum(off ** 2) / fit.dof))
-    if angle < _WARN_DEGREES or fit.chi2 < _WARN_CHI2 * fit.dof:
-        return ()
-    return (f'the readings differ by {angle:.2g}° from the known orientations: if the placement '
-            'of the sensor is not more accurate, the result has this error; take 12 or more '
-            'poses in other orientations, too, and fit model 10',)
+    if angle >= _WARN_DEGREES and fit.chi2 >= _WARN_CHI2 * fit.dof:
+        yield Finding('placement', f'the readings differ by {angle:.2g}° from the known '
+                      'orientations: if the placement of the sensor is not more accurate, the '
+                      'result has this error', 'take 12 or more poses in other orientations, too, '
+                      'and fit model 10')
 
 
 def _rotation_onto(directions: Floats, known: Floats) -> Floats:

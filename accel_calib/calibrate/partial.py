@@ -54,15 +54,16 @@ from .pose_planning import (
     missing_poses,
     turn_words,
 )
-from .quality import fit_warnings, in_g, quality_of
+from .quality import fit_findings, in_g, quality_of
 from .rest_noise import with_rest_noise
-from .unknown_orientation import copy_warning, only_norm, PRIOR, rejected_by
+from .unknown_orientation import copies, only_norm, PRIOR, rejected_by
 from ..effects import EFFECTS, Model, MODELS, sensor_force, with_vector
 from ..errors import InputError, RefusedFitError
 from ..estimate.equations import variance_factor
 from ..estimate.fit import estimate, Fit, judge, Prior
 from ..estimate.least_squares import NotConvergedError
 from ..estimate.outliers import LARGEST_SHARE, originals
+from ..finding import Finding, without
 from ..geometry import unit
 from ..table import check_units, Floats, Poses
 from ..text import counted
@@ -149,7 +150,7 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
     calibration = Calibration(
         'ideal', PRIOR, Model({}), units, sensor or poses.sensor, 'ros', date, fit.covariance,
         quality, poses, rejected, 'mounting alone: offset and gain are not calibrated',
-        (_not_calibrated(),))
+        (Finding('open', _not_calibrated()),))
     return with_rest_noise(gated(calibration), poses)
 
 
@@ -181,7 +182,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     -------
     Calibration
         The calibration with ΔR = I and the method `PRIOR`. Its covariance includes the prior. The
-        reason states what the poses determine, and a warning what they leave open.
+        reason states what the poses determine, and a finding what they leave open.
 
     Raises
     ------
@@ -208,14 +209,14 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
         tuple(sorted((*rejected, *out), key=lambda each: each.row)), '', ())
     about = carried(calibration)
     calibration = replace(calibration, reason=_known_words(about),
-                          warnings=(_open_words(about), *copy_warning(original, poses_g),
-                                    *partial_warnings(fit)))
+                          noted=(_open(about), *copies(original, poses_g),
+                                 *partial_findings(fit)))
     return with_rest_noise(gated(calibration), poses)
 
 
 def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected, ...]]:
     """Return the plausible poses, without doubtful ones if others are left, and the other rows."""
-    if units.name == 'native':
+    if units.is_native:
         raise InputError(f'the readings are in native units, and {what} does not determine their '
                          'scale; expected readings in m/s2 or g', 'convert the readings, or turn '
                          'the sensor to 9 or more poses spread over the sphere and fit')
@@ -337,13 +338,14 @@ def _log_evidence(fit: Fit, factor: float, prior: Prior) -> float:
     return -((fit.chi2 + deviation) / factor + float(np.linalg.slogdet(spread)[1])) / 2.0
 
 
-def partial_warnings(fit: Fit) -> tuple[str, ...]:
-    """Return the warnings about the noise of the poses."""
-    found = fit_warnings(fit, 0.0)
+def partial_findings(fit: Fit) -> tuple[Finding, ...]:
+    """Return the findings about the noise of the poses."""
+    found = fit_findings(fit, 0.0)
     if fit.dof > 0:
         return found
-    return (f'{counted(len(fit.poses_g), "pose")} cannot show whether poses repeat as well as the '
-            'noise of their samples predicts: take more poses', *found[1:])
+    return (Finding('no_check', f'{counted(len(fit.poses_g), "pose")} cannot show whether poses '
+                    'repeat as well as the noise of their samples predicts', 'take more poses'),
+            *without(found, 'no_check'))
 
 
 @dataclass(frozen=True)
@@ -437,7 +439,7 @@ def carried_words(calibration: Calibration) -> str:
     if not calibration.model.effects:
         return f'mounting alone; {_not_calibrated()}'
     about = carried(calibration)
-    return f'{_known_words(about)}; {_open_words(about)}'
+    return f'{_known_words(about)}; {_open(about).words}'
 
 
 def _known_words(about: Carried) -> str:
@@ -450,15 +452,16 @@ def _known_words(about: Carried) -> str:
             f'{_mg(about.along_g)}, and at each pose |a| to {_mg(about.among_g)}')
 
 
-def _open_words(about: Carried) -> str:
-    """Return a text about what the poses leave open, and the poses that determine it."""
+def _open(about: Carried) -> Finding:
+    """Return what the poses leave open, and the poses that determine it."""
     gains = joined([f'±{100.0 * each:.1f} % on {axis}'
                     for axis, each in zip('xyz', about.gain, strict=True)])
     missing = turn_words(missing_poses(_NAME, about.cone.axis[np.newaxis]))
-    return (f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '
-            f'±{_mg(about.offset_across_g)} ({about.tilt_deg:.1f}° of tilt until it is levelled), '
-            f'gain {gains}, cross-axis ±{100.0 * about.cross_axis:.1f} %; elsewhere on the sphere '
-            f'|a| is known to {_mg(about.elsewhere_g)}; to determine them, {missing}')
+    return Finding(
+        'open', f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '
+        f'±{_mg(about.offset_across_g)} ({about.tilt_deg:.1f}° of tilt until it is levelled), '
+        f'gain {gains}, cross-axis ±{100.0 * about.cross_axis:.1f} %; elsewhere on the sphere '
+        f'|a| is known to {_mg(about.elsewhere_g)}', f'to determine them, {missing}')
 
 
 def _mg(value_g: float) -> str:

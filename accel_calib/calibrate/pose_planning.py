@@ -24,7 +24,7 @@ the smaller models that the poses determine.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -51,6 +51,7 @@ from ..estimate.geometry import (
     rows_of,
     WEAK_DILUTION,
 )
+from ..finding import Finding
 from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats
 from ..text import counted
@@ -398,9 +399,9 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
         f'{turn_words(missing_poses(name, directions, noise))}, hold it still and continue{offer}')
 
 
-def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tuple[str, ...]:
+def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iterator[Finding]:
     """
-    Return a warning if the poses do not determine the largest model.
+    Yield a finding if the poses do not determine the largest model.
 
     Parameters
     ----------
@@ -409,20 +410,15 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> tupl
     directions, noise
         As in `refuse_if_unfit`.
 
-    Returns
-    -------
-    tuple of str
-        One warning, or none.
-
     """
     largest = NORM_MODELS[-1]
-    if chosen not in NORM_MODELS[:-1]:
-        return ()
-    open_ = identifiability(largest, directions, noise).undetermined
-    return (f'the poses do not determine {combination_words(open_)}, so model {chosen} is the '
-            f'largest possible: it omits {joined(left_out(chosen, largest))}, '
-            f'{_commonly(chosen, largest, directions, noise)}; to determine them, '
-            f'{turn_words(missing_poses(largest, directions, noise))}',)
+    if chosen in NORM_MODELS[:-1]:
+        open_ = identifiability(largest, directions, noise).undetermined
+        yield Finding(
+            'undetermined', f'the poses do not determine {combination_words(open_)}, so model '
+            f'{chosen} is the largest possible: it omits {joined(left_out(chosen, largest))}, '
+            f'{_commonly(chosen, largest, directions, noise)}',
+            f'to determine them, {turn_words(missing_poses(largest, directions, noise))}')
 
 
 def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:

@@ -14,6 +14,7 @@ rate of the temperature, for `temperature_rate` and lags.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from ..estimate.equations import noise_of
 from ..estimate.fit import Fit, judge
 from ..estimate.geometry import coverage, WEAK_DILUTION
 from ..estimate.mistakes import Rival, unseen_mistakes
+from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses
 from ..text import listed
@@ -109,7 +111,7 @@ class Verification:
 def in_g(poses: Poses, units: Units) -> Poses:
     """Return the poses with readings, std and reference in g; native references are in g."""
     scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
-    if 'reference' in poses and units.name != 'native':
+    if 'reference' in poses and not units.is_native:
         scaled['reference'] = units.to_g(poses['reference'])
     return poses.with_columns(**scaled)
 
@@ -197,7 +199,7 @@ def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
 
     """
     reading = poses_g.reading
-    if units.name == 'native':
+    if units.is_native:
         reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
     if vectors:
         return np.linalg.norm(reading - poses_g['reference'], axis=1)
@@ -241,17 +243,6 @@ def _largest_percent(errors_g: Floats) -> float:
     return float(np.max(np.abs(errors_g))) * 100.0
 
 
-_NO_DOF = 'there are only as many poses as free parameters'
-_UNCOVERED = 'the poses leave a region of the sphere uncovered'
-_NO_NOISE = 'the poses have no std and count'
-_TOO_LARGE = 'the residuals are'
-
-NOT_LOCATED = 'which row is the outlier is not certain'
-"""Beginning of the warning about poses that may be wrong instead of those left out."""
-
-UNCHECKED = 'the other poses hardly check'
-"""Beginning of the warning about poses whose mistake does not show."""
-
 _UNSEEN_G = 0.01
 """Mistakes of such poses that do not show are reported above this size [g]."""
 
@@ -265,57 +256,63 @@ _LARGE_CHI2 = 4.0
 """chi² per degree of freedom above which a fit warns."""
 
 
-def fit_warnings(fit: Fit, dilution: float) -> tuple[str, ...]:
-    """Return warnings about a fit with this dilution."""
-    warnings = []
+OF_A_FIT = ('no_check', 'uncovered', 'noise_not_known', 'residuals', 'hardly_checked',
+            'outlier_not_certain')
+"""Kinds of findings about one fit, which do not hold for another fit."""
+
+
+def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
+    """Return findings about a fit with this dilution."""
+    found = []
     if fit.dof == 0:
-        warnings.append(f'{_NO_DOF}: the fit cannot be checked; take more poses')
+        found.append(Finding('no_check', 'there are only as many poses as free parameters: the '
+                             'fit cannot be checked', 'take more poses'))
     if dilution > WEAK_DILUTION:
-        warnings.append(f'{_UNCOVERED}: there the error is up to {dilution:.0f} times that of a '
-                        'pose; take the next pose that is suggested')
+        found.append(Finding('uncovered', 'the poses leave a region of the sphere uncovered: '
+                             f'there the error is up to {dilution:.0f} times that of a pose',
+                             'take the next pose that is suggested'))
     if not fit.noise_known:
         known = ('the residuals alone' if fit.dof > 0 else
                  'the noise of a common sensor, 0.5 mg, which may be wrong for this one')
-        warnings.append(f'{_NO_NOISE}: the uncertainty comes from {known}')
+        found.append(Finding('noise_not_known', 'the poses have no std and count: the '
+                             f'uncertainty comes from {known}'))
     elif fit.dof > 0 and fit.chi2 / fit.dof > _LARGE_CHI2:
-        warnings.append(f'{_TOO_LARGE} {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of the '
-                        'pose means: poses repeat worse than the noise of their samples predicts, '
-                        'or the model lacks an effect')
-    return (*warnings, *_unchecked_warning(fit))
+        found.append(Finding(
+            'residuals', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of '
+            'the pose means: poses repeat worse than the noise of their samples predicts, or the '
+            'model lacks an effect'))
+    return (*found, *_hardly_checked(fit))
 
 
-def _unchecked_warning(fit: Fit) -> tuple[str, ...]:
-    """Return a warning about poses whose mistake the other poses do not show, or none."""
+def _hardly_checked(fit: Fit) -> Iterator[Finding]:
+    """Yield a finding about poses whose mistake the other poses do not show."""
     if fit.dof == 0 or fit.prior is not None:
-        return ()
+        return
     unseen = unseen_mistakes(fit)
     rows = fit.poses_g.row[unseen > _UNSEEN_G].tolist()
     if not rows:
-        return ()
+        return
     largest = float(np.max(unseen))
     size = f'a mistake of {largest * MG:.0f} mg' if largest < _WHOLE_G else 'any mistake'
-    return (f'{UNCHECKED} {listed("row", rows[:_MOST_NAMED])}{_and_more(rows)}: {size} would move '
-            'the result and not show; take one more pose in about the same orientation',)
+    yield Finding(
+        'hardly_checked', f'the other poses hardly check {listed("row", rows[:_MOST_NAMED])}'
+        f'{_and_more(rows)}: {size} would move the result and not show',
+        'take one more pose in about the same orientation', 'USABLE', tuple(rows))
 
 
-def rival_warnings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> tuple[str, ...]:
-    """Return a warning about poses that may be wrong instead of those left out, or none."""
+def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator[Finding]:
+    """Yield a finding about poses that may be wrong instead of those left out."""
     if not found:
-        return ()
+        return
     out, instead = (sorted({int(row[index]) for index in indices}) for indices in
                     ([each.left_out for each in found], [each.instead for each in found]))
-    return (f'{NOT_LOCATED}: {listed("row", out)} is left out, but the poses agree about as well '
-            f'without {"one of " if len(instead) > 1 else ""}'
-            f'{listed("row", instead[:_MOST_NAMED])}{_and_more(instead)} instead; the '
-            'uncertainty includes both cases; take these poses again, or take more poses',)
+    yield Finding(
+        'outlier_not_certain', f'which row is the outlier is not certain: {listed("row", out)} is '
+        f'left out, but the poses agree about as well without '
+        f'{"one of " if len(instead) > 1 else ""}{listed("row", instead[:_MOST_NAMED])}'
+        f'{_and_more(instead)} instead; the uncertainty includes both cases',
+        'take these poses again, or take more poses', 'USABLE', (*out, *instead))
 
 
 def _and_more(rows: list[int]) -> str:
     return f' and {len(rows) - _MOST_NAMED} more' if len(rows) > _MOST_NAMED else ''
-
-
-def other_warnings(warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the warnings that do not come from `fit_warnings`."""
-    return tuple(line for line in warnings
-                 if not line.startswith((_NO_DOF, _UNCOVERED, _NO_NOISE, _TOO_LARGE, NOT_LOCATED,
-                                         UNCHECKED)))

@@ -16,7 +16,7 @@ significantly more than noise, by an F test at `_LEVEL` with the moderated varia
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import get_args, Literal
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, Rejected
 from .pose_planning import refuse_if_unfit, unseen
-from .quality import fit_warnings, in_g, quality_of, rival_warnings
+from .quality import fit_findings, in_g, quality_of, rival_findings
 from ..effects import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
@@ -42,6 +42,7 @@ from ..estimate.geometry import (
 from ..estimate.least_squares import NotConvergedError, Point, solve
 from ..estimate.mistakes import covariance_with, Rival, rivals
 from ..estimate.outliers import fit_norm, originals, start_of
+from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses
 from ..text import listed
@@ -83,7 +84,7 @@ def directions_of(poses: Poses, units: Units) -> Floats:
 
     """
     raw = unit(poses.reading)
-    if units.name != 'native' and dilution('4', raw) > WEAK_DILUTION:
+    if not units.is_native and dilution('4', raw) > WEAK_DILUTION:
         return raw
     return unit(poses.reading - fit_4(poses.reading)[1])
 
@@ -107,8 +108,8 @@ class NormFit:
         Indices of the outliers, with their copies.
     directions : (k, 3) array
         Approximate directions of up of the poses kept.
-    warnings : tuple of str
-        Warnings for the user.
+    findings : tuple of Finding
+        What is worth knowing about the fit.
     rivals : tuple of Rival
         Poses that may be wrong instead of those left out.
 
@@ -120,7 +121,7 @@ class NormFit:
     kept: NDArray[np.intp]
     left_out: NDArray[np.intp]
     directions: Floats
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     rivals: tuple[Rival, ...] = ()
 
     @property
@@ -142,12 +143,12 @@ def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -
     quality = quality_of(found.fit, units, found.directions)
     return Calibration(found.name, method, found.fit.model, units, '', 'ros', '',
                        found.covariance, quality, poses, rejected, found.reason,
-                       found.warnings)
+                       found.findings)
 
 
 def own_scale(poses: Poses, units: Units) -> Units:
     """Return native units with the scale estimated from the poses; other units unchanged."""
-    if units.name != 'native':
+    if not units.is_native:
         return units
     if len(poses) < free_parameters('4'):
         refuse_if_unfit('4', np.zeros((len(poses), 3)))
@@ -197,12 +198,12 @@ def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method
     name, reason = ((model, f'model {model} was requested') if model != 'auto'
                     else _choose(fits))
     unlike = _rivals(name, fits[name], kept, np.unique(original), poses_g)
-    warnings = (*copy_warning(original, poses_g), *rival_warnings(unlike, poses_g.row),
-                *fit_warnings(fits[name], dilutions[name]))
+    findings = (*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
+                *fit_findings(fits[name], dilutions[name]))
     if model == 'auto':
-        warnings = (*warnings, *unseen(list(dilutions)[-1], used, noise))
+        findings = (*findings, *unseen(list(dilutions)[-1], used, noise))
     return NormFit(name, reason, fits[name], kept, np.flatnonzero(~np.isin(original, kept)), used,
-                   warnings, unlike)
+                   findings, unlike)
 
 
 def _rivals(name: str, fit: Fit, kept: NDArray[np.intp], distinct: NDArray[np.intp],
@@ -219,9 +220,9 @@ def _rivals(name: str, fit: Fit, kept: NDArray[np.intp], distinct: NDArray[np.in
                                instead=int(distinct[each.instead])) for each in found)
 
 
-def copy_warning(original: NDArray[np.intp], poses: Poses) -> tuple[str, ...]:
+def copies(original: NDArray[np.intp], poses: Poses) -> Iterator[Finding]:
     """
-    Return a warning about the rows that count as one pose, or none.
+    Yield a finding about the rows that count as one pose.
 
     Parameters
     ----------
@@ -232,13 +233,13 @@ def copy_warning(original: NDArray[np.intp], poses: Poses) -> tuple[str, ...]:
 
     """
     first, count = np.unique(original, return_counts=True)
-    groups = [listed('row', poses.row[original == each].tolist())
-              for each in first[count > 1][:_MOST_NAMED]]
-    if not groups:
-        return ()
-    more = int(np.sum(count > 1)) - len(groups)
-    return (f'equal rows count as one pose: {"; ".join(groups)}'
-            f'{f"; and {more} more" if more else ""}',)
+    groups = [poses.row[original == each].tolist() for each in first[count > 1]]
+    if groups:
+        shown = '; '.join(listed('row', rows) for rows in groups[:_MOST_NAMED])
+        more = len(groups) - _MOST_NAMED
+        yield Finding('copies', f'equal rows count as one pose: {shown}'
+                      f'{f"; and {more} more" if more > 0 else ""}',
+                      rows=tuple(row for rows in groups for row in rows))
 
 
 def only_norm(poses_g: Poses) -> Poses:
@@ -352,5 +353,5 @@ def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
         return ()
     away = np.linalg.norm(sensor_force(model, poses_g.reading, {}), axis=1) - 1.0
     return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
-                          'in the fit of the others')
+                          'in the fit of the others', 'outlier')
                  for row, error in zip(poses_g.row, away, strict=True))

@@ -206,7 +206,7 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     """
     weight = _weight(first, second)
     mean = weight * first.mean + (1.0 - weight) * second.mean
-    if units.name != 'native':
+    if not units.is_native:
         chord = float(np.linalg.norm(first.mean - second.mean)) / units.per_g
         mean = mean * (1.0 + 0.5 * weight * (1.0 - weight) * chord**2)
     noise = np.sqrt(weight**2 * first.std**2 / first.count
@@ -230,7 +230,7 @@ def _weight(first: Dwell, second: Dwell) -> float:
 
 
 def _radius(means: Sequence[Floats], units: Units) -> float:
-    if units.name != 'native':
+    if not units.is_native:
         return units.per_g
     return 0.5 * float(np.ptp(np.array(means), axis=0).max()) if means else 0.0
 

@@ -141,7 +141,7 @@ class Rule:
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings = settings
-        self.known = units.name != 'native'
+        self.known = not units.is_native
         self._per_g = units.per_g
         self._lowest = np.full(3, np.inf)
         self._highest = np.full(3, -np.inf)

@@ -1,4 +1,11 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: parse, call, write. Each command is a module; `main` is the entry point."""
+"""
+The command line: parse, call, write. `main` is the entry point.
+
+`commands` lists the commands with their options, and `options` has those of several commands.
+`frame` runs a command, for one input or several. `inputs` makes records from the arguments. The
+other modules have the commands themselves.
+
+"""

@@ -1,66 +1,90 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib compare``: test whether calibrations of one sensor agree."""
+"""``accel-calib verify``, ``compare`` and ``history``: judge stored calibrations."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
+from rich.table import Table
 
-from . import options
-from .terminal import working
-from ..compare import compare, Comparison, LEVEL
-from ..rating import rate_comparison
+from .fit import error_line, rated, short_if_known
+from .frame import Done, plain, table, working
+from .inputs import intake_for, rows_between
+from ..calibrate import verify
+from ..compare import compare, Comparison, History, history_of, LEVEL
+from ..rating import rate_comparison, rate_verification
 from ..stored import read_calibration
+from ..table import check_units
+from ..text import short
 from ..units import MG
 
-_EXAMPLE = ('accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
-            'exit status:\n'
-            '  0: they agree, 1: they do not agree, 2: they cannot be compared')
-
-DISAGREE = 1
+FAILED = 1
+"""Exit status if the residual is above ``--max``, or if calibrations do not agree."""
 
 
-def add_to(made: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    options.add_example(made, _EXAMPLE)
-    made.add_argument('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
-                      help='two or more stored calibrations of one sensor')
-    made.add_argument('--report', type=Path, metavar='FILE', help='page to write (HTML)')
-    options.add_json(made)
-    made.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Compare the calibrations, and print the result."""
+def run_verify(args: argparse.Namespace) -> Done:
+    """Evaluate a calibration on the poses of a log."""
+    found, calibration = intake_for(args, args.poses)
+    poses = rows_between(found.poses, args.rows)
+    check_units(poses, calibration.units)
+    verification = verify(calibration, poses)
+    rating = rate_verification(verification, calibration, poses)
     if args.report is not None:
-        from ..report import check_matplotlib
+        from ..report import write_calibration_page
 
-        check_matplotlib()
-    with options.errors_in_json(args.json):
-        calibrations = [read_calibration(path) for path in args.calibrations]
-        comparison = compare(calibrations)
-    models = [calibration.name for calibration in calibrations]
+        with working('drawing the page'):
+            write_calibration_page(args.report, calibration, rating, str(args.poses),
+                                   verification=(verification, poses),
+                                   stored=str(args.calibration), notes=found.lines)
+    result = {'file': args.poses, 'poses': len(poses), **asdict(verification), **rated(rating),
+              'read_lines': found.lines, 'rating_lines': rating.lines}
+    above = args.max is not None and not verification.rms_after_mg <= args.max
+    return Done(result, several_verify([plain(result)]), FAILED if above else 0)
+
+
+def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
+    """Yield how the logs were read, a row for each, and the ratings."""
+    names = [f'{result["file"]}: ' if len(results) > 1 else '' for result in results]
+    for name, result in zip(names, results, strict=True):
+        for line in (error_line(result),) if 'error' in result else result['read_lines']:
+            yield f'{name}{line}'
+    yield table(
+        'Residual of |force| over these poses [mg]',
+        ('poses', 'before', 'after', 'largest after', 'noise floor'),
+        ((result['file'], short(result['rms_before_mg']), short(result['rms_after_mg']),
+          short(result['max_after_percent'] * 10), short_if_known(result['noise_floor_mg']))
+         for result in results if 'error' not in result))
+    for name, result in zip(names, results, strict=True):
+        for line in result.get('rating_lines', ()):
+            yield f'{name}{line}'
+
+
+def run_compare(args: argparse.Namespace) -> Done:
+    """Test whether calibrations agree."""
+    paths, calibrations = args.calibrations, [read_calibration(path) for path in args.calibrations]
+    comparison = compare(calibrations)
     rating = rate_comparison(comparison)
     if args.report is not None:
         from ..report import write_comparison_page
 
         with working('drawing the page'):
-            write_comparison_page(args.report, comparison, rating, args.calibrations, calibrations)
-    options.write_json(args.json, {**_result(args.calibrations, models, comparison),
-                                   **options.rated(rating)})
-    _show(args, models, comparison)
-    for line in rating.lines:
-        options.console(args).print(line)
-    return 0 if comparison.agree else DISAGREE
+            write_comparison_page(args.report, comparison, rating, paths, calibrations)
+    models = [calibration.name for calibration in calibrations]
+    return Done({**_comparison_result(paths, models, comparison), **rated(rating)},
+                [*_comparison_lines(paths, models, comparison), *rating.lines],
+                0 if comparison.agree else FAILED)
 
 
-def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dict[str, Any]:
+def _comparison_result(paths: list[Path], models: list[str], comparison: Comparison
+                       ) -> dict[str, Any]:
     """Return the result for JSON."""
     outlier = comparison.outlier
     return {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
@@ -68,17 +92,27 @@ def _result(paths: list[Path], models: list[str], comparison: Comparison) -> dic
                      zip(paths, models, comparison.runs, strict=True)]}
 
 
-def _show(args: argparse.Namespace, models: list[str], comparison: Comparison) -> None:
-    """Print the result."""
-    console = options.console(args)
-    console.print(_runs_table(args.calibrations, models, comparison))
-    console.print(_parameters_table(comparison))
+def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
+                      ) -> Iterator[Any]:
+    yield table(
+        'Corrected |a| minus the mean of the others [mg]',
+        ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
+        ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
+          f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
+         enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
+    yield table(
+        'Spread of the parameters over the runs [mg]',
+        ('', 'mean', 'spread', 'stated', 'ratio'),
+        ((one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
+          f'{(one.stated_sd ** 2).mean() ** 0.5 * MG:.3g}',
+          '' if one.ratio is None else f'{one.ratio:.2f}')
+         for one in comparison.parameters if np.any(one.stated_sd)))
     for note in comparison.notes:
-        console.print(f'note: {note}')
+        yield f'note: {note}'
     if comparison.tilt_deg is not None:
-        console.print('the directions of up of levelled calibrations differ by up to '
-                      f'{comparison.tilt_deg:.3g}°; the test does not use them')
-    console.print(_answer(comparison))
+        yield ('the directions of up of levelled calibrations differ by up to '
+               f'{comparison.tilt_deg:.3g}°; the test does not use them')
+    yield _answer(comparison)
 
 
 def _answer(comparison: Comparison) -> str:
@@ -93,33 +127,77 @@ def _answer(comparison: Comparison) -> str:
             'others agree.')
 
 
-def _runs_table(paths: list[Path], models: list[str], comparison: Comparison) -> Any:
-    """Return a table that compares each run with the others."""
-    from rich.table import Table
+def run_history(args: argparse.Namespace) -> Done:
+    """Sort calibrations by date, and compare them."""
+    calibrations = [read_calibration(path) for path in args.calibrations]
+    history = history_of(calibrations)
+    if args.report is not None:
+        from ..report import write_history_page
 
-    table = Table(title='Corrected |a| minus the mean of the others [mg]')
-    table.add_column('run', overflow='fold')
-    for name in ('model', 'RMS', 'expected', 'largest', 'p'):
-        table.add_column(name, justify='right')
-    for number, (path, model, run) in enumerate(zip(paths, models, comparison.runs,
-                                                    strict=True), 1):
-        table.add_row(f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
-                      f'{run.largest_mg:.3g}', f'{run.p_value:.2g}')
-    return table
+        with working('drawing the page'):
+            write_history_page(args.report, history, args.calibrations, calibrations)
+    return Done(_history_result(args.calibrations, history), _history_lines(args, history))
 
 
-def _parameters_table(comparison: Comparison) -> Any:
-    """Return a table of the spread of each parameter."""
-    from rich.table import Table
+def _history_result(paths: Sequence[Path], history: History) -> dict[str, Any]:
+    """Return the result for JSON; runs are numbered from 1, in order of date."""
+    changes = []
+    for number, change in enumerate(history.changes, 1):
+        rating, comparison = rate_comparison(change.comparison), change.comparison
+        changes.append({
+            'from': number, 'to': number + 1, 'agree': comparison.agree,
+            'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
+            'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
+            'change': change.change, 'change_sd': change.sd, 'rating': rating.name,
+            'rating_reason': rating.reason})
+    return {
+        'agree': history.whole.agree, 'p_value': history.whole.p_value,
+        'runs': [{'file': paths[moment.index], 'date': moment.when and moment.when.isoformat(),
+                  'model': moment.model, 'temperature': moment.temperature,
+                  'residual_mg': moment.residual_mg} for moment in history.moments],
+        'parameters': [{'name': each.name, 'values': each.values, 'stated_sd': each.stated_sd}
+                       for each in history.parameters],
+        'changes': changes, 'notes': history.notes}
 
-    table = Table(title='Spread of the parameters over the runs [mg]')
-    table.add_column('')
-    for name in ('mean', 'spread', 'stated', 'ratio'):
-        table.add_column(name, justify='right')
-    for one in comparison.parameters:
-        if not np.any(one.stated_sd):
-            continue  # not in the model
-        stated = float((one.stated_sd ** 2).mean() ** 0.5) * MG
-        table.add_row(one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
-                      f'{stated:.3g}', '' if one.ratio is None else f'{one.ratio:.2f}')
-    return table
+
+def _history_lines(args: argparse.Namespace, history: History) -> Iterator[Any]:
+    yield _dates_table(history)
+    for first, second, change in zip(history.labels, history.labels[1:], history.changes,
+                                     strict=False):
+        yield _step_line(first, second, change)
+    for note in history.notes:
+        yield f'note: {note}'
+    if args.report is not None:
+        yield f'stored in {args.report}'
+
+
+def _step_line(first: str, second: str, change: Any) -> str:
+    """Return one step as a line of text."""
+    from ..report.repeats import change_in_words
+
+    comparison = change.comparison
+    verdict = 'agree' if comparison.agree else 'differ'
+    most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
+    return (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
+            f'{rate_comparison(comparison).name}; largest change: '
+            f'{change.parameter.replace(".", " ")} {most}')
+
+
+def _dates_table(history: History) -> Table:
+    """Return a table of offset and gain, one row per calibration and axis."""
+    from ..report.repeats import GAINS, in_words, OFFSETS
+
+    made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
+    for name in ('date', ''):
+        made.add_column(name, no_wrap=True)
+    for name in ('offset [mg]', 'gain - 1 [%]'):
+        made.add_column(name, no_wrap=True, justify='right')
+    found = {each.name: each for each in history.parameters}
+    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
+        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
+            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
+                     for name in names)
+            made.add_row(begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                for cell in cells))
+    return made

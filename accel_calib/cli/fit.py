@@ -1,173 +1,308 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib fit``: from poses to a calibration."""
+"""``accel-calib fit``, ``calibrate`` and ``fleet``: from logs to calibrations."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from . import options
-from .results import calibration_result, show_calibration
-from .terminal import working
+import numpy as np
+from rich.table import Table
+
+from .frame import console, Done, progress, table, working
+from .inputs import given, intake, log_options, prior, rows_between, settings
 from ..calibrate import (
     Calibration,
     fit_poses,
     fit_with_fleet,
-    FRAMES,
+    GyroBias,
     level_by_rows,
-    METHODS,
-    MODEL_NAMES,
+    Outlook,
     outlook,
 )
+from ..effects import effect_named, LADDER, value_unit
 from ..errors import InputError
+from ..estimate.closed_form import sensing_axes
 from ..intake import Intake
 from ..rating import rate, Rating
 from ..stored import write_calibration
-from ..text import now
+from ..table import Floats, Poses
+from ..text import counted, now, short, with_sd
+from ..units import MG
 
-_EXAMPLE = 'accel-calib fit poses.csv -o calibration.yaml --flat 1'
+if TYPE_CHECKING:
+    from ..fleet import Summary
+    from ..pipeline import Outcome
 
-
-def add_to(made: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    options.add_example(made, _EXAMPLE)
-    made.add_argument('poses', nargs='+', type=Path, metavar='POSES',
-                      help='pose table, or a recording, whose poses are captured first')
-    made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help='calibration to write (YAML); a folder for several POSES')
-    made.add_argument('--report', type=Path, metavar='FILE',
-                      help='page to write (HTML); a folder for several POSES')
-    made.add_argument('--model', choices=MODEL_NAMES, default='auto',
-                      help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: '
-                      'cross-axis; 12: known orientation; auto (default): the smallest that the '
-                      'data support')
-    made.add_argument('--method', choices=METHODS, default='ml',
-                      help='ml (default) weights poses by their noise and leaves out outliers; '
-                      "algebraic minimises the cost functions of AN5286 and the ESGI'95 report, "
-                      'with every row')
-    made.add_argument('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive')
-    made.add_argument('--flat', type=int, metavar='ROW', help='row of a pose with the robot '
-                      'level, 1-based; it determines the mounting')
-    made.add_argument('--nose-down', type=int, metavar='ROW', help='row of a pose with the nose '
-                      'of the robot tilted straight down, by 10° or more; it determines the '
-                      'heading of the mounting (needs --flat)')
-    made.add_argument('--frame', choices=FRAMES, default='ros',
-                      help='levelled frame (default: ros, z up)')
-    options.add_prior(made)
-    made.add_argument('--jobs', type=int, default=1, metavar='N',
-                      help='number of tables to process in parallel')
-    options.add_log(made)
-    options.add_max_dwell(made)
-    options.add_json(made)
-    made.set_defaults(run=run)
+BAD_RATING = 1
+"""Exit status of ``calibrate`` for a calibration that is BAD."""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Fit and store, and print the quality and the rating."""
-    if args.report is not None:
-        from ..report import check_matplotlib
-
-        check_matplotlib()
-    if len(args.poses) == 1:
-        return _run_one(args)
-    results = options.in_parallel(partial(_attempt, args), args.poses, args.jobs)
-    options.write_json(args.json, results)
-    console = options.console(args)
-    for result in results:
-        console.print(f'{result["file"]} {_in_a_line(result)}')
-    return 2 if any('error' in result for result in results) else 0
-
-
-def _run_one(args: argparse.Namespace) -> int:
-    with options.errors_in_json(args.json):
-        fitted = _fit(args, args.poses[0])
-    _store(fitted, args.output, args.report)
-    options.write_json(args.json, _result(args, fitted))
-    _show(args, fitted)
-    return 0
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """A calibration of one log, with its rating."""
-
-    path: Path
-    intake: Intake
-    calibration: Calibration
-    rating: Rating
-
-
-def _fit(args: argparse.Namespace, path: Path) -> _Fitted:
-    """Fit one log with the given options."""
-    intake = options.intake(args, path)
-    poses = intake.poses
+def run_fit(args: argparse.Namespace) -> Done:
+    """Fit and store a calibration."""
+    found = intake(args, args.poses)
     with working('fitting'):
-        chosen = options.rows_between(poses, args.rows)
-        fleet = options.prior(args)
-        if fleet is not None and (args.model not in ('auto', '10') or args.method != 'ml'):
-            raise InputError(f'--prior with --model {args.model} --method {args.method}, expected '
-                             'model 10 by maximum likelihood', 'leave out these options')
-        if fleet is None:
-            calibration = fit_poses(chosen, intake.units, model=args.model, method=args.method,
-                                    sensor=args.sensor, date=now())
-        else:
-            calibration = fit_with_fleet(chosen, intake.units, fleet, sensor=args.sensor,
-                                         date=now())
-        calibration = level_by_rows(calibration, poses, args.frame, args.flat, args.nose_down)
-    return _Fitted(path, intake, calibration, rate(calibration))
-
-
-def _result(args: argparse.Namespace, fitted: _Fitted) -> dict[str, Any]:
-    """Return the result for JSON."""
-    return {'file': fitted.path, **calibration_result(fitted.calibration, args.model),
-            **options.rated(fitted.rating), 'read_lines': fitted.intake.lines}
-
-
-def _attempt(args: argparse.Namespace, path: Path) -> dict[str, Any]:
-    """Fit one of several logs; an error is returned as the result."""
-    def work() -> dict[str, Any]:
-        fitted = _fit(args, path)
-        _store(fitted, args.output and args.output / f'{path.stem}.yaml',
-               args.report and args.report / f'{path.stem}.html')
-        return _result(args, fitted)
-
-    return options.attempted(work, path)
-
-
-def _store(fitted: _Fitted, output: Path | None, report: Path | None) -> None:
-    if output is not None:
-        write_calibration(output, fitted.calibration)
-    if report is not None:
+        calibration = _fit(args, found, rows_between(found.poses, args.rows))
+        calibration = level_by_rows(calibration, found.poses, args.frame, args.flat,
+                                    args.nose_down)
+    rating = rate(calibration)
+    if args.output is not None:
+        write_calibration(args.output, calibration)
+    if args.report is not None:
         from ..report import write_calibration_page
 
         with working('drawing the page'):
-            write_calibration_page(report, fitted.calibration, fitted.rating, str(fitted.path),
-                                   stored=str(output or 'calibration.yaml'),
-                                   notes=fitted.intake.lines)
+            write_calibration_page(args.report, calibration, rating, str(args.poses),
+                                   stored=str(args.output or 'calibration.yaml'),
+                                   notes=found.lines)
+    return Done({'file': args.poses, **calibration_result(calibration, args.model),
+                 **rated(rating), 'read_lines': found.lines},
+                _shown(args, found, calibration, rating))
 
 
-def _in_a_line(result: dict[str, Any]) -> str:
-    if 'error' in result:
-        return f'{result["error"]}; {result["advice"]}'
-    return (f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-            f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}')
+def _fit(args: argparse.Namespace, found: Intake, chosen: Poses) -> Calibration:
+    """Return the calibration of the chosen rows."""
+    fleet = prior(args)
+    if fleet is None:
+        return fit_poses(chosen, found.units, model=args.model, method=args.method,
+                         sensor=args.sensor, date=now())
+    if args.model not in ('auto', '10') or args.method != 'ml':
+        raise InputError(f'--prior with --model {args.model} --method {args.method}, expected '
+                         'model 10 by maximum likelihood', 'leave out these options')
+    return fit_with_fleet(chosen, found.units, fleet, sensor=args.sensor, date=now())
 
 
-def _show(args: argparse.Namespace, fitted: _Fitted) -> None:
-    """Print the result."""
-    console, calibration = options.console(args), fitted.calibration
-    for line in fitted.intake.lines:
-        console.print(line)
-    show_calibration(console, calibration)
-    console.print(f'model {calibration.name}: {calibration.reason}')
-    asked = outlook(calibration, args.model).next_pose
-    console.print(f'next pose: {asked.words}')
+def _shown(args: argparse.Namespace, found: Intake, calibration: Calibration, rating: Rating
+           ) -> Iterator[Any]:
+    yield from found.lines
+    yield from calibration_lines(calibration)
+    yield f'model {calibration.name}: {calibration.reason}'
+    yield f'next pose: {outlook(calibration, args.model).next_pose.words}'
     for path in filter(None, (args.output, args.report)):
-        console.print(f'stored in {path}')
-    for line in fitted.rating.lines:
-        console.print(line)
+        yield f'stored in {path}'
+    yield from rating.lines
+
+
+def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line for each of several results."""
+    for result in results:
+        yield f'{result["file"]} ' + (error_line(result) or (
+            f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+            f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}'))
+
+
+def error_line(result: dict[str, Any]) -> str:
+    """Return the error of one of several inputs; empty if there is none."""
+    return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
+
+
+def rated(rating: Rating) -> dict[str, str]:
+    """Return a rating for JSON."""
+    return {'rating': rating.name, 'rating_reason': rating.reason}
+
+
+def run_calibrate(args: argparse.Namespace) -> Done:
+    """Calibrate, store, and write the page."""
+    from .refine import refinement_result
+    from ..pipeline import calibrated
+
+    found = intake(args, args.log)
+    with working('fitting'):
+        outcome = calibrated(found.poses, found.units, flat=args.flat, nose_down=args.nose_down,
+                             frame=args.frame, sensor=args.sensor, refined=args.refined,
+                             fleet=prior(args))
+    stored = _stored_outcome(args, found, outcome)
+    refinement, rating = outcome.refinement, outcome.rating
+    return Done(
+        {'file': args.log, **calibration_result(outcome.calibration, 'auto'), **rated(rating),
+         'read_lines': found.lines, 'refined': outcome.line,
+         'refinement': None if refinement is None else refinement_result(refinement)},
+        [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
+         *rating.lines], BAD_RATING if rating.name == 'BAD' else 0)
+
+
+def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
+    """Write the calibration, unless it is BAD, and the page; return lines about them."""
+    from ..report import has_matplotlib, write_calibration_page
+
+    if outcome.rating.name != 'BAD' or args.keep_bad:
+        write_calibration(args.output, outcome.calibration)
+        line = f'stored in {args.output}'
+    else:
+        line = 'not stored, because it is BAD; to store it, use --keep-bad'
+    page = args.output.with_suffix('.html')
+    if not has_matplotlib():
+        return [line, f'no page {page}: matplotlib is not installed']
+    with working('drawing the page'):
+        write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
+                               refinement=outcome.refinement, stored=str(args.output),
+                               notes=found.lines)
+    return [line, f'page: {page}']
+
+
+def run_fleet(args: argparse.Namespace) -> Done:
+    """Calibrate many recordings on Dask."""
+    from ..fleet import cluster, Options, recordings, run, STATUS, Store
+
+    with working('looking for recordings'):
+        found = list({each.path: each for each in recordings(args.recordings)}.values())
+    asked = Options(**{**given(Options, args), 'log': log_options(args),
+                       'settings': settings(args), 'exports': tuple(dict.fromkeys(args.export))})
+    with cluster(args.scheduler, args.workers) as client:
+        console(args).print(f'{counted(len(found), "recording")}; dashboard: '
+                            f'{client.dashboard_link}')
+        with progress('recordings') as moved:
+            summary = run(client, found, asked, Store(args.output.absolute()), moved)
+    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
+                 'sensors': summary.sensors}, _summary_lines(summary, args.output))
+
+
+def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
+    """Yield the summary as lines of text."""
+    counts = summary.counts
+    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
+           f'could not be read, {counts["skipped"]} skipped because they are done')
+    for row in summary.sensors:
+        for change in row['changes']:
+            if change['for_good']:
+                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
+                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
+    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
+
+
+def calibration_result(calibration: Calibration, asked: str) -> dict[str, Any]:
+    """Return a calibration for JSON; `asked` is the requested model."""
+    return {
+        'model': calibration.name, 'method': calibration.method,
+        'units': calibration.units.name, 'sensor': calibration.sensor,
+        'frame': calibration.frame, 'offset': calibration.offset, 'gain': calibration.gain,
+        'rotation': calibration.model.rotation, 'offset_sd': calibration.offset_sd,
+        'gain_sd': calibration.gain_sd, 'parameters': calibration.parameters,
+        'covariance': calibration.covariance,
+        'poses_used': len(calibration.poses) - len(calibration.rejected),
+        'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
+        **asdict(calibration.quality), 'reason': calibration.reason,
+        'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
+        **_outlook(outlook(calibration, asked))}
+
+
+def _rest_noise(calibration: Calibration) -> dict[str, Any]:
+    """Return the gyro bias [rad/s] and the noise of a sample for JSON; None if not known."""
+    gyro, noise = calibration.gyro, calibration.noise
+    return {'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
+            'noise_force': noise and _known(noise.force),
+            'noise_rate': noise and _known(noise.rate)}
+
+
+def _known(values: Floats) -> Floats | None:
+    return None if np.isnan(values).all() else values
+
+
+def _gyro_line(gyro: GyroBias) -> str:
+    """Return the gyro bias as a line of text, in °/s."""
+    values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
+        'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
+    slope = ('' if not np.any(gyro.slope) else
+             f' at {gyro.temperature:.1f} °C, changes by '
+             f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
+    return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
+
+
+def _outlook(found: Outlook) -> dict[str, Any]:
+    """Return what the poses determine, and the next pose, for JSON."""
+    seen, asked = found.identifiability, found.next_pose
+    unseen = seen.open_parameters
+    return {
+        'uncertainty_mg': found.uncertainty_mg,
+        'identifiability': {
+            'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
+            'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
+                           for name, deviation in seen.deviations.items()},
+            'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
+                             for open_ in seen.undetermined]},
+        'next_pose': None if asked.direction is None else {
+            'direction': asked.direction, 'words': asked.words}}
+
+
+def _own_names(calibration: Calibration) -> dict[str, Any]:
+    """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
+    if calibration.name == '9':
+        axes = sensing_axes(calibration.gain, calibration.offset)
+        return {'shifts': axes.shifts, 'scales': axes.scales,
+                'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
+    if 'reference' in calibration.poses:
+        return {'matrix': calibration.gain @ calibration.model.rotation,
+                'shift': calibration.offset}
+    return {}
+
+
+def calibration_lines(calibration: Calibration) -> Iterator[Any]:
+    """Yield tables and lines: quality, parameters, poses left out and warnings."""
+    yield _quality_table(calibration)
+    yield _parameter_table(calibration)
+    if calibration.gyro is not None:
+        yield _gyro_line(calibration.gyro)
+    for rejected in calibration.rejected:
+        yield f'left out: row {rejected.row}: {rejected.reason}'
+    for warning in calibration.warnings:
+        yield f'note: {warning}'
+
+
+def _quality_table(calibration: Calibration) -> Table:
+    """Return a table of the residual before and after the fit."""
+    quality = calibration.quality
+    return table('Residual of |force| [mg]', (
+        f'model {calibration.name}, {counted(len(calibration.used_poses), "pose")}', 'before',
+        'after'), (
+        ('RMS', short(quality.rms_before_mg), short(quality.rms_after_mg)),
+        ('largest', short(quality.max_before_percent * MG / 100.0),
+         short(quality.max_after_percent * MG / 100.0)),
+        ('held out', '', short_if_known(quality.held_out_rms_mg)),
+        ('noise floor', '', short_if_known(quality.noise_floor_mg))))
+
+
+def _parameter_table(calibration: Calibration) -> Table:
+    """Return a table of the parameters that the model has, with their standard deviations."""
+    table = Table(title='reading = W ΔR force + V', show_header=False)
+    table.add_column('', no_wrap=True)
+    table.add_column('', no_wrap=True, justify='right')
+    table.add_column('', no_wrap=True)
+    for row in (*_linear_rows(calibration), *_effect_rows(calibration)):
+        table.add_row(*row)
+    return table
+
+
+def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and unit of the entries of V and W that the model has."""
+    name = calibration.units.name
+    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[name]
+    for axis, value, sd in zip('xyz', calibration.offset, calibration.offset_sd, strict=True):
+        yield f'offset {axis}', with_sd(value, sd), unit
+    per_g = 'per g' if name == 'native' else ''
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1)):
+        value, sd = calibration.gain[i, j], calibration.gain_sd[i, j]
+        mirrored = i > j and value == calibration.gain[j, i]
+        if (sd > 0.0 or value) and not mirrored:
+            yield f'gain {"xyz"[i]}{"xyz"[j] if i != j else ""}', with_sd(value, sd), per_g
+
+
+def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and unit of the parameters beyond V and W."""
+    deviations = dict(zip(calibration.parameters, np.sqrt(np.diag(calibration.covariance)),
+                          strict=True))
+    for effect, values in calibration.model.values.items():
+        shown = {} if effect in LADDER else effect_named(effect).shown(values)
+        for own, value in shown.items():
+            unit, scale = value_unit(effect, own)
+            sd = deviations[f'{effect}.{own}']
+            yield f'{effect} {own}', with_sd(value * scale, sd * scale), unit
+
+
+def short_if_known(value: float | None) -> str:
+    """Return a number in three digits, or that it is not known."""
+    return 'not known' if value is None else short(value)

@@ -5,7 +5,7 @@
 """
 The command ``accel-calib``.
 
-Only the module of the requested command is imported, so that ``--help`` does not wait for numpy.
+Only what the requested command needs is imported, so that ``--help`` does not wait for numpy.
 
 """
 
@@ -14,43 +14,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
-from importlib import import_module
 import os
 import re
 import sys
 from typing import NoReturn
 
-from . import targets
+from .commands import add_options, BAD_INPUT, COMMANDS
 from .terminal import in_one_line, use_plain_characters
 from .. import __version__
 from ..errors import AccelCalibError, crash_words, system_error
 
-BAD_INPUT = 2
 INTERRUPTED = 130
-
-COMMANDS = {
-    'demo': 'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
-    'calibrate': 'make a calibration, a page and a verdict from any log',
-    'capture': 'find the still stretches of a recording and write the pose table',
-    'fit': 'fit a calibration to still poses',
-    'verify': 'evaluate a calibration on poses that it was not fitted to',
-    'compare': 'test whether calibrations of one sensor agree within their uncertainties',
-    'history': 'show offset and gain over the dates of calibrations of one sensor',
-    'refine': 'find effects that a calibration lacks, and add them',
-    'fleet': 'calibrate the recordings of many sensors in parallel, on Dask',
-    'apply': 'correct a recording with a calibration',
-    'export': 'write a calibration in the format of a firmware, an autopilot or another tool',
-    'noise': 'find noise density, bias instability and random walk from a long rest',
-    'simulate': 'simulate poses or a recording of a sensor with known effects',
-    'report': 'write a report about effects that a calibration lacks, with figures (HTML)',
-    'watch': 'show the progress of a calibrator node, and which pose is next',
-    'live': 'calibrate on a page in the browser, from a serial port or a recording',
-    'node': 'run the calibrator node',
-    'simulator': 'run the simulated Imu node',
-}
-"""Summary of each command."""
-
-_MODULES = {'node': 'nodes', 'simulator': 'nodes'}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -88,20 +62,13 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> _Parser:
         prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
         'gravity as the reference.')
     top.add_argument('--version', action='version', version=__version__)
-    top.set_defaults(run=lambda args: _help(top))
     commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND')
-    for name, summary in COMMANDS.items():
-        made = commands.add_parser(name, help=summary,
-                                   description=f'{summary[0].upper()}{summary[1:]}.')
+    for name, command in COMMANDS.items():
+        what = command.summary
+        made = commands.add_parser(name, help=what, description=f'{what[0].upper()}{what[1:]}.')
         if name in wanted:
-            import_module(f'.{_MODULES.get(name, name)}', __package__).add_to(made)
-            targets.add_force(made)
+            add_options(made, command)
     return top
-
-
-def _help(top: argparse.ArgumentParser) -> int:
-    top.print_help()
-    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -120,14 +87,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complete()
     own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
     try:
-        args = parser(own[:1]).parse_command(own, own[0] if own else '')
+        top = parser(own[:1])
+        args = top.parse_command(own, own[0] if own else '')
     except KeyboardInterrupt:
         return INTERRUPTED
+    if not args.command:
+        top.print_help()
+        return 0
     args.for_ros = for_ros
     try:
-        if args.command:
-            targets.check(args)
-        status: int = args.run(args)
+        from .frame import run  # imports numpy and rich
+
+        return run(args)
     except AccelCalibError as err:
         return _refuse(args.command, str(err))
     except OSError as err:
@@ -136,7 +107,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as err:  # a defect of this program, which no user should see as a traceback
         return _refuse(args.command, crash_words(err))
-    return status
 
 
 def _complete() -> None:

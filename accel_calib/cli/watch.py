@@ -7,47 +7,73 @@
 A terminal shows a screen that is drawn again, with a bell for each captured pose. Another output,
 such as a pipe or ``ssh HOST COMMAND`` without ``-t``, gets a line for each change.
 
+**Large words.** The sides of the sensor to point up are drawn in letters of 5 rows of pixels, so
+that they can be read from a distance. Two columns of the terminal, or half a row, are one pixel.
+
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+import math
 import os
 import sys
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
-from . import options
-from .terminal import ended, Output
+import numpy as np
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from .frame import Done, Output
+from .terminal import ended
+from ..calibrate.pose_planning import words_of
 from ..errors import InputError, NEEDS_ROS
+from ..units import MG
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-    from rich.live import Live
-
     from ..ros.watch import Show
     from ..session.guidance import Progress
 
-_EXAMPLE = 'accel-calib watch --node left/calibrator'
+GOOD, BAD, NEXT = 'green', 'red', 'bold yellow'
+
+_SCALE = 2.0
+"""Stillness at the end of its bar; the limit is at its middle."""
+
+_WORDS = 30
+"""Width of the words beside the bars, so that the bars keep their length."""
+
+_OTHER_ROWS = 16
+"""Rows of the screen besides the large words."""
+
+_LETTERS = {
+    'A': '.#. #.# ### #.# #.#', 'B': '##. #.# ##. #.# ##.', 'C': '### #.. #.. #.. ###',
+    'E': '### #.. ##. #.. ###', 'F': '### #.. ##. #.. #..', 'G': '### #.. #.# #.# ###',
+    'H': '#.# #.# ### #.# #.#', 'I': '# # # # #', 'K': '#.# #.# ##. #.# #.#',
+    'L': '#.. #.. #.. #.. ###', 'M': '#...# ##.## #.#.# #...# #...#',
+    'N': '#..# ##.# #.## #..# #..#', 'O': '### #.# #.# #.# ###', 'P': '### #.# ### #.. #..',
+    'R': '##. #.# ##. #.# #.#', 'T': '### .#. .#. .#. .#.', ' ': '. . . . .',
+}
+"""Rows of pixels of each letter, from the top."""
 
 
-def add_to(made: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    options.add_example(made, _EXAMPLE)
-    made.epilog = (f'{made.epilog}\n\nCtrl-C ends it; all arguments after --ros-args are passed '
-                   'to ROS')
-    made.add_argument('--node', default='calibrator', metavar='NAME',
-                      help='name of the calibrator node, with its namespace if it has one '
-                      '(default: %(default)s)')
-    made.add_argument('--once', action='store_true', help='print the progress once, and end')
-    made.add_argument('--no-bell', dest='bell', action='store_false',
-                      help='no terminal bell for captured poses')
-    made.set_defaults(run=run)
+class _Row(NamedTuple):
+    """A row of the screen: what it shows, in words, and as the share of a bar (NaN: no bar)."""
+
+    label: str
+    words: str
+    share: float = math.nan
+    style: str = GOOD
+    limit: float = math.nan
 
 
-def run(args: argparse.Namespace) -> int:
-    """Show the progress until the user ends it; return the exit status."""
+def run_watch(args: argparse.Namespace) -> Done:
+    """Show the progress until the user ends it."""
     with ended() as is_over:
         try:
             from ..ros import watch
@@ -64,13 +90,11 @@ def run(args: argparse.Namespace) -> int:
         except BrokenPipeError:
             # The reader of the pipe has ended. Python must not write the rest at its exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+    return Done()
 
 
 def _print(node: str, progress: Progress | None) -> None:
     """Print a progress once."""
-    from .watch_view import screen, state
-
     if progress is None:
         return
     if sys.stdout.isatty():
@@ -82,8 +106,6 @@ def _print(node: str, progress: Progress | None) -> None:
 @contextmanager
 def _output(bell: bool) -> Iterator[Show]:
     """Yield the function that shows the progress."""
-    from rich.live import Live
-
     console = Output()
     if not sys.stdout.isatty() or console.is_dumb_terminal:
         yield _Lines().show
@@ -104,8 +126,6 @@ class _Lines:
 
     def show(self, node: str, progress: Progress | None, problem: str) -> None:
         """Print what has changed."""
-        from .watch_view import changes
-
         if problem != self._problem:
             print(problem or f'messages from {node} arrive again', flush=True)
         if progress is not None:
@@ -132,10 +152,204 @@ class _Screen:
 
     def show(self, node: str, progress: Progress | None, problem: str) -> None:
         """Draw the screen."""
-        from .watch_view import captured, screen
-
         if progress is not None and captured(self._last, progress) and self._bell:
             self._live.console.bell()
         self._last = progress
         self.view = screen(node, progress, problem)
         self._live.update(self.view, refresh=True)
+
+
+def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
+    """
+    Return the screen.
+
+    Parameters
+    ----------
+    node : str
+        Full name of the calibrator.
+    progress : Progress or None
+        Its progress; None before the first message.
+    problem : str, optional
+        Why no messages arrive, and what to do.
+
+    """
+    parts: list[RenderableType] = [Text(problem, style=f'bold {BAD}')] if problem else []
+    if progress is not None:
+        parts += [_table(_rows(progress)), '', *_next(node, progress)]
+    elif not problem:
+        parts.append(Text('waiting for the first message'))
+    return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
+
+
+def state(node: str, progress: Progress) -> Iterator[str]:
+    """Yield the lines of a progress: its rows, the next pose, and the call of ~/fit."""
+    for row in _rows(progress):
+        yield f'{row.label}: {row.words}'
+    yield f'next: {progress.advice or "wait"}'
+    if _sides(progress):
+        yield _direction(progress)
+    if _is_enough(progress):
+        yield fit_call(node)
+
+
+def captured(before: Progress | None, now: Progress) -> bool:
+    """Return whether a pose was captured in between."""
+    return before is not None and now.poses > before.poses
+
+
+def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
+    """Yield a line for each change that the user must know; all is new if `before` is None."""
+    if before is None or (before.poses, before.advice) != (now.poses, now.advice):
+        what = 'captured pose' if captured(before, now) else 'poses:'
+        yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
+               f'next: {now.advice or "wait"}{f": {fit_call(node)}" if _is_enough(now) else ""}')
+    if before is None or before.still != now.still:
+        yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
+
+
+def fit_call(node: str) -> str:
+    """Return the command that calls ~/fit."""
+    return f'ros2 service call {node}/fit std_srvs/srv/Trigger'
+
+
+def _rows(progress: Progress) -> list[_Row]:
+    now, style = progress, GOOD if progress.still else BAD
+    share = now.poses / max(now.poses, now.total, 1)
+    return [
+        _Row('stillness', _stillness(now), now.stillness / _SCALE, style, 1.0 / _SCALE),
+        _Row('dwell', _dwell(now), now.dwell / now.min_dwell, style),
+        _Row('poses', _count(now), share),
+        _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
+        _Row('accuracy', _accuracy(now)), _Row('|a|', _length(now)),
+        *([] if math.isnan(now.temperature) else [
+            _Row('temperature', f'{now.temperature:.1f} °C')])]
+
+
+def _stillness(progress: Progress) -> str:
+    if math.isnan(progress.stillness):
+        return 'no Imu messages yet'
+    digits = 2 if progress.stillness < 10.0 else 0
+    times = f'{progress.stillness:.{digits}f} times the limit'
+    return f'{"still" if progress.still else "moving"}, {times}'
+
+
+def _dwell(progress: Progress) -> str:
+    enough = progress.dwell >= progress.min_dwell
+    return f'{progress.dwell:.1f} s of {progress.min_dwell:g} s{", long enough" if enough else ""}'
+
+
+def _count(progress: Progress) -> str:
+    if progress.poses >= progress.total:
+        return str(progress.poses)
+    return f'{progress.poses} of about {progress.total}'
+
+
+def _accuracy(progress: Progress) -> str:
+    if math.isnan(progress.accuracy):
+        return 'not known'
+    if math.isinf(progress.accuracy):
+        return 'not determined by these poses'
+    return f'{progress.accuracy * MG:.2g} mg expected'
+
+
+def _length(progress: Progress) -> str:
+    if math.isnan(progress.corrected):
+        return 'not known' if math.isnan(progress.length) else f'{progress.length:.4f} g'
+    raw = '' if math.isnan(progress.length) else f'{progress.length:.4f} g, '
+    return f'{raw}corrected {progress.corrected:.4f} g'
+
+
+def _is_enough(progress: Progress) -> bool:
+    """Return whether more poses no longer help, and the fit is not made yet."""
+    return not progress.direction and '~/fit' in progress.advice
+
+
+def _direction(progress: Progress) -> str:
+    return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
+
+
+def _next(node: str, progress: Progress) -> Iterator[RenderableType]:
+    """Yield the next action, in large words if it is a pose or the fit."""
+    sides = _sides(progress)
+    if _is_enough(progress):
+        yield from (_Large('CALL FIT', f'bold {GOOD}'), '')
+    elif sides:
+        yield from (_Large(sides, NEXT), '')
+    yield Text(progress.advice or 'wait', style='bold')
+    if sides:
+        yield Text(_direction(progress), style='dim')
+    if '~/fit' in progress.advice:
+        yield Text(fit_call(node), style='dim')
+
+
+def _sides(progress: Progress) -> str:
+    """Return the sides to point up, such as ``FRONT LEFT``; empty if the advice is another."""
+    if not progress.direction:
+        return ''
+    words = words_of(np.sign(np.round(np.array(progress.direction), 1)))
+    sides = words.removeprefix('the ').rsplit(' ', 1)[0]
+    return sides.upper() if words in progress.advice else ''
+
+
+def _table(rows: Iterable[_Row]) -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0), expand=True)
+    table.add_column(no_wrap=True)
+    table.add_column(ratio=1)
+    table.add_column(no_wrap=True, min_width=_WORDS)
+    for row in rows:
+        bar = '' if math.isnan(row.share) else _Bar(row)
+        table.add_row(Text(row.label), bar, Text(row.words))
+    return table
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """A bar that fills the available width, with a line at the limit."""
+
+    row: _Row
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        full, empty, line = '#-|' if options.ascii_only else '█░┃'
+        width = options.max_width
+        done = round(min(self.row.share, 1.0) * width)
+        text = Text(full * done, style=self.row.style, no_wrap=True)
+        text.append(empty * (width - done), style='dim')
+        if not math.isnan(self.row.limit):
+            at = min(round(self.row.limit * width), width - 1)
+            text = Text.assemble(text[:at], (line, 'bold white'), text[at + 1:], no_wrap=True)
+        yield text
+
+
+@dataclass(frozen=True)
+class _Large:
+    """Words in the largest letters that fit the terminal."""
+
+    words: str
+    style: str
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        rows = _pixels(self.words)
+        wide, half = _two_columns(rows), _half_rows(rows)
+        fitting = [lines for lines in (wide, half) if len(lines[0]) <= options.max_width
+                   and len(lines) <= console.height - _OTHER_ROWS]
+        lines = fitting[0] if fitting and not options.ascii_only else [self.words]
+        yield Text('\n'.join(lines), style=self.style)
+
+
+def _pixels(words: str) -> list[str]:
+    """Return the rows of pixels of words."""
+    letters = [_LETTERS[letter].split() for letter in words]
+    return ['.'.join(parts) for parts in zip(*letters)]
+
+
+def _two_columns(rows: list[str]) -> list[str]:
+    """Return lines with two columns for a pixel."""
+    return [''.join('██' if pixel == '#' else '  ' for pixel in row) for row in rows]
+
+
+def _half_rows(rows: list[str]) -> list[str]:
+    """Return lines with half a row for a pixel."""
+    blocks = {'..': ' ', '#.': '▀', '.#': '▄', '##': '█'}
+    padded = [*rows, '.' * len(rows[0])]
+    return [''.join(blocks[upper + lower] for upper, lower in zip(above, below))
+            for above, below in zip(padded[::2], padded[1::2])]

@@ -91,9 +91,9 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
         raise InputError(f'the calibrations are of the sensors {" and ".join(sensors)}, expected '
                          'one sensor', 'select calibrations of one sensor; if it was only '
                          'renamed, set sensor: in the files to one name')
-    native = [run.units.name == 'native' for run in calibrations]
+    native = [run.units.is_native for run in calibrations]
     if any(native) and not all(native):
-        other = next(run.units.name for run in calibrations if run.units.name != 'native')
+        other = next(run.units.name for run in calibrations if not run.units.is_native)
         raise InputError(f'run {native.index(True) + 1} is in native units and another run in '
                          f'{other}, expected the same unit, because the conversion is not known',
                          'fit all runs from readings in one unit')

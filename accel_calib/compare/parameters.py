@@ -147,9 +147,9 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
 def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
     """Return the factors from readings and forces to the common unit, standard g or native."""
     units = calibration.units
-    if units.name == 'native':
+    if units.is_native:
         return units.per_g / per_g, 1.0
-    scale = units.per_g / STANDARD_GRAVITY if units.name == 'm/s2' else units.per_g
+    scale = units.per_g / STANDARD_GRAVITY if units.is_si else units.per_g
     return scale, scale
 
 

@@ -31,6 +31,7 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 from .catalogue import (
     CARRIERS,
     CHANGES,
+    curve_unit,
     effect_named,
     EFFECTS,
     EMPIRICAL,
@@ -41,6 +42,8 @@ from .catalogue import (
     NOMINAL_SUPPLY,
     PROCESSES,
     REFERENCE_TEMPERATURE,
+    unit_of,
+    value_unit,
     VARIABLES,
     WANDER,
 )
@@ -93,9 +96,9 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'CUBE', 'EFFE
            'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'ONE', 'PROCESSES', 'PRODUCT',
            'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER',
            'WAVE', 'AtContext', 'Context', 'Effect', 'Model', 'ThermalStream',
-           'acting_temperature', 'by_axis', 'check_context', 'correct', 'difference',
-           'effect_named', 'empirical_name', 'empirical_parts', 'fitted_places', 'force_slope',
-           'is_effect', 'length_rows', 'model_with', 'parameter_basis', 'parameter_names',
-           'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force', 'simulate_poses',
-           'simulate_recording', 'times', 'too_large', 'turn_between', 'with_linear_part',
-           'with_vector']
+           'acting_temperature', 'by_axis', 'check_context', 'correct', 'curve_unit',
+           'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'fitted_places',
+           'force_slope', 'is_effect', 'length_rows', 'model_with', 'parameter_basis',
+           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
+           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between',
+           'unit_of', 'value_unit', 'with_linear_part', 'with_vector']

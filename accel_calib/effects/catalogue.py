@@ -43,8 +43,8 @@ from .form import (
     WAVE,
 )
 from .thermal import acting_temperature, rate_at
-from ..table import Floats
-from ..units import STANDARD_GRAVITY
+from ..table import COLUMNS, Floats
+from ..units import MG, STANDARD_GRAVITY
 
 REFERENCE_TEMPERATURE = 25.0
 """Temperature at which the temperature effects are zero [°C], as in data sheets."""
@@ -406,3 +406,35 @@ def effect_named(name: str) -> Effect:
     """Return the effect with this name: from the catalogue, or an empirical curve."""
     found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
     return found or empirical(name)
+
+
+_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
+_WITHOUT_UNIT = ('of_sensor', 'form')
+"""Constants of a shape that select one of two forms."""
+
+
+def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
+    """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
+    effect = effect_named(effect_name)
+    curve = effect_name if effect_name.startswith(f'{EMPIRICAL}-') else ''
+    if value_name not in effect.parameters:
+        return _shape_unit(value_name, curve), 1.0
+    unit = curve_unit(curve) if curve else effect.unit
+    return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
+
+
+def curve_unit(name: str) -> str:
+    """Return the unit of an empirical curve."""
+    return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
+
+
+def _shape_unit(name: str, curve: str) -> str:
+    """Return the unit of a constant of the shape of an effect."""
+    if name in _WITHOUT_UNIT:
+        return ''
+    return unit_of(empirical_parts(curve)[1]) if curve else 's'
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a quantity of the context, with readings in g."""
+    return 'g' if column == 'std' else COLUMNS[column].unit

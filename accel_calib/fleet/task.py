@@ -252,7 +252,7 @@ def _linear(calibration: Calibration) -> Row:
 
 def _for_prior(intake: Intake, found: Calibration) -> Row:
     """Return values and covariance of model 10, if the poses determine it."""
-    if intake.units.name == 'native':
+    if intake.units.is_native:
         return {}
     if found.model.effects != MODELS[_WHOLE_MODEL]:
         try:

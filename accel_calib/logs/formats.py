@@ -33,7 +33,6 @@ READING = ('ax', 'ay', 'az')
 RATE = ('gx', 'gy', 'gz')
 MICRO = 1e-6
 MILLI = 1e-3
-NANO = 1e-9
 DEGREE = 0.017453292519943295
 
 

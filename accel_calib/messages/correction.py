@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 
 def output_scale(calibration: Calibration, gravity: float) -> float:
     """Return m/s² per unit of corrected force; `gravity` is the local gravity [m/s²]."""
-    return 1.0 if calibration.units.name == 'm/s2' else gravity / calibration.force_per_g
+    return 1.0 if calibration.units.is_si else gravity / calibration.force_per_g
 
 
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,

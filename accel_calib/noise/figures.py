@@ -292,7 +292,7 @@ def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
     """Return sensor, axis, factor from g or rad/s, and unit of a row of `Rest.values`."""
     if row > 2:
         return 'gyroscope', 'xyz'[row - 3], 1.0, 'rad/s' if rad_s else 'native'
-    if units.name == 'native':
+    if units.is_native:
         return 'accelerometer', 'xyz'[row], units.per_g, 'native'
     return 'accelerometer', 'xyz'[row], gravity, 'm/s²'
 

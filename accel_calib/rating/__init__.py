@@ -24,8 +24,7 @@ it must not be used. All limits are in `LIMITS`.
 
 from .expected import Expected
 from .limits import GOOD_MG, Limit, LIMITS
-from .shortcomings import RatingName, RATINGS
 from .verdicts import rate, rate_comparison, rate_refinement, rate_verification, Rating
 
-__all__ = ['GOOD_MG', 'LIMITS', 'RATINGS', 'Expected', 'Limit', 'Rating', 'RatingName', 'rate',
-           'rate_comparison', 'rate_refinement', 'rate_verification']
+__all__ = ['GOOD_MG', 'LIMITS', 'Expected', 'Limit', 'Rating', 'rate', 'rate_comparison',
+           'rate_refinement', 'rate_verification']

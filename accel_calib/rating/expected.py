@@ -205,7 +205,7 @@ class Expected:
     @cached_property
     def before_mg(self) -> float | None:
         """Return the error without the calibration, without noise [mg]; None if not known."""
-        if self.calibration.units.name == 'native':
+        if self.calibration.units.is_native:
             return None
         before, noise = self.quality.rms_before_mg, self.noise_mg or 0.0
         return math.sqrt(max(before ** 2 - noise ** 2, 0.0))

@@ -1,14 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rules of the rating of a calibration: its shortcomings, and what removes them."""
+"""The rules of the rating of a calibration: what is found, and what removes it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 import math
-from typing import get_args, Literal, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,157 +25,116 @@ from .limits import (
     TO_CHECK,
     WORST_ERROR,
 )
-from ..calibrate import Calibration, EDITED, FLAT, NOT_LOCATED, UNCHECKED
-from ..calibrate.checks import axes_of, fault_of
+from ..calibrate import Calibration
 from ..calibrate.mounting import flat_direction
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
+from ..finding import Finding, ranked, without
 from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..refine import Refinement
 
-RatingName = Literal['GOOD', 'USABLE', 'BAD']
-RATINGS: tuple[str, ...] = get_args(RatingName)
 
-
-@dataclass(frozen=True)
-class Shortcoming:
-    """A reason for a rating below GOOD, and what removes it."""
-
-    name: RatingName
-    reason: str
-    remedy: str = ''
-
-
-def shortcomings(expected: Expected, refinement: Refinement | None) -> list[Shortcoming]:
-    """Return the shortcomings of a calibration; the most informative of each name is first."""
+def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:
+    """Return what is worth knowing about a calibration, that which decides its rating first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
-    return [*_refused(expected, refinement), *_wrong_axes(expected), *_too_large(expected),
-            *_limited(expected), *_warned(expected, NOT_LOCATED), *_unchecked(expected), *named,
-            *_inexact(expected, error),
-            *_left_out(expected), *_warned(expected, UNCHECKED)]
+    own = [*_refused(expected, refinement), *_too_large(expected), *_limited(expected),
+           *_checked(expected), *named, *_inexact(expected, error), *_left_out(expected)]
+    kinds = {each.kind for each in own}
+    return ranked((*own, *without(expected.calibration.noted, *kinds)))
 
 
-def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Shortcoming]:
+def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield the reason why the gate refuses the calibration, if it is the refined one."""
     if refinement is not None and refinement.refusal and _has(expected, refinement):
         message, advice = refinement.refusal
-        yield Shortcoming('BAD', message, advice)
+        yield Finding('refused', message, advice, 'BAD')
 
 
-def _wrong_axes(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield faults of the wiring that known orientations show, and doubts about the flat pose."""
-    calibration, poses = expected.calibration, expected.calibration.poses
-    check = 'check the wiring, the driver and the signs of ref_x,ref_y,ref_z'
-    mat_q = axes_of(poses.reading, poses['reference']) if 'reference' in poses else None
-    fault = None if mat_q is None else fault_of(mat_q)
-    if mat_q is not None and fault is not None and np.linalg.det(mat_q) < 0.0:
-        if calibration.name == '12':
-            yield Shortcoming('USABLE', f'{fault}; model 12 corrects it', check)
-        else:
-            yield Shortcoming('BAD', f'{fault}; model {calibration.name} does not correct it',
-                              check)
-    elif fault is not None and not calibration.is_levelled and calibration.name != '12':
-        yield Shortcoming('USABLE', f'{fault}, and the mounting is not known', check)
-    if any(line.startswith(FLAT) for line in calibration.warnings):
-        yield Shortcoming('USABLE', 'the flat pose is not near the expected axis: the sensor is '
-                          'mounted another way, or an axis is wrong', 'check the mounting, the '
-                          'wiring and the signs')
-
-
-def _too_large(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if the readings are as good without the calibration."""
+def _too_large(expected: Expected) -> Iterator[Finding]:
+    """Yield a finding if the readings are as good without the calibration."""
     own = expected.own_mg
     before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
     if own > BAD_ERROR.value:
-        yield Shortcoming('BAD', f'the error in new orientations is {mg(own)}, expected at most '
-                          f'{mg(BAD_ERROR.value)}', _remedy(expected))
+        yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
+                      f'{mg(BAD_ERROR.value)}', _remedy(expected), 'BAD')
     elif calibrated and before is not None and own > max(before, MATTERS.value) and (
             not expected.is_partial):
-        name: RatingName = 'BAD' if own > WORST_ERROR.value else 'USABLE'
-        yield Shortcoming(name, f'the error in new orientations is {mg(own)}, and '
-                          f'{mg(before)} without the calibration', _remedy(expected))
+        yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
+                      'without the calibration', _remedy(expected),
+                      'BAD' if own > WORST_ERROR.value else 'USABLE')
 
 
-def _limited(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if the calibration is edited, partial, or only a mounting."""
-    calibration = expected.calibration
-    if EDITED in calibration.warnings:
-        yield Shortcoming('USABLE', EDITED, 'verify it on new poses, or fit again')
-    if not calibration.model.effects:
-        yield Shortcoming('USABLE', 'it is a mounting alone: offset and gain are not calibrated',
-                          _more_poses(expected))
+def _limited(expected: Expected) -> Iterator[Finding]:
+    """Yield a finding if the calibration is partial, or only a mounting."""
+    if not expected.calibration.model.effects:
+        yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
+                      'calibrated', _more_poses(expected), 'USABLE')
     elif expected.is_partial:
-        yield Shortcoming('USABLE', 'the poses lie near one direction: in other orientations the '
-                          f'error is up to {mg(expected.worst_mg)}', _more_poses(expected))
+        yield Finding('partial', 'the poses lie near one direction: in other orientations the '
+                      f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
 
 
-def _warned(expected: Expected, begin: str) -> Iterator[Shortcoming]:
-    """Yield a shortcoming for each warning of the fit with this beginning."""
-    for line in expected.calibration.warnings:
-        if line.startswith(begin):
-            reason, _, remedy = line.rpartition('; ')
-            yield Shortcoming('USABLE', reason, remedy)
-
-
-def _unchecked(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if too few poses check the fit."""
+def _checked(expected: Expected) -> Iterator[Finding]:
+    """Yield findings if too few poses check the fit."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
     if expected.dof == 0:
-        yield Shortcoming('USABLE', 'nothing checks the fit: there are only as many poses as '
-                          'values', _more_poses(expected))
+        yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
+                      _more_poses(expected), 'USABLE')
     elif expected.noise_mg is None and expected.dof < TO_CHECK.value:
-        yield Shortcoming('USABLE', f'only {counted(expected.dof, "pose")} more than values '
-                          'check the fit, and the noise is not known', _more_poses(expected))
+        yield Finding('few_checks', f'only {counted(expected.dof, "pose")} more than values check '
+                      'the fit, and the noise is not known', _more_poses(expected), 'USABLE')
     else:
         yield from _too_few_left(expected)
     open_ = 1.0 - expected.quality.coverage
     if 100.0 * open_ > 100.0 - COVERED.value:
-        yield Shortcoming('USABLE', f'{100.0 * open_:.0f} % of the sphere is far from all poses, '
-                          'and nothing checks the model there', TAKE_ALL_SIDES
-                          if expected.next_pose.direction is None else _more_poses(expected))
+        yield Finding('not_covered', f'{100.0 * open_:.0f} % of the sphere is far from all poses, '
+                      'and nothing checks the model there', TAKE_ALL_SIDES
+                      if expected.next_pose.direction is None else _more_poses(expected),
+                      'USABLE')
     if 'doubtful' in expected.poses and np.any(expected.poses['doubtful']):
         rows = expected.poses.row[expected.poses['doubtful'] > 0.0].tolist()
-        yield Shortcoming('USABLE', f'the sensor may have moved in {listed("row", rows)}',
-                          'take these poses again')
+        yield Finding('doubtful', f'the sensor may have moved in {listed("row", rows)}',
+                      'take these poses again', 'USABLE', tuple(rows))
 
 
-def _too_few_left(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if few poses check the fit after outliers were left out."""
-    out = sum(each.reason.startswith('outlier') for each in expected.calibration.rejected)
-    if out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * out:
-        yield Shortcoming('USABLE', f'{counted(out, "outlier")} left out, and only '
-                          f'{counted(expected.dof, "pose")} more than values check the fit',
-                          _more_poses(expected))
+def _too_few_left(expected: Expected) -> Iterator[Finding]:
+    """Yield a finding if few poses check the fit after outliers were left out."""
+    out = [each.row for each in expected.calibration.rejected if each.kind == 'outlier']
+    if out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * len(out):
+        yield Finding('outliers', f'{counted(len(out), "outlier")} left out, and only '
+                      f'{counted(expected.dof, "pose")} more than values check the fit',
+                      _more_poses(expected), 'USABLE', tuple(out))
 
 
-def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if the poses show what the model does not contain."""
+def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+    """Yield a finding if the poses show what the model does not contain."""
     hidden, noise = expected.hidden_mg, expected.noise_mg
     if noise is None or hidden < MATTERS.value or hidden < noise * math.sqrt(
             HIDDEN.value ** 2 - 1.0):
         return
     begin = f'{mg(hidden)} of the residual are not noise'
     if refinement is None:
-        yield Shortcoming('USABLE', f'{begin}: an effect is missing, or poses moved',
-                          'run refine to find the missing effect')
+        what = f'{begin}: an effect is missing, or poses moved'
+        advice = 'run refine to find the missing effect'
     elif refinement.steps and not _has(expected, refinement):
         names = ', '.join(step.effect for step in refinement.steps)
-        yield Shortcoming('USABLE', f'{begin}: {names} is missing in the model',
-                          refinement.refusal[1] if refinement.refusal else
-                          'use the refined calibration')
+        what = f'{begin}: {names} is missing in the model'
+        advice = refinement.refusal[1] if refinement.refusal else 'use the refined calibration'
     elif any(step.effect == WANDER for step in refinement.steps):
-        yield Shortcoming('USABLE', f'{begin}: the offset changed slowly with time ({WANDER})',
-                          'let the sensor warm up, and take the poses within a few minutes')
+        what = f'{begin}: the offset changed slowly with time ({WANDER})'
+        advice = 'let the sensor warm up, and take the poses within a few minutes'
     else:
-        yield Shortcoming('USABLE', f'{begin}, and no effect explains them', 'check what differs '
-                          'between the poses, clamp the sensor, and take the poses again')
+        what = f'{begin}, and no effect explains them'
+        advice = ('check what differs between the poses, clamp the sensor, and take the poses '
+                  'again')
+    yield Finding('beyond_noise', what, advice, 'USABLE')
 
 
 def _has(expected: Expected, refinement: Refinement) -> bool:
@@ -184,46 +142,47 @@ def _has(expected: Expected, refinement: Refinement) -> bool:
     return expected.calibration.model.effects == refinement.calibration.model.effects
 
 
-def _not_corrected(expected: Expected) -> Iterator[Shortcoming]:
+def _not_corrected(expected: Expected) -> Iterator[Finding]:
     """Yield the effects of the model that a later sample is not corrected for."""
     for name, size in expected.not_corrected:
         if size > MATTERS.value:
             short = 'a curve' if name.startswith(EMPIRICAL) else name
             if 'time' in depends_on(name):
-                yield Shortcoming('USABLE', f'the readings changed with time by {mg(size)} '
-                                  f'({short}), and may change again', 'let the sensor settle, '
-                                  'and take the poses again')
+                yield Finding('settling', f'the readings changed with time by {mg(size)} '
+                              f'({short}), and may change again', 'let the sensor settle, and '
+                              'take the poses again', 'USABLE')
             else:
-                yield Shortcoming('USABLE', f'{short} of {mg(size)} cannot be corrected in '
-                                  'single samples', '')
+                yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected in '
+                              'single samples', level='USABLE')
 
 
-def _inexact(expected: Expected, error: float) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if an error that has no name yet is too large [mg]."""
+def _inexact(expected: Expected, error: float) -> Iterator[Finding]:
+    """Yield a finding if an error that has no name yet is too large [mg]."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
     if error > GOOD_ERROR.value:
         if expected.omitted_mg > max(GOOD_ERROR.value / 2.0, expected.own_mg):
-            yield Shortcoming('USABLE', f'model {expected.omits} omits what these poses do not '
-                              f'determine: the error may be {mg(error)}',
-                              _more_poses(expected))
+            yield Finding('omitted', f'model {expected.omits} omits what these poses do not '
+                          f'determine: the error may be {mg(error)}', _more_poses(expected),
+                          'USABLE')
         else:
-            yield Shortcoming('USABLE', 'the error in new orientations is up to '
-                              f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}',
-                              _remedy(expected))
+            yield Finding('new_orientations', 'the error in new orientations is up to '
+                          f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}',
+                          _remedy(expected), 'USABLE')
     elif expected.worst_mg > WORST_ERROR.value:
-        yield Shortcoming('USABLE', f'the error is up to {mg(expected.worst_mg)} where there is '
-                          f'no pose, expected at most {mg(WORST_ERROR.value)}',
-                          _more_poses(expected))
+        yield Finding('far_from_poses', f'the error is up to {mg(expected.worst_mg)} where there '
+                      f'is no pose, expected at most {mg(WORST_ERROR.value)}',
+                      _more_poses(expected), 'USABLE')
 
 
-def _left_out(expected: Expected) -> Iterator[Shortcoming]:
-    """Yield a shortcoming if many poses were left out."""
+def _left_out(expected: Expected) -> Iterator[Finding]:
+    """Yield a finding if many poses were left out."""
     calibration = expected.calibration
-    count, total = len(calibration.rejected), len(calibration.poses)
-    if total and 100.0 * count > LEFT_OUT.value * total:
-        yield Shortcoming('USABLE', f'{count} of {counted(total, "pose")} were left out',
-                          'hold the sensor still in each pose, and take them again')
+    rows = tuple(each.row for each in calibration.rejected)
+    if rows and 100.0 * len(rows) > LEFT_OUT.value * len(calibration.poses):
+        yield Finding('left_out', f'{len(rows)} of {counted(len(calibration.poses), "pose")} were '
+                      'left out', 'hold the sensor still in each pose, and take them again',
+                      'USABLE', rows)
 
 
 def _more_poses(expected: Expected) -> str:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
@@ -15,15 +15,14 @@ from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
 from .shortcomings import (
     advice_of,
     degrees,
+    findings_of,
     mg,
     number,
-    RatingName,
-    Shortcoming,
-    shortcomings,
     temperature_words,
 )
 from ..calibrate import Calibration, Verification
 from ..estimate.geometry import coverage
+from ..finding import Finding, Level, ranked
 from ..table import Poses
 from ..text import counted
 from ..units import MG
@@ -41,20 +40,23 @@ class Rating:
     Parameters
     ----------
     name : {'GOOD', 'USABLE', 'BAD'}
-        The verdict.
+        The verdict, which is the worst level of the findings.
     reason : str
         Reason, as one sentence without a full stop.
     figures : str
         The figures of the result.
     next : str
         What to do next; may be empty.
+    findings : tuple of Finding
+        What is worth knowing, that which decides the verdict first.
 
     """
 
-    name: RatingName
+    name: Level
     reason: str
     figures: str
     next: str  # noqa: A003, the name of the second line
+    findings: tuple[Finding, ...] = ()
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -68,14 +70,14 @@ class Rating:
         return tuple(f'{label:<{width}}  {text}' for label, text in lines)
 
 
-def _rated(found: list[Shortcoming], good: str, figures: str, advice: str) -> Rating:
-    """Return the rating with the first of the worst shortcomings."""
-    for name in ('BAD', 'USABLE'):
-        own = [each for each in found if each.name == name]
-        if own:
-            remedies = list(dict.fromkeys(each.remedy for each in [own[0], *found] if each.remedy))
-            return Rating(own[0].name, own[0].reason, figures, '; '.join(remedies[:2]))
-    return Rating('GOOD', good, figures, advice)
+def _rated(findings: Iterable[Finding], good: str, figures: str, advice: str) -> Rating:
+    """Return the rating with the most informative of the worst findings."""
+    found = ranked(findings)
+    below = [each for each in found if each.level != 'GOOD']
+    if not below:
+        return Rating('GOOD', good, figures, advice, found)
+    remedies = list(dict.fromkeys(each.advice for each in below if each.advice))
+    return Rating(below[0].level, below[0].text, figures, '; '.join(remedies[:2]), found)
 
 
 def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> Rating:
@@ -98,7 +100,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     expected = Expected(calibration)
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
             f'({degrees(expected.error_mg)} of tilt)')
-    return _rated(shortcomings(expected, refinement), good, _figures(expected),
+    return _rated(findings_of(expected, refinement), good, _figures(expected),
                   advice_of(calibration))
 
 
@@ -146,8 +148,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
     found = [*_on_new_poses(verification, expected, error)]
     covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
-        own = rate(calibration)
-        found += [Shortcoming(own.name, own.reason, own.next)] if own.name != 'GOOD' else []
+        found += rate(calibration).findings
     noise = 'noise not known' if floor is None else f'noise {mg(floor)}'
     figures = (f'{number(verification.rms_before_mg)} -> {mg(verification.rms_after_mg)}, '
                f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}')
@@ -158,30 +159,30 @@ def rate_verification(verification: Verification, calibration: Calibration,
 
 
 def _on_new_poses(verification: Verification, expected: Expected, error: float
-                  ) -> Iterator[Shortcoming]:
-    """Yield the shortcomings that a verification shows."""
+                  ) -> Iterator[Finding]:
+    """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
-    native = expected.calibration.units.name == 'native'
+    native = expected.calibration.units.is_native
     before = _without_noise(verification.rms_before_mg, floor)
     if error > BAD_ERROR.value:
-        yield Shortcoming('BAD', f'the error of these poses is {mg(error)}, expected at most '
-                          f'{mg(BAD_ERROR.value)}', again)
+        yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
+                      f'{mg(BAD_ERROR.value)}', again, 'BAD')
     elif not native and error > max(before, floor or 0.0):
-        yield Shortcoming('BAD' if error > MATTERS.value else 'USABLE', 'the error of these '
-                          f'poses is {mg(error)}, and {mg(before)} without the calibration',
-                          again)
+        yield Finding('no_gain', f'the error of these poses is {mg(error)}, and {mg(before)} '
+                      'without the calibration', again,
+                      'BAD' if error > MATTERS.value else 'USABLE')
     stated = expected.error_mg
     changed = error > max(CHANGED.value * stated, MATTERS.value)
     if changed and rate(expected.calibration).name == 'GOOD':
-        yield Shortcoming('USABLE', f'the error of these poses is {mg(error)}, and the fit '
-                          f'states {mg(stated)}: the sensor has changed', again)
+        yield Finding('changed', f'the error of these poses is {mg(error)}, and the fit states '
+                      f'{mg(stated)}: the sensor has changed', again, 'USABLE')
     elif error > GOOD_ERROR.value:
-        yield Shortcoming('USABLE', f'the error of these poses is {mg(error)}, expected at most '
-                          f'{mg(GOOD_ERROR.value)}', again)
+        yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
+                      f'{mg(GOOD_ERROR.value)}', again, 'USABLE')
     if floor is not None and floor > GOOD_ERROR.value:
-        yield Shortcoming('USABLE', f'the noise of these poses is {mg(floor)}, too large to see '
-                          f'an error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in each '
-                          'pose')
+        yield Finding('noise', f'the noise of these poses is {mg(floor)}, too large to see an '
+                      f'error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in each pose',
+                      'USABLE')
 
 
 def rate_comparison(comparison: Comparison) -> Rating:
@@ -208,19 +209,19 @@ def rate_comparison(comparison: Comparison) -> Rating:
              else f'; run {comparison.outlier + 1} differs from the others')
     if not comparison.agree:
         large = largest.rms_mg > GOOD_ERROR.value
-        found.append(Shortcoming(
-            'BAD' if large else 'USABLE', f'the calibrations differ by {mg(largest.rms_mg)}, '
-            f'which noise does not explain{which}', 'use the latest calibration, or take the '
-            'poses again' if large else 'use the latest calibration'))
+        found.append(Finding(
+            'disagreement', f'the calibrations differ by {mg(largest.rms_mg)}, which noise does '
+            f'not explain{which}', 'use the latest calibration, or take the poses again'
+            if large else 'use the latest calibration', 'BAD' if large else 'USABLE'))
     elif largest.expected_mg > GOOD_ERROR.value:
-        found.append(Shortcoming('USABLE', 'the uncertainty of the differences is '
-                                 f'{mg(largest.expected_mg)}, too large to see a change of '
-                                 f'{mg(GOOD_ERROR.value)}', 'fit them with more poses'))
+        found.append(Finding('noise', 'the uncertainty of the differences is '
+                             f'{mg(largest.expected_mg)}, too large to see a change of '
+                             f'{mg(GOOD_ERROR.value)}', 'fit them with more poses', 'USABLE'))
     tilt = comparison.tilt_deg
     if tilt is not None and tilt > TILT.value:
-        found.append(Shortcoming('USABLE', f'the mountings differ by {tilt:.1f}°',
-                                 'check that the level ground is level, and that the sensor was '
-                                 'not mounted again'))
+        found.append(Finding('mounting', f'the mountings differ by {tilt:.1f}°',
+                             'check that the level ground is level, and that the sensor was not '
+                             'mounted again', 'USABLE'))
     return _rated(found, 'the calibrations agree within their uncertainties', figures,
                   next(iter(comparison.notes), ''))
 

@@ -32,7 +32,6 @@ from ..calibrate import (
     Calibration,
     check_sensor,
     fit_poses,
-    FLAT,
     gated,
     in_g,
     Rejected,
@@ -40,7 +39,7 @@ from ..calibrate import (
 )
 from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
 from ..calibrate.pose_planning import refuse_if_unfit
-from ..calibrate.quality import fit_warnings, other_warnings, quality_of, with_history
+from ..calibrate.quality import fit_findings, OF_A_FIT, quality_of, with_history
 from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, Model, WANDER
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate.closed_form import fit_4
@@ -48,6 +47,7 @@ from ..estimate.equations import variance_factor
 from ..estimate.fit import judge
 from ..estimate.geometry import LARGEST_DILUTION
 from ..estimate.least_squares import NotConvergedError
+from ..finding import Finding, without
 from ..geometry import unit
 from ..table import check_units, Floats, Poses
 from ..text import counted, listed
@@ -73,7 +73,7 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
 def ideal(poses: Poses, units: Units) -> Calibration:
     """Return the ideal sensor; for native readings with a fitted offset and scale."""
     values: dict[str, Floats] = {}
-    if units.name == 'native':
+    if units.is_native:
         mat_w, vec_v = fit_4(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
         values = {'offset': vec_v / units.per_g}
@@ -157,7 +157,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
             f'found {counted(len(sound), "pose")} for '
             f'{counted(found.base.linear.onto.shape[1], "parameter")} of the base, expected more '
             'poses to find an effect', 'take 24 poses or more')
-    note = (sample_words(len(poses_g), total),) if len(poses_g) < total else ()
+    note = (Finding('note', sample_words(len(poses_g), total)),) if len(poses_g) < total else ()
     given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
 
@@ -170,7 +170,7 @@ class _Given:
     poses_g: Poses
     stored: bool
     rejected: tuple[Rejected, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
     @property
     def joint(self) -> bool:
@@ -224,10 +224,11 @@ def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
     force = found.final.model.at(out.columns).force(out.reading)
     away = np.linalg.norm(force, axis=1) - 1.0
     rejected = [Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g in '
-                         'the fit of the others')
+                         'the fit of the others', 'outlier')
                 for row, error in zip(out.row, away, strict=True)]
     if found.clipped is not None:
-        rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor')
+        rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
+                              'clipped')
                      for row in given.poses_g.row[found.clipped.poses]]
     return tuple(sorted((*given.rejected, *(each for each in rejected
                                             if each.row in given.poses.row)),
@@ -382,13 +383,13 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
                       if key not in ('reference', 'orientation')}, kept.row)
     at_poses = judge(model, kept)
     names = ', '.join(name.removesuffix('_change') for name in found.added)
-    warnings = [line for line in other_warnings(base.warnings)
-                if not given.stored or line.startswith(FLAT)]
+    others = without(base.noted, *OF_A_FIT)
+    kept_findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
     refined = replace(
         base, model=Model(model.values, base.model.rotation),
         covariance=matrix @ final.fit.covariance @ matrix.T,
         quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
-        rejected=rejected, warnings=(*given.notes, *warnings), method='ml',
+        rejected=rejected, noted=(*given.notes, *kept_findings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
     try:
         return _determined(gated(with_rest_noise(refined, given.poses)), final)
@@ -397,7 +398,7 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
 
 
 def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration with warnings, or a refusal if the poses do not determine it."""
+    """Return a calibration with findings, or a refusal if the poses do not determine it."""
     fit = final.fit
     if refined.name == 'ideal':  # an offset that was not fitted is not zero
         refuse_if_unfit('4', unit(fit.equations.force))
@@ -412,4 +413,4 @@ def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[
                          f'is up to {dilution:.3g} times that of a pose, expected less than '
                          f'{LARGEST_DILUTION:.0f} times',
                          TAKE_ALL_SIDES)
-    return replace(refined, warnings=(*refined.warnings, *fit_warnings(fit, dilution))), ()
+    return replace(refined, noted=(*refined.noted, *fit_findings(fit, dilution))), ()

@@ -111,10 +111,6 @@ class State:
         share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
         return self.gap_mg(share)
 
-    def with_effects(self, values: dict[str, Floats]) -> State | None:
-        """Return the state with these effects, fitted, or None without a sound fit."""
-        return fitted_state(Model(values), self.poses_g)
-
     def without(self, poses: NDArray[np.intp]) -> State | None:
         """Return the state without these poses, fitted, or None without a sound fit."""
         kept = np.delete(np.arange(len(self.poses_g)), poses)

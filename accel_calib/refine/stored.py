@@ -19,9 +19,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibrate import Calibration, EDITED, in_g
+from ..calibrate import Calibration, in_g
 from ..effects import CHANGES, effect_named, Model, parameter_names
 from ..estimate.fit import estimate, judge
+from ..finding import has
 from ..geometry import unit
 from ..table import COLUMNS, Floats, Poses
 
@@ -57,10 +58,10 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     stored = in_g(calibration.used_poses, calibration.units)
     if not len(stored) or not calibration.model.effects:
         return poses_g
-    shared = _shares(poses_g, stored)
-    if shared and EDITED not in calibration.warnings and _agrees(calibration, poses_g):
+    shared, edited = _shares(poses_g, stored), has(calibration.noted, 'edited')
+    if shared and not edited and _agrees(calibration, poses_g):
         return poses_g
-    if shared or EDITED in calibration.warnings:
+    if shared or edited:
         stored = _as_calibrated(stored, calibration)
     count = (len(poses_g), len(stored))
     columns = {key: _joined(key, poses_g, stored) for key in COLUMNS

@@ -84,7 +84,7 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
 
 def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
     """Return a refined calibration with the fleet included."""
-    values, covariance, warnings = posterior(refined.model.vector, refined.covariance, fleet)
+    values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
     columns = {key: each for key, each in poses_g.columns.items()
                if key not in ('reference', 'orientation')}
@@ -92,7 +92,7 @@ def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibr
     name = f' of model {fleet.model}' if fleet.model else ''
     return with_rest_noise(gated(replace(
         refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
-        method=FLEET, warnings=(*warnings, *refined.warnings),
+        method=FLEET, noted=(*findings, *refined.noted),
         quality=quality_of(fit, refined.units, unit(fit.equations.force)),
         reason=f'{refined.reason}; with the typical values of '
                f'{counted(fleet.sensors, "sensor")}{name}')), refined.poses)

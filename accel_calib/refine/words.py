@@ -28,6 +28,7 @@ from ..effects import (
     parameter_names,
     PROCESSES,
     TO_SEPARATE,
+    value_unit,
     VARIABLES,
     WANDER,
 )
@@ -315,9 +316,6 @@ def _remarks(step: Step) -> list[str]:
 
 
 _LEAST_P = 1e-16
-_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
-_WITHOUT_UNIT = ('of_sensor', 'form')
-"""Constants of a shape that select one of two forms."""
 
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
@@ -373,30 +371,3 @@ def values_of(step: Step) -> list[tuple[str, str]]:
                  else f'{value:.5g} {unit}'.rstrip())
         values.append((name, words))
     return values
-
-
-def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
-    """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
-    effect = effect_named(effect_name)
-    curve = effect_name if effect_name.startswith(f'{EMPIRICAL}-') else ''
-    if value_name not in effect.parameters:
-        return _shape_unit(value_name, curve), 1.0
-    unit = curve_unit(curve) if curve else effect.unit
-    return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
-
-
-def curve_unit(name: str) -> str:
-    """Return the unit of an empirical curve."""
-    return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
-
-
-def _shape_unit(name: str, curve: str) -> str:
-    """Return the unit of a constant of the shape of an effect."""
-    if name in _WITHOUT_UNIT:
-        return ''
-    return unit_of(empirical_parts(curve)[1]) if curve else 's'
-
-
-def unit_of(column: str) -> str:
-    """Return the unit of a quantity of the context, with readings in g."""
-    return 'g' if column == 'std' else COLUMNS[column].unit

@@ -32,8 +32,16 @@ from .residuals import (
     with_thermal,
 )
 from .style import ACCENT, AFTER, BEFORE, Chart, FAINT, INK, new_figure, PAPER, save, styled, THIRD
-from ..effects import AXES, CARRIERS, effect_named, empirical_parts, parameter_names, VARIABLES
-from ..refine.words import base_words, curve_unit
+from ..effects import (
+    AXES,
+    CARRIERS,
+    curve_unit,
+    effect_named,
+    empirical_parts,
+    parameter_names,
+    VARIABLES,
+)
+from ..refine.words import base_words
 from ..table import Floats, Poses
 from ..text import short
 from ..units import MG

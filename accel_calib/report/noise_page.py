@@ -19,7 +19,7 @@ import numpy as np
 
 from .drawings import Drawing
 from .sheet import figures, heading, listing, numbers, paragraph, scroll_table, section, sheet
-from .style import ACCENT, AFTER, Chart, Mark, new_figure, save, styled, THIRD
+from .style import ACCENT, AFTER, Chart, Mark, new_figure, styled, THIRD
 from .. import __version__
 from ..disk import write_atomically
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
@@ -71,16 +71,6 @@ def noise_page(found: NoiseFigures, source: str) -> str:
             section('For Kalibr and VINS', listing(kalibr_lines(found))),
             section('How to read this', listing(_HOW_TO_READ), kind='reading')]
     return sheet(title, body)
-
-
-def write_noise_figures(folder: Path, found: NoiseFigures) -> list[Path]:
-    """Write the figures as PNG, and return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for drawing in noise_drawings(found):
-        paths.append(folder / f'{drawing.name}.png')
-        save(drawing.figure, paths[-1])
-    return paths
 
 
 def noise_drawings(found: NoiseFigures) -> list[Drawing]:

@@ -39,8 +39,8 @@ from .. import __version__
 from ..compare import Comparison, History
 from ..compare.comparison import Parameter
 from ..disk import write_atomically
+from ..effects import value_unit
 from ..rating import rate_comparison
-from ..refine.words import value_unit
 from ..table import Floats
 from ..text import short, with_sd
 from ..units import MG

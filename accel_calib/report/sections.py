@@ -41,12 +41,13 @@ from ..effects import (
     empirical_parts,
     LADDER,
     REFERENCE_TEMPERATURE,
+    value_unit,
     VARIABLES,
     with_vector,
 )
 from ..estimate.geometry import coverage
 from ..refine.records import percent
-from ..refine.words import chance, value_unit, values_of, verdict_words
+from ..refine.words import chance, values_of, verdict_words
 from ..table import Floats
 from ..text import counted, short, with_sd
 from ..units import MG
@@ -158,7 +159,7 @@ def _linear(calibration: Calibration) -> tuple[Floats, Floats]:
 
 def _offsets(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     found, deviation = _linear(calibration)
-    native = calibration.units.name == 'native'
+    native = calibration.units.is_native
     scale, unit = (calibration.units.per_g, 'native') if native else (MG, 'mg')
     for k, axis in enumerate(AXES):
         if deviation[k] or found[k]:
@@ -169,7 +170,7 @@ def _offsets(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
 def _gains(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     """Yield the sensitivities of the axes; one row if they are equal."""
     found, deviation = (part[3:6] for part in _linear(calibration))
-    native, per_g = calibration.units.name == 'native', calibration.units.per_g
+    native, per_g = calibration.units.is_native, calibration.units.per_g
     usual = '' if native else f'±{_USUAL_GAIN_PERCENT:g} %'
     equal = np.ptp(found) < _SAME
     for axis, value, sd in zip(AXES, found, deviation, strict=True):

@@ -302,7 +302,7 @@ def _python(calibration: Calibration, stored: str) -> str:
     known = ''.join(f', {key}={key}' for key in calibration.model.needs if key in COLUMNS
                     and key in ('time', 'temperature', 'supply_voltage', 'rate'))
     unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native units'}[calibration.units.name]
-    force = 'g' if calibration.units.name == 'native' else unit
+    force = 'g' if calibration.units.is_native else unit
     return ('import accel_calib as ac\n\n'
             f'calibration = ac.load({stored!r})\n'
             f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')

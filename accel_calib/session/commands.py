@@ -25,10 +25,8 @@ from .store import Store, writing_advice
 from .work import at_rest, change_words, fit, is_partial, plan_for, refined
 from .worker import Compute, Files, Found, Part, Task
 from ..calibrate import (
-    ARBITRARY_HEADING,
     Calibration,
     carried_words,
-    FLAT,
     level,
     mounting_only,
     set_heading,
@@ -226,8 +224,8 @@ class Commands:
                       ) -> Part[str]:
         """Store and use, or offer, a calibration with a new mounting; return the answer."""
         words = [*words, change_words(self._session.sensor.present, calibration), *(
-            each for each in calibration.warnings
-            if each.startswith(FLAT) or each == ARBITRARY_HEADING)]
+            each.words for each in calibration.noted
+            if each.kind in ('flat_pose', 'heading'))]
         return (yield from self._use(calibration, words, offered=offered))
 
     def _use(self, calibration: Calibration, words: list[str], *, offered: bool = False

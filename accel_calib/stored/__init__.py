@@ -8,7 +8,7 @@ Files of this package: calibrations and what a fleet of sensors has in common.
 
 """
 
-from .calibration_yaml import read_calibration, write_calibration
+from .calibration_yaml import OF_FILE, read_calibration, write_calibration
 from .fleet_yaml import read_prior, write_priors
 
-__all__ = ['read_calibration', 'read_prior', 'write_calibration', 'write_priors']
+__all__ = ['OF_FILE', 'read_calibration', 'read_prior', 'write_calibration', 'write_priors']

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,6 @@ from .plain_yaml import (
 from .. import __version__
 from ..calibrate import (
     Calibration,
-    EDITED,
     FRAMES,
     gated,
     GyroBias,
@@ -48,6 +47,7 @@ from ..calibrate import (
     MODEL_NAMES,
     Quality,
     Rejected,
+    RejectedKind,
     SampleNoise,
     STORED_METHODS,
 )
@@ -62,6 +62,7 @@ from ..errors import (
     StoredCalibrationError,
 )
 from ..estimate.fit import judge
+from ..finding import Finding, KINDS, LEVELS, without
 from ..table import check_values, COLUMNS, Floats, LARGEST, Poses
 from ..units import UNIT_NAMES, Units
 
@@ -72,13 +73,18 @@ except ImportError:
 
 FORMAT = 'accel_calib calibration'
 _FIRST_LINE = f'format: {FORMAT}'
-VERSION = 2
-"""Version 1 had no stream and no checksum, and NaN for an undetermined covariance."""
+VERSION = 3
+"""Version 1 had no stream and no checksum, and NaN for an undetermined covariance; version 2 had
+findings as text, and no kinds of rejected poses."""
 
 _CORRECTION = ('force = transpose(rotation) matrix (reading - offset), plus the effects other '
                'than offset and gain; offset in the unit of the readings')
-OTHER_CORRECTION = 'the correction in the file is not that of its effects; the effects are used'
-"""Warning of a calibration whose file was edited by hand in one of the two."""
+OF_FILE = {
+    'edited': Finding('edited', 'the file was edited by hand since it was stored',
+                      'verify it on new poses, or fit again', 'USABLE'),
+    'correction_in_file': Finding('correction_in_file', 'the correction in the file is not that '
+                                  'of its effects', 'the effects are used')}
+"""Findings about a file that does not match its checksum, which are not stored."""
 
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
 _SAME = 1e-9
@@ -101,7 +107,7 @@ _ABOUT_EFFECT = ('what', 'unit')
 _KEYS: Mapping[str, tuple[str, ...]] = {
     '': ('format', 'version', 'package_version', 'equation', 'sensor', 'stream', 'date', 'units',
          'model', 'method', 'reason', 'effects', 'frame', 'rotation', 'mounting', 'correction',
-         'covariance', 'quality', 'gyro_bias', 'noise', 'rejected', 'warnings', 'poses',
+         'covariance', 'quality', 'gyro_bias', 'noise', 'rejected', 'findings', 'poses',
          'checksum'),
     'units': ('readings', 'per_g'),
     'quality': tuple(each.name for each in fields(Quality)),
@@ -130,8 +136,8 @@ def format_calibration(calibration: Calibration) -> str:
         'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality), **_rest_noise(calibration),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
-        'warnings': [line for line in calibration.warnings
-                     if line not in (EDITED, OTHER_CORRECTION)],
+        'findings': [{**asdict(each), 'rows': list(each.rows)}
+                     for each in without(calibration.noted, *OF_FILE)],
         'poses': {'row': calibration.poses.row.tolist(),
                   **{key: calibration.poses[key].tolist() for key, column in COLUMNS.items()
                      if key in calibration.poses and not column.made}},
@@ -194,7 +200,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     Returns
     -------
     Calibration
-        The calibration, with the warning `EDITED` if the checksum does not match.
+        The calibration, with the finding ``edited`` if the checksum does not match.
 
     Raises
     ------
@@ -219,7 +225,8 @@ def parse_calibration(text: str, name: str) -> Calibration:
         return calibration
     other = _other_correction(content, calibration, name)
     _check_keys(content, name)
-    return replace(calibration, warnings=(*calibration.warnings, EDITED, *other))
+    return replace(calibration, noted=(
+        *calibration.noted, OF_FILE['edited'], *other))
 
 
 def _checked(content: Mapping[str, Any], name: str) -> Calibration:
@@ -248,8 +255,8 @@ def _check_keys(content: Mapping[str, Any], name: str) -> None:
 
 
 def _other_correction(content: Mapping[str, Any], calibration: Calibration, name: str
-                      ) -> tuple[str, ...]:
-    """Return a warning if a file states a correction that is not that of its effects."""
+                      ) -> tuple[Finding, ...]:
+    """Return a finding if a file states a correction that is not that of its effects."""
     if content.get('correction') is None:
         return ()
     try:
@@ -260,7 +267,7 @@ def _other_correction(content: Mapping[str, Any], calibration: Calibration, name
     except (KeyError, TypeError, ValueError) as err:
         raise _damaged(name, f'correction: {err}') from err
     same = all(np.allclose(found, own, rtol=0.0, atol=_SAME * size) for found, own, size in pairs)
-    return () if same else (OTHER_CORRECTION,)
+    return () if same else (OF_FILE['correction_in_file'],)
 
 
 def _damaged(name: str, what: str) -> DamagedCalibrationError:
@@ -297,6 +304,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
               for name, effect in _known_effects(content).items()}
     model = Model(values, array_at(content, 'rotation', (3, 3)))
     size = int(np.sum(model.stated))
+    content = _from_version_2(content)
     units = mapping_at(content, 'units')
     rejected = [mapping_at({'rejected': each}, 'rejected')
                 for each in list_at(content, 'rejected')]
@@ -310,11 +318,12 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(mapping_at(content, 'quality')),
         poses=_poses(mapping_at(content, 'poses')),
-        rejected=tuple(Rejected(whole_at(each, 'row'), text_at(each, 'reason'))
+        rejected=tuple(Rejected(whole_at(each, 'row'), text_at(each, 'reason'),
+                                choice_at(each, 'kind', get_args(RejectedKind)))
                        for each in rejected),
         reason=text_at(content, 'reason'),
-        warnings=tuple(text_at({'warning': line}, 'warning')
-                       for line in list_at(content, 'warnings')),
+        noted=tuple(_finding(mapping_at({'finding': each}, 'finding'))
+                    for each in list_at(content, 'findings')),
         gyro=_gyro_bias(content), noise=_sample_noise(content))
     return _from_version_1(calibration) if content['version'] == 1 else calibration
 
@@ -327,6 +336,26 @@ def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
             raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
                              f'{", ".join(effect.values)}')
     return np.array([number_at(known, part, LARGEST) for part in effect.values])
+
+
+def _finding(stated: Mapping[str, Any]) -> Finding:
+    """Return a finding of a file."""
+    rows = array_at(stated, 'rows', (len(list_at(stated, 'rows')),)).astype(int).tolist()
+    return Finding(choice_at(stated, 'kind', KINDS), text_at(stated, 'text'),
+                   text_at(stated, 'advice'), choice_at(stated, 'level', LEVELS), tuple(rows))
+
+
+def _from_version_2(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the content of a file with records in place of the texts of earlier versions."""
+    if 'findings' in content:
+        return content
+    texts = [text_at({'warning': each}, 'warning') for each in list_at(content, 'warnings')]
+    rejected = [mapping_at({'rejected': each}, 'rejected')
+                for each in list_at(content, 'rejected')]
+    return {**content, 'findings': [{**asdict(Finding('note', text)), 'rows': []}
+                                    for text in texts],
+            'rejected': [{**each, 'kind': 'outlier' if text_at(each, 'reason')[:7] == 'outlier'
+                          else 'implausible'} for each in rejected]}
 
 
 def _from_version_1(calibration: Calibration) -> Calibration:

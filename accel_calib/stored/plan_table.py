@@ -6,13 +6,11 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 from typing import TextIO
 
-from ..disk import check_regular, write_atomically
-from ..errors import InputError
-from ..refine import PlannedPose, PosePlan
+from ..disk import write_atomically
+from ..refine import PosePlan
 from ..units import STANDARD_GRAVITY
 
 _CONTEXT = {'temperature': 'temperature', 'supply_voltage': 'supply_voltage', 'std': 'vibration',
@@ -46,44 +44,3 @@ def write_plan(path: Path, plan: PosePlan) -> None:
                              ' / '.join(pose.separates), f'{pose.expected:.4f}'])
 
     write_atomically(path, write)
-
-
-def read_plan(path: Path) -> tuple[PlannedPose, ...]:
-    """
-    Return the poses of a plan.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, or a value is not a finite number.
-    OSError
-        If the file cannot be read.
-
-    """
-    check_regular(path)
-    lines = [line for line in path.read_text(encoding='utf-8').splitlines()
-             if line.strip() and not line.startswith('#')]
-    reader = csv.DictReader(lines)
-    missing = [name for name in _FIELDS if name not in (reader.fieldnames or ())]
-    if missing:
-        raise InputError(f'{path} lacks the columns {", ".join(missing)}, expected a plan',
-                         'use a file that accel-calib refine --plan has written')
-    return tuple(_pose(path, row) for row in reader)
-
-
-def _pose(path: Path, row: dict[str, str]) -> PlannedPose:
-    """Return the pose of one row."""
-    def number(name: str) -> float:
-        try:
-            value = float(row[name])
-        except (TypeError, ValueError):
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(f'{path}: pose {row["pose"]} has {name} {row[name]!r}, expected a '
-                             'finite number', 'correct the value, or write the plan again')
-        return value
-
-    context = {key: number(name) / _SCALE.get(key, 1.0) for key, name in _CONTEXT.items()
-               if row[name]}
-    return PlannedPose((number('up_x'), number('up_y'), number('up_z')), row['attitude'], context,
-                       tuple(row['separates'].split(' / ')), number('expected_probability'))

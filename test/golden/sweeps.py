@@ -36,6 +36,7 @@ from accel_calib.estimate import (
     Prior,
     variance_factor,
 )
+from accel_calib.finding import Finding, LEVELS
 from accel_calib.rating import Expected, LIMITS, rate
 from accel_calib.table import check_units, numbered, Poses
 from accel_calib.units import units_of
@@ -45,9 +46,9 @@ from inside import (
     axes_of,
     change,
     distinct,
+    doubts_about_flat,
     equations,
     fault_of,
-    flat_warnings,
     is_over,
     missing_poses,
     Model,
@@ -212,7 +213,8 @@ def mountings() -> Any:
     def flat(frame: Any, k: int) -> Any:
         found = level(made, made.predict(ups[k:k + 1])[0], frame)
         nose = made.predict(unit(ups[k:k + 1] + np.array([0.3, -0.4, 0.5])))[0]
-        return [mounting(ups[k], frame), found.warnings, flat_warnings(found.rotation, frame),
+        doubts = [*doubts_about_flat(found.rotation, frame)]
+        return [mounting(ups[k], frame), found.noted, doubts,
                 attempt(lambda: set_heading(found, nose).rotation)]
 
     def near(degrees: float) -> Any:
@@ -310,7 +312,7 @@ def gates() -> Any:
         passed = attempt(gated, calibration)
         given = passed if isinstance(passed, Calibration) else calibration
         expected, verdict = Expected(given), rate(given)
-        return [passed if isinstance(passed, Exception) else passed.warnings, verdict.name,
+        return [passed if isinstance(passed, Exception) else passed.noted, verdict.name,
                 verdict.reason, verdict.next, expected.error_mg, expected.few, expected.dof]
 
     def valued(name: str, size: float) -> Any:
@@ -323,7 +325,7 @@ def gates() -> Any:
 
     def rejected(count: int) -> Any:
         return told(replace(made, rejected=tuple(
-            Rejected(k + 1, 'outlier: far') for k in range(count))))
+            Rejected(k + 1, 'outlier: far', 'outlier') for k in range(count))))
 
     return [
         _grid(valued, ('offset', 'axis_gain'), (-1.5, -0.7, -0.6, 0.3, 0.99, 1.01, 1.2, 1.3)),
@@ -339,10 +341,8 @@ def gates() -> Any:
         _grid(measured, ('coverage',), (0.5, 0.84, 0.86), (False,)),
         _grid(measured, ('rms_before_mg',), (0.1, 0.5, 2.0), (True, False)),
         _grid(rejected, (1, 2, 4, 5, 9, 11)), LIMITS,
-        [told(replace(made, warnings=(line,))) for line in (
-            'the file was edited by hand since it was stored', 'the flat pose reads -1 g',
-            'which row is the outlier is not certain: row 2; take more',
-            'the other poses hardly check row 1: any mistake; take one more')],
+        [told(replace(made, noted=(Finding(kind, 'what', 'advice', level),)))
+         for level in LEVELS for kind in ('edited', 'flat_pose', 'hardly_checked')],
         told(replace(made, poses=made.poses.with_columns(doubtful=(K[:20] % 7 == 3) * 1.0))),
         [attempt(gated, replace(made, model=Model(values, turn))).__class__.__name__ for turn in (
             np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.00001, np.eye(3) * (1.0 + 1e-8))]]
@@ -359,7 +359,7 @@ def rated_effects() -> Any:
         covariance = np.eye(len(model.vector)) * 1e-8
         covariance[:9, :9] = made.covariance
         whole = replace(made, model=model, covariance=covariance, poses=poses)
-        return [attempt(lambda: gated(whole).warnings), attempt(
+        return [attempt(lambda: gated(whole).noted), attempt(
             lambda: [rate(whole), of_expected(Expected(whole)), whole.ranges])]
 
     def wild(units: Any, scale: float, zero: float) -> Any:

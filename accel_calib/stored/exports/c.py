@@ -238,7 +238,7 @@ def identifier(text: str) -> str:
 
 
 def _text(header: Header, calibration: Calibration, name: str, use: Sequence[str]) -> str:
-    unit = 'm/s^2' if calibration.units.name == 'm/s2' else 'g'
+    unit = 'm/s^2' if calibration.units.is_si else 'g'
     temperature = 'temperature, ' if header.of_temperature else ''
     comment = ['Calibration of an accelerometer, written by accel-calib export.', '',
                *about(calibration), '',

@@ -258,8 +258,8 @@ def make_betaflight(calibration: Calibration, options: Options) -> Made:
 
     """
     signs, per_g = _signs(options), _counts_per_g(calibration, options)
-    factor = (1.0 if calibration.units.name == 'native' else
-              per_g / (STANDARD_GRAVITY if calibration.units.name == 'm/s2' else 1.0))
+    factor = (1.0 if calibration.units.is_native else
+              per_g / (STANDARD_GRAVITY if calibration.units.is_si else 1.0))
     grid = steady_grid(calibration)
     mean = np.mean(grid.reading * factor - grid.force * per_g, axis=0)
     counts = np.round(mean * signs)
@@ -280,7 +280,7 @@ def _counts_per_g(calibration: Calibration, options: Options) -> float:
     """Return the counts per g of the firmware: those asked for, or a power of two near them."""
     if options.counts_per_g is not None:
         return options.counts_per_g
-    if calibration.units.name != 'native':
+    if not calibration.units.is_native:
         return _COUNTS_PER_G
     return float(2.0 ** np.round(np.log2(calibration.units.per_g)))
 

@@ -349,7 +349,7 @@ def in_metric(calibration: Calibration, label: str) -> Calibration:
         If the readings are native.
 
     """
-    if calibration.units.name == 'native':
+    if calibration.units.is_native:
         raise InputError(f'the calibration is for native readings, but {label} corrects readings '
                          'in m/s2', f'fit a calibration to the readings that {label} logs in m/s2')
     return calibration.in_units('m/s2')

@@ -90,7 +90,7 @@ def _rounded(value: float) -> float:
 
 def make_imucal(calibration: Calibration, options: Options) -> Made:
     """Return the JSON file of imucal: FerrarisCalibrationInfo."""
-    native = calibration.units.name == 'native'
+    native = calibration.units.is_native
     matrix, constant, correct = _affine(calibration, STANDARD_GRAVITY if native else 1.0)
     gain = np.linalg.inv(matrix)
     sizes = np.linalg.norm(gain, axis=1)
@@ -225,7 +225,7 @@ def make_vins(calibration: Calibration, options: Options, noise: Noise | None) -
     root = float(np.sqrt(figures['update_rate']))
     rows = [('acc_n', NOISE_KEYS[0], 'm/s^2'), ('gyr_n', NOISE_KEYS[2], 'rad/s'),
             ('acc_w', NOISE_KEYS[1], 'm/s^3'), ('gyr_w', NOISE_KEYS[3], 'rad/s^2')]
-    gravity = (calibration.units.per_g if calibration.units.name == 'm/s2' else STANDARD_GRAVITY)
+    gravity = (calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY)
     lines = [*_comment(calibration), f'# source: {VINS_URL}',
              '# VINS does not correct offset and gain: correct readings with accel-calib first.',
              f'# noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)',

@@ -1,0 +1,389 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The commands, with the options of each.
+
+The choices of an option are imported with the options of the requested command, so that
+``--help`` does not wait for numpy.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+import re
+from typing import NamedTuple
+
+from . import options
+
+BAD_INPUT = 2
+"""Exit status for invalid input."""
+
+
+class Command(NamedTuple):
+    """
+    A command.
+
+    Parameters
+    ----------
+    summary : str
+        What it does.
+    module : str
+        Module in this folder with the function ``run_NAME``.
+    example : str
+        End of the help; its first line is an example.
+    options : function
+        Adds its options to a parser.
+    writes : str
+        Kind of the file that ``-o`` names; empty for any.
+    about : str
+        Argument that an error in JSON is about; empty for none.
+
+    """
+
+    summary: str
+    module: str
+    example: str
+    options: Callable[[options.Parser], None]
+    writes: str = ''
+    about: str = ''
+
+
+def add_options(made: options.Parser, command: Command) -> None:
+    """Add the options and the example of a command to its parser."""
+    made.epilog = f'example:\n  {command.example}'
+    made.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.options(made)
+    if {action.dest for action in made._actions} & {'output', 'json'}:
+        options.share(made, '--force')
+
+
+def _flat(text: str) -> int | str:
+    if text in ('first', 'last'):
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text}: expected a row, first or last') from None
+
+
+def _regex(text: str) -> str:
+    try:
+        re.compile(text)
+    except re.error as err:
+        raise argparse.ArgumentTypeError(f'{text}: {err}, expected a regular expression') from None
+    return text
+
+
+def _port(text: str) -> int:
+    port = int(text)
+    if not 0 <= port <= 65535:
+        raise argparse.ArgumentTypeError(f'{text}: expected a number from 0 to 65535')
+    return port
+
+
+def _fit(made: options.Parser) -> None:
+    from ..calibrate import METHODS, MODEL_NAMES
+
+    add = made.add_argument
+    options.add_poses(made)
+    options.add_outputs(made, 'calibration')
+    add('--model', choices=MODEL_NAMES, default='auto', help='4: offset, gain; 7: gain by axis; '
+        '9: angles of the axes; 10: cross-axis; 12: known orientation; auto (default): the '
+        'smallest that the data support')
+    add('--method', choices=METHODS, default='ml', help='ml (default) weights poses by their '
+        'noise and leaves out outliers; algebraic minimises the cost functions of AN5286 and the '
+        "ESGI'95 report, with every row")
+    add('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, 1-based; it '
+        'determines the mounting')
+    options.add_mounting(made)
+    options.share(made, '--prior', '--sensor-model')
+
+
+def _calibrate(made: options.Parser) -> None:
+    add = made.add_argument
+    add('log', type=Path, metavar='LOG', help='recording or pose table: CSV in any dialect, '
+        'rosbag2, .mcap, .db3, ROS 1 .bag, PX4 .ulg, ArduPilot .bin')
+    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+        help='calibration to write (default: %(default)s); the page has the same name with .html')
+    add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
+        'or first or last; it determines the mounting')
+    options.add_mounting(made)
+    add('--keep-bad', action='store_true', help='store a calibration that is BAD, too')
+    options.share(made, '--prior', '--sensor-model', '--no-refine', '--max-dwell', '--json')
+    options.add_log(made)
+
+
+def _verify(made: options.Parser) -> None:
+    options.add_poses(made)
+    options.add_stored(made, required=True)
+    made.add_argument('--max', type=options.positive, metavar='MG', help='largest '
+                      'residual (RMS) of the corrected poses [mg]; exit status 1 above it')
+    options.add_page(made, 'page to write (HTML); a folder for several POSES')
+    options.share(made, '--jobs', '--json')
+
+
+def _refine(made: options.Parser) -> None:
+    options.add_poses(made)
+    options.add_base(made)
+    options.add_outputs(made, 'refined calibration', 'report')
+    made.add_argument('--plan', type=Path, metavar='FILE', help='poses to take next, which '
+                      'separate the named effects from their rivals (CSV); not written if there '
+                      'is nothing to separate; a folder for several POSES')
+
+
+def _report(made: options.Parser) -> None:
+    add = made.add_argument
+    options.add_poses(made, None)
+    options.add_base(made)
+    add('-o', '--output', type=Path, required=True, metavar='FILE', help='report to write (HTML)')
+    add('--figures', type=Path, metavar='FOLDER', help='folder for the figures as SVG and PNG')
+
+
+def _compare(made: options.Parser) -> None:
+    made.add_argument('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
+                      help='two or more stored calibrations of one sensor, in any order')
+    options.add_page(made)
+    options.share(made, '--json')
+
+
+def _capture(made: options.Parser) -> None:
+    from ..capture import CaptureSettings, REPEATED
+
+    made.add_argument('recording', type=Path, metavar='RECORDING', help='CSV in any dialect, '
+                      'rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or ArduPilot .bin')
+    made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
+                      help='pose table to write')
+    options.add_fields(made, CaptureSettings, {
+        'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
+        'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still '
+                          'sensor, in the unit of ax (default: adapts to the noise of the '
+                          'sensor)'},
+        'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
+                           'checked)'},
+        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
+        'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
+        'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'},
+        'repeated': {'choices': REPEATED, 'help': 'keep, merge or refuse repeated poses (default: '
+                     'keep)'}})
+    options.add_log(made)
+    options.share(made, '--max-dwell', '--json')
+
+
+def _apply(made: options.Parser) -> None:
+    made.add_argument('recording', type=Path, metavar='RECORDING',
+                      help='any log: CSV, rosbag2 folder, .mcap, .db3, ROS 1 .bag, …')
+    options.add_stored(made, required=True)
+    made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
+                      help='CSV table or bag to write, of the same kind as the recording')
+    made.add_argument('--no-rotate', action='store_true', help='correct offset and gain alone, '
+                      'and stay in the frame of the sensor; otherwise a levelled calibration '
+                      'turns everything in a message, and its frame_id ends with _levelled')
+    options.add_log(made)
+
+
+def _export(made: options.Parser) -> None:
+    from ..stored.exports import FORMATS, Options
+
+    made.epilog = '\n'.join([f'{made.epilog}\nformats:', *(
+        f'  {name:<11}{each.what}' for name, each in FORMATS.items())])
+    made.add_argument('calibration', type=Path, metavar='CALIBRATION', help='stored calibration')
+    made.add_argument('--to', required=True, choices=tuple(FORMATS), metavar='FORMAT',
+                      help='format, see below')
+    made.add_argument('-o', '--output', metavar='FILE', help='file to write; - for standard '
+                      'output (default: beside the calibration, named after it)')
+    made.add_argument('--noise', type=Path, metavar='FILE', help='kalibr, vins: result of '
+                      'accel-calib noise --json')
+    options.add_fields(made, Options, {
+        'name': {'help': 'c, arduino: first part of the names in the header (default: from the '
+                 'name of the calibration)'},
+        'instance': {'metavar': 'N', 'help': 'px4, ardupilot: number of the accelerometer '
+                     '(default: px4 0, ardupilot 1)'},
+        'device_id': {'metavar': 'ID', 'help': 'px4, ardupilot: device id of the accelerometer'},
+        'axes': {'choices': ('same', 'flu'), 'help': 'px4, ardupilot, betaflight: axes of the '
+                 'readings; same: of the flight controller; flu: x forward, y left, z up, for '
+                 'readings from ROS (default: %(default)s)'},
+        'counts_per_g': {'metavar': 'COUNTS', 'help': 'betaflight: acc_1G of the driver (default: '
+                         '2048, or the power of two nearest to the native units)'}})
+    options.share(made, '--json')
+
+
+def _noise(made: options.Parser) -> None:
+    made.add_argument('recording', type=Path, metavar='RECORDING',
+                      help='recording with a long rest: any log, or a bag')
+    options.add_stored(made, 'stored calibration to apply first, for readings in counts or volts')
+    options.add_page(made, 'page to write with the Allan deviation and the figures (HTML)')
+    options.add_log(made)
+    options.share(made, '--json')
+
+
+def _simulate(made: options.Parser) -> None:
+    from ..logs import LogOptions
+
+    add = made.add_argument
+    add('-o', '--output', type=Path, required=True, metavar='OUT', help='CSV table to write')
+    add('--effect', action='append', default=[], metavar='NAME=VALUE,...', help='effect of the '
+        'catalogue with its values, in g (offset), g/g (gains), g/g2 (quadratic), ...; one value '
+        'is used for all axes; can be repeated')
+    add('--recording', action='store_true', help='write samples of a sensor that is turned, '
+        'instead of pose means')
+    for name, kind, default, metavar, about in (
+            ('poses', int, 24, 'N', 'number of poses'),
+            ('noise', float, 0.003, 'G', 'standard deviation of a sample [g]'),
+            ('samples', int, 100, 'N', 'samples per pose'),
+            ('rate', options.positive, 100.0, 'HZ', 'samples per second of a recording'),
+            ('dwell', options.positive, 3.0, 'S', 'duration of each rest of a recording'),
+            ('turn', options.positive, 1.0, 'S', 'duration of each turn of a recording'),
+            ('seed', int, 0, None, 'seed of the noise')):
+        made.add_argument(f'--{name}', type=kind, default=default, metavar=metavar,
+                          help=f'{about} (default: {default:g})')
+    add('--temperature', type=float, nargs=2, default=(), metavar=('FIRST', 'LAST'), help='first '
+        'and last temperature [degC]')
+    add('--mounting', type=float, nargs=3, default=(0.0, 0.0, 0.0),
+        metavar=('ROLL', 'PITCH', 'YAW'), help='attitude of the sensor on the robot [deg]; the '
+        'first pose is flat')
+    add('--reference', action='store_true', help='write the true force, too (known orientation)')
+    options.add_fields(made, LogOptions, options.units('m/s2'))
+
+
+def _fleet(made: options.Parser) -> None:
+    from ..stored.exports import CALIBRATION_ALONE
+
+    add = made.add_argument
+    add('recordings', nargs='+', metavar='RECORDINGS', help='recordings, pose tables, folders, '
+        'globs in quotes, lists (@list.txt), or addresses such as s3://bucket/folder')
+    add('-o', '--output', type=Path, required=True, metavar='FOLDER', help='folder of the '
+        'results; all workers must see it')
+    add('--scheduler', default='', metavar='ADDRESS', help='address of a Dask scheduler (default: '
+        'a cluster on this machine)')
+    add('--workers', type=int, metavar='N', help='workers on this machine (default: one per core)')
+    add('--sensor-from', type=_regex, default='', metavar='REGEX', help='take the name of the '
+        'sensor from the path: the groups, or the whole match (default: the folder and the name '
+        'in the file)')
+    add('--model-from', type=_regex, default='', metavar='REGEX', help='take the model of the '
+        'sensor from its name')
+    made.add_argument('--export', action='append', default=[], choices=CALIBRATION_ALONE,
+                      metavar='FORMAT', help='write each calibration in this format, too; can be '
+                      f'repeated: {", ".join(CALIBRATION_ALONE)}')
+    options.add_log(made)
+    options.share(made, '--no-refine', '--max-dwell', '--json')
+
+
+HIDDEN = {
+    'temperature': 'offset_temperature=4e-4,-3e-4,5e-4',
+    'temperature-lag': 'offset_temperature=8e-4,-6e-4,1e-3,12,0',
+    'gain-temperature': 'gain_temperature=5e-4,-4e-4,6e-4',
+    'quadratic': 'quadratic=0.004,-0.003,0.005'}
+"""What the sensor can hide, as effects of the simulator. The lag is that of the die, 12 s."""
+
+
+def _demo(made: options.Parser) -> None:
+    from ..session import WEB_PORT
+
+    made.add_argument('--hidden', choices=HIDDEN, help='let the sensor hide this effect, and show '
+                      'that ~/refine finds it and that the corrected topic gets better')
+    made.add_argument('--web', action='store_true', help='calibrate on the live page instead, '
+                      f'at port {WEB_PORT}, until Ctrl-C')
+    options.share(made, '--json')
+
+
+def _watch(made: options.Parser) -> None:
+    add = made.add_argument
+    add('--node', default='calibrator', metavar='NAME', help='name of the calibrator node, with '
+        'its namespace if it has one (default: %(default)s)')
+    add('--once', action='store_true', help='print the progress once, and end')
+    add('--no-bell', dest='bell', action='store_false', help='no terminal bell for captured poses')
+
+
+def _live(made: options.Parser) -> None:
+    from ..session import WEB_PORT
+
+    add = made.add_argument
+    add('source', metavar='LOG-OR-PORT', help='recording to play in real time; or serial port '
+        'that sends one line for each sample, such as t,ax,ay,az')
+    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+        help='calibration to continue and to store (default: %(default)s)')
+    add('--port', type=_port, default=WEB_PORT, help='port of the page; 0: any free port '
+        '(default: %(default)s)')
+    add('--host', default='127.0.0.1', metavar='ADDRESS', help='address at which the page is '
+        'served; 0.0.0.0: to the whole network, without encryption (default: %(default)s)')
+    add('--baud', type=int, default=115200, help='baud rate of the serial port (default: '
+        '%(default)s)')
+    add('--speed', type=options.positive, default=1.0, help='speed of a recording, relative to '
+        'real time (default: %(default)s)')
+    options.add_log(made)
+
+
+def _none(made: options.Parser) -> None:
+    """Add no options."""
+
+
+_FOR_ROS = 'all arguments after --ros-args are passed to ROS'
+
+COMMANDS = {
+    'demo': Command(
+        'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
+        'nodes', 'accel-calib demo --hidden temperature', _demo),
+    'calibrate': Command(
+        'make a calibration, a page and a verdict from any log', 'fit',
+        'accel-calib calibrate log.csv --flat last', _calibrate, 'calibration', 'log'),
+    'capture': Command(
+        'find the still stretches of a recording and write the pose table', 'recordings',
+        'accel-calib capture recording.mcap -o poses.csv', _capture, 'table'),
+    'fit': Command(
+        'fit a calibration to still poses', 'fit',
+        'accel-calib fit poses.csv -o calibration.yaml --flat 1', _fit, 'calibration'),
+    'verify': Command(
+        'evaluate a calibration on poses that it was not fitted to', 'compare',
+        'accel-calib verify other_log.csv -c calibration.yaml --max 5\n'
+        'exit status:\n  0: within --max, 1: above --max, 2: bad input', _verify),
+    'compare': Command(
+        'test whether calibrations of one sensor agree within their uncertainties', 'compare',
+        'accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
+        'exit status:\n  0: they agree, 1: they do not agree, 2: they cannot be compared',
+        _compare),
+    'history': Command(
+        'show offset and gain over the dates of calibrations of one sensor', 'compare',
+        'accel-calib history january.yaml april.yaml july.yaml --report history.html', _compare),
+    'refine': Command(
+        'find effects that a calibration lacks, and add them', 'refine',
+        'accel-calib refine poses.csv -o refined.yaml --report report.html', _refine,
+        'calibration', 'poses'),
+    'fleet': Command(
+        'calibrate the recordings of many sensors in parallel, on Dask', 'fit',
+        'accel-calib fleet recordings/ -o results/\n'
+        "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786",
+        _fleet),
+    'apply': Command(
+        'correct a recording with a calibration', 'recordings',
+        'accel-calib apply recording.mcap -c calibration.yaml -o corrected', _apply, 'table'),
+    'export': Command(
+        'write a calibration in the format of a firmware, an autopilot or another tool', 'export',
+        'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
+    'noise': Command(
+        'find noise density, bias instability and random walk from a long rest', 'recordings',
+        'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
+    'simulate': Command(
+        'simulate poses or a recording of a sensor with known effects', 'recordings',
+        'accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
+        '--effect axis_gain=0.01', _simulate, 'table'),
+    'report': Command(
+        'write a report about effects that a calibration lacks, with figures (HTML)', 'refine',
+        'accel-calib report poses.csv -o report.html --figures figures', _report, 'page'),
+    'watch': Command(
+        'show the progress of a calibrator node, and which pose is next', 'watch',
+        f'accel-calib watch --node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', _watch),
+    'live': Command(
+        'calibrate on a page in the browser, from a serial port or a recording', 'nodes',
+        'accel-calib live /dev/ttyUSB0 --baud 115200 -o calibration.yaml\n\n'
+        'open the link that it prints in a browser; Ctrl-C ends it', _live, 'calibration'),
+    'node': Command(
+        'run the calibrator node', 'nodes',
+        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}', _none),
+    'simulator': Command(
+        'run the simulated Imu node', 'nodes',
+        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}', _none),
+}

@@ -1,0 +1,114 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Findings: kinds, levels and rows decide, and no text does."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import accel_calib as ac
+from accel_calib.calibrate import Calibration, fit_poses, level
+from accel_calib.finding import Finding, KINDS, ranked, without
+from accel_calib.rating import rate, Rating
+from accel_calib.refine import refine
+from accel_calib.table import Poses
+from accel_calib.units import units_of
+from inside import format_calibration, parse_calibration
+import numpy as np
+import pytest
+from shared import random_directions
+
+G = units_of('g')
+COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],
+          'cross_axis': [0.006, -0.004, 0.005]}
+
+
+def poses_of(count: int = 24, **options: Any) -> Poses:
+    up = random_directions(count, np.random.default_rng(4))
+    return ac.simulate(COMMON, directions=up, units='g', **options)
+
+
+def with_(poses: Poses, row: int, factor: float) -> Poses:
+    reading = poses.reading.copy()
+    reading[row] *= factor
+    return poses.with_columns(reading=reading)
+
+
+def upside_down() -> Calibration:
+    made = fit_poses(poses_of(), G)
+    return level(made, made.predict(np.array([[0.0, 0.0, -1.0]]))[0], 'ros')
+
+
+def mirrored() -> Calibration:
+    poses = poses_of(reference=True)
+    return fit_poses(poses.with_columns(reading=poses.reading * [1.0, -1.0, 1.0]), G, model='10')
+
+
+def edited() -> Calibration:
+    text = format_calibration(fit_poses(poses_of(), G))
+    return parse_calibration(text.replace("sensor: ''", 'sensor: other'), 'x.yaml')
+
+
+def refined() -> Calibration:
+    stored = replace(edited(), sensor='')
+    warm = np.linspace(15.0, 35.0, 24)
+    return refine(poses_of(temperature=warm), G, base=stored).calibration
+
+
+RESULTS: dict[str, Callable[[], Calibration]] = {
+    'clean': lambda: fit_poses(poses_of(), G),
+    'few': lambda: fit_poses(poses_of(10), G, model='10'),
+    'one_side': lambda: fit_poses(poses_of(12), G, model='7'),
+    'without_noise': lambda: fit_poses(Poses({'reading': poses_of(12).reading},
+                                             np.arange(1, 13)), G),
+    'a_knock': lambda: fit_poses(with_(poses_of(11), 5, 1.03), G, model='10'),
+    'a_large_residual': lambda: fit_poses(
+        poses_of().with_columns(std=np.full((24, 3), 1e-6)), G, model='4'),
+    'upside_down': upside_down, 'mirrored': mirrored, 'edited': edited, 'refined': refined}
+
+
+def figures(calibration: Calibration) -> tuple[Any, ...]:
+    rating: Rating = rate(calibration)
+    return (rating.name, [(each.kind, each.level, each.rows) for each in rating.findings],
+            [each.kind for each in calibration.noted], calibration.name,
+            calibration.model.vector.tolist(), [each.row for each in calibration.rejected])
+
+
+@pytest.mark.parametrize('name', RESULTS)
+def test_no_result_depends_on_a_text(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected, checked = figures(RESULTS[name]()), Finding.__post_init__
+
+    def reword(self: Finding) -> None:
+        checked(self)
+        object.__setattr__(self, 'text', 'reworded')
+        object.__setattr__(self, 'advice', 'reworded')
+
+    monkeypatch.setattr(Finding, '__post_init__', reword)
+    made = RESULTS[name]()
+    told = without(rate(made).findings, 'edited', 'heading')  # constants
+    assert {each.text for each in told} <= {'reworded'}
+    assert figures(made) == expected
+
+
+def test_the_cases_have_many_kinds_of_findings() -> None:
+    kinds = {each.kind for make in RESULTS.values() for each in rate(make()).findings}
+    assert len(kinds) >= 8, kinds
+
+
+def test_the_verdict_is_the_level_of_the_first_finding() -> None:
+    found = rate(RESULTS['mirrored']())
+    assert found.name == 'BAD'
+    assert (found.findings[0].level, found.findings[0].text) == ('BAD', found.reason)
+
+
+def test_findings_are_ranked_by_level_and_then_by_kind() -> None:
+    note, usable = Finding(KINDS[0], 'a'), Finding(KINDS[5], 'b', level='USABLE')
+    other, bad = Finding(KINDS[3], 'c', level='USABLE'), Finding(KINDS[-1], 'd', level='BAD')
+    assert ranked([note, usable, other, bad]) == (bad, other, usable, note)
+    assert without([note, bad], KINDS[0]) == (bad,)
+
+
+def test_a_kind_that_is_not_listed_is_refused() -> None:
+    with pytest.raises(ValueError, match="'surprise'"):
+        Finding('surprise', 'what')
