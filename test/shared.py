@@ -1,13 +1,14 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: real recordings, a simulated sensor, and the command line."""
+"""Helpers of several tests: recordings, a sensor, the command line, and tasks of a session."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 from accel_calib.geometry import unit
+from accel_calib.session import Step, Task
 from accel_calib.table import Floats
 from inside import main, Model, model_with
 import numpy as np
@@ -48,3 +49,23 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
     """Run a command, and return the exit status and the JSON on standard output."""
     status = run(*arguments, '--json', '-')
     return status, json.loads(capsys.readouterr().out)
+
+
+def result(step: Step) -> Any:
+    """Return the result of a step, computed in this process."""
+    return step.run(lambda function, *given: function(*given))
+
+
+def answer_of(task: Task) -> Any:
+    """Run a task of a session at once, and return its answer."""
+    try:
+        step = next(task)
+        while True:
+            try:
+                found = result(step)
+            except Exception as error:
+                step = task.throw(error)
+            else:
+                step = task.send(found)
+    except StopIteration as end:
+        return end.value

@@ -18,7 +18,6 @@ from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
-    ActiveCalibration,
     dwells_of,
     fitted,
     LiveCapture,
@@ -26,6 +25,7 @@ from inside import (
     plan_for,
     PoseBook,
     rest_after,
+    Sensor,
     simulate_poses,
     simulate_recording,
     spread_directions,
@@ -180,63 +180,63 @@ def test_a_next_pose_is_asked_for_with_any_number_of_poses(unit: Any, count: int
 
 def test_drift_is_that_of_the_rests_since_the_calibration(stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
-    active = ActiveCalibration(GRAVITY)
-    assert active.drift is None
-    active.adopt(calibration)
+    sensor = Sensor(CalibratorSettings(), UNITS)
+    assert sensor.drift is None
+    sensor.adopt(calibration)
     for k, direction in enumerate(spread_directions(5)):
         reading = calibration.predict((direction * GRAVITY * 1.01)[None])[0]
         rest = dwell(10.0 * k, reading / GRAVITY)
-        active.update(rest, 0.001)
-        active.end(rest, 0.001)
-    assert active.residual == pytest.approx(0.01, abs=1e-6)
-    assert active.drift.error == pytest.approx(0.01, abs=1e-6)
-    active.adopt(calibration)
-    assert active.drift.count == 0
-    assert active.residual == pytest.approx(0.01, abs=1e-6)
+        sensor.update(rest, 0.001)
+        sensor.end(rest, 0.001)
+    assert sensor.residual == pytest.approx(0.01, abs=1e-6)
+    assert sensor.drift.error == pytest.approx(0.01, abs=1e-6)
+    sensor.adopt(calibration)
+    assert sensor.drift.count == 0
+    assert sensor.residual == pytest.approx(0.01, abs=1e-6)
 
 
 def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
         stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
-    active = ActiveCalibration(GRAVITY)
-    active.adopt(calibration)
+    sensor = Sensor(CalibratorSettings(), UNITS)
+    sensor.adopt(calibration)
 
     def rest(time: float, off: float) -> Dwell:
         reading = calibration.predict(np.array([[0.0, 0.0, (1.0 + off) * GRAVITY]]))[0]
         return dwell(time, reading / GRAVITY)
 
     for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
-        active.update(rest(time, off), 0.001)
-        active.end(rest(time, off), 0.001)
-        assert active.drift is not None
-        assert active.drift.change is None
-    active.update(rest(50.0, 0.005), 0.001)
-    assert active.drift.change is not None
-    active.update(rest(50.0, 0.0), 0.001)
-    assert active.drift.change is None
-    active.end(rest(50.0, 0.005), 0.001)
-    assert active.drift.change is not None
-    assert active.drift.count == 6
+        sensor.update(rest(time, off), 0.001)
+        sensor.end(rest(time, off), 0.001)
+        assert sensor.drift is not None
+        assert sensor.drift.change is None
+    sensor.update(rest(50.0, 0.005), 0.001)
+    assert sensor.drift.change is not None
+    sensor.update(rest(50.0, 0.0), 0.001)
+    assert sensor.drift.change is None
+    sensor.end(rest(50.0, 0.005), 0.001)
+    assert sensor.drift.change is not None
+    assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
-    active.adopt(level(calibration, flat, 'ros'))
-    assert active.drift.change is not None
-    active.adopt(None)
-    assert active.drift is None
+    sensor.adopt(level(calibration, flat, 'ros'))
+    assert sensor.drift.change is not None
+    sensor.adopt(None)
+    assert sensor.drift is None
 
 
 def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(
         stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
-    active = ActiveCalibration(GRAVITY)
-    active.adopt(calibration)
+    sensor = Sensor(CalibratorSettings(), UNITS)
+    sensor.adopt(calibration)
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
-    active.update(early, 0.001)
-    active.update(late, 0.001)
-    active.end(early, 0.001)
-    assert active.drift is not None
-    assert active.drift.count == 2
-    active.end(late, 0.001)
-    assert active.drift.count == 2
+    sensor.update(early, 0.001)
+    sensor.update(late, 0.001)
+    sensor.end(early, 0.001)
+    assert sensor.drift is not None
+    assert sensor.drift.count == 2
+    sensor.end(late, 0.001)
+    assert sensor.drift.count == 2
 
 
 def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
@@ -259,8 +259,8 @@ def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
 def test_robot_that_stands_for_hours_is_monitored_all_the_time(
         stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
-    active, live = ActiveCalibration(GRAVITY), LiveCapture(CaptureSettings(), UNITS)
-    active.adopt(calibration)
+    sensor, live = Sensor(CalibratorSettings(), UNITS), LiveCapture(CaptureSettings(), UNITS)
+    sensor.adopt(calibration)
     rng = np.random.default_rng(1)
     counts, left_at = [], 0.0
     base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
@@ -271,10 +271,10 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(
         readings[:, 2] += shift
         for change in push_all(live, readings, start=time[0], rate=4.0, capture=False, block=40):
             if change.rest is not None:
-                active.update(change.rest, 0.001)
-        if active.drift is not None and active.drift.change is not None:
+                sensor.update(change.rest, 0.001)
+        if sensor.drift is not None and sensor.drift.change is not None:
             left_at = left_at or time[0]
-        counts.append(0 if active.drift is None else active.drift.count)
+        counts.append(0 if sensor.drift is None else sensor.drift.count)
     assert max(counts) >= 5  # long rests are compared in parts of 5 minutes
     assert 1000.0 < left_at < 1800.0
 

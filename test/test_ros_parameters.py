@@ -5,18 +5,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
-from inside import capture_settings, changed, yaml_lines
+from inside import capture_settings, changed, default_of, expected
 from inside_ros import SimulatorSettings
 import pytest
 import yaml
 
 CONFIG = Path(__file__).parent.parent / 'config' / 'calibrator.yaml'
+SETTINGS = [CalibratorSettings, SimulatorSettings]
+WIDTH = 99
+COMMENT = '    # '
+
+
+def yaml_lines(settings: type[Any]) -> Iterator[str]:
+    """Yield the lines of a parameter file with all defaults, for any node name."""
+    yield '# Parameters of the calibrator with their defaults; generated from'
+    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
+    yield '/**:'
+    yield '  ros__parameters:'
+    for each in fields(settings):
+        live = ' *' if each.metadata['live'] else ''
+        words = f"{each.metadata['words']} ({expected(each)}){live}"
+        yield from wrap(words, WIDTH, initial_indent=COMMENT, subsequent_indent=COMMENT)
+        yield f'    {each.name}: {yaml_value(default_of(each))}'
+
+
+def yaml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value)
 
 
 def test_parameter_file_is_the_table() -> None:

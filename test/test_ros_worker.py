@@ -16,7 +16,7 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.logs import write_table
-from accel_calib.session import CalibratorSettings, Job, Log
+from accel_calib.session import CalibratorSettings, Files, Log, Task
 from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import fitted, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
@@ -53,22 +53,27 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
     worker = Worker(in_executor(node), on_events, pytest.fail)
     services = Services(node, worker, logged.append)
 
-    def finish(found: str) -> str:
+    def fit() -> Task:
+        found = yield Files(work)
         threads.add(threading.current_thread())
         return found
 
-    def refuse(found: str) -> str:
+    def load() -> Task:
+        yield Files()
         raise InputError('no such thing', 'try another')
 
-    def work(compute: Any) -> str:
+    def save() -> Task:
+        yield from ()
+        return 'at once'
+
+    def work() -> str:
         before, ends = ticks[0], time.monotonic() + 60.0
         while ticks[0] < before + TICKS and time.monotonic() < ends:
             time.sleep(0.01)
         return f'{min(ticks[0] - before, TICKS)} ticks'
 
-    services.serve('fit', lambda: Job(work, finish))
-    services.serve('load', lambda: Job(lambda compute: 'read', refuse))
-    services.serve('save', lambda: 'at once')
+    for command in (fit, load, save):
+        services.serve(command.__name__, command)
     node.create_timer(0.005, lambda: ticks.__setitem__(0, ticks[0] + 1))
     executor = make_executor(context)
     executor.add_node(node)

@@ -11,15 +11,17 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
-from accel_calib.session import Job, Mounting
+from accel_calib.session import Mounting
 from accel_calib.stored import read_calibration
 from inside import main, spread_directions
 import pytest
+from shared import result
 from test_session import Driver
 
 pytestmark = pytest.mark.usefixtures('home')
@@ -106,7 +108,7 @@ def test_node_uses_a_stored_calibration_only_for_its_sensor(
     before = path.read_bytes()
     driver = Driver(sensor=stated, calibration_file=str(path) if given else '')
     driver.feed(readings([[0, 0, 1]])[:30])
-    used = driver.session.active.calibration is not None
+    used = driver.session.sensor.calibration is not None
     assert used is (owner in ('', stated or 'imu_link'))
     if not used:
         assert repr(owner) in driver.finding('calibration').words
@@ -117,15 +119,14 @@ def test_a_fit_that_ends_after_another_sensor_took_over_is_not_used_for_it(
         readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(12)))
-    job = driver.session.commands.fit()
-    assert isinstance(job, Job)
-    found = job.run(lambda function, *given: function(*given))
+    task = driver.session.commands.fit()
+    found = result(next(task))
     driver.now += 3.0
     driver.feed(readings([[0, 0, 1]])[:30], 'other')
     with pytest.raises(AccelCalibError, match='call ~/fit again'):
-        job.finish(found)
-    assert driver.session.sensor == 'other'
-    assert driver.session.active.calibration is None
+        task.send(found)
+    assert driver.session.name == 'other'
+    assert driver.session.sensor.calibration is None
 
 
 @pytest.mark.parametrize('name', ['undo', 'load', 'reset'])
@@ -135,15 +136,15 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     turned = readings(spread_directions(12))
     driver.feed(turned)
     driver.done(driver.session.commands.fit())
-    job = getattr(driver.session.commands, name)()
-    found = job.run(lambda function, *given: function(*given))
+    task = getattr(driver.session.commands, name)()
+    found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
-    poses = len(driver.session.live.book.poses())
+    poses = len(driver.session.sensor.live.book.poses())
     with pytest.raises(AccelCalibError, match="'other' has replaced 'imu_link' meanwhile"):
-        job.finish(found)
-    assert driver.session.active.calibration is None
-    assert len(driver.session.live.book.poses()) == poses > 0
+        task.send(found)
+    assert driver.session.sensor.calibration is None
+    assert len(driver.session.sensor.live.book.poses()) == poses > 0
 
 
 def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
@@ -152,13 +153,26 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
     stored(sensor='imu_link').rename(home / 'imu.data_raw@imu_link.yaml')
     driver, rest = Driver(), readings([[0, 0, 1]])[:30]
     assert driver.session.accepts('imu_link')
-    late = [event for event in driver.session.events() if isinstance(event, Job)]
+    late = [event for event in driver.session.events() if isinstance(event, Generator)]
     driver.now += 3.0
     driver.feed(rest, 'other')
-    for job in late:
-        driver.done(job)
-    assert driver.session.sensor == 'other'
-    assert driver.session.active.calibration is None
+    for task in late:
+        driver.done(task)
+    assert driver.session.name == 'other'
+    assert driver.session.sensor.calibration is None
+
+
+def test_an_automatic_fit_of_a_sensor_is_not_one_of_the_next(readings: Readings) -> None:
+    driver = Driver()
+    turned = readings(spread_directions(12))
+    driver.feed(turned)
+    driver.session.set_settings(replace(driver.session.settings, auto_fit=True))
+    task, = driver.session.commands.due()
+    driver.now += 3.0
+    driver.feed(turned[:200], 'other')
+    assert driver.done(task) == ''
+    assert driver.session.sensor.calibration is None
+    assert not driver.session.commands.due()
 
 
 def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings
@@ -166,7 +180,7 @@ def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(reading
     driver = Driver()
     driver.session.commands.enable(False)
     driver.feed(readings([[0, 0, 1]])[:30])
-    assert not driver.session.active.enabled
+    assert not driver.session.enabled
 
 
 def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_parameter(

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
 import errno
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, findings, Job, Level, Log, Session
+from accel_calib.session import CalibratorSettings, findings, Level, Log, Session, state, Task
 from accel_calib.stored import read_calibration, write_calibration
 from inside import (
     Identity,
@@ -30,6 +30,7 @@ from inside import (
 )
 import numpy as np
 import pytest
+from shared import answer_of
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -52,19 +53,17 @@ class Driver:
 
     def handle(self) -> None:
         for event in self.session.events():
-            if isinstance(event, Job):
+            if isinstance(event, Generator):
                 words = self.done(event)
                 self.log += [Log('info', words)] if words else []
             elif isinstance(event, Log):
                 self.log.append(event)
 
-    def done(self, job: Job | str) -> str:
+    def done(self, task: Task) -> str:
         """Return the answer of a command."""
-        while isinstance(job, Job):
-            job = job.finish(job.run(lambda function, *given: function(*given)))
-        if self.session is not None:
-            self.handle()
-        return job
+        answer: str = answer_of(task)
+        self.handle()
+        return answer
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
         """Push readings [m/s²], and return the number of accepted messages."""
@@ -85,7 +84,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in findings(self.session.health()) if each.name == name)
+        return next(each for each in findings(state.health(self.session)) if each.name == name)
 
 
 @pytest.mark.parametrize(('one', 'other'), [
@@ -117,34 +116,6 @@ def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.Monke
     assert store_of('~/x.yaml', named, 'm/s2').calibration == Path('/me/x.yaml')
 
 
-def test_files_of_version_1_are_taken_over_once(home: Path, readings: Readings, stored: Stored
-                                                ) -> None:
-    home.mkdir(parents=True)
-    stored(sensor='imu_link').rename(home / 'imu_link.yaml')
-    (home / 'imu_link_poses.csv').write_text('ax,ay,az\n0.1,0.2,9.8\n')
-    left, right = Driver('/left/imu'), Driver('/right/imu')
-    for driver in (left, right):
-        driver.feed(readings([[0, 0, 1]])[:10])
-    assert left.session.active.calibration is not None
-    assert len(left.session.live.book.poses()) == 1
-    assert 'imu_link.yaml is now' in left.logged()
-    assert right.session.active.calibration is None
-    assert len(right.session.live.book.poses()) == 0
-    assert {path.name for path in home.iterdir()} == {
-        'left.imu@imu_link.yaml', 'left.imu@imu_link_poses.csv', 'left.imu@imu_link.lock',
-        'right.imu@imu_link.lock'}
-
-
-def test_files_of_version_1_of_another_sensor_stay(home: Path, readings: Readings, stored: Stored
-                                                   ) -> None:
-    home.mkdir(parents=True)
-    stored(sensor='left/imu').rename(home / 'left_imu.yaml')
-    driver = Driver()
-    driver.feed(readings([[0, 0, 1]])[:10], 'left_imu')
-    assert driver.session.active.calibration is None
-    assert (home / 'left_imu.yaml').exists()
-
-
 def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
         home: Path, readings: Readings) -> None:
     turned = readings(spread_directions(12))
@@ -152,8 +123,8 @@ def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
     one.feed(turned)
     assert one.done(one.session.commands.fit())
     other.feed(turned[:10])
-    assert other.session.active.calibration is None
-    assert len(other.session.live.book.poses()) == 0
+    assert other.session.sensor.calibration is None
+    assert len(other.session.sensor.live.book.poses()) == 0
     found = read_calibration(next(home.glob('left_imu-*.yaml')))
     assert (found.sensor, found.stream) == ('left/imu', '/imu/data_raw')
     poses = read_poses(next(home.glob('left_imu-*_poses.csv')))
@@ -167,21 +138,21 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
     for driver in (first, second):
         driver.feed(readings(spread_directions(12)))
-    assert first.session.publishes
-    assert not second.session.publishes
+    assert first.session.files.locked
+    assert not second.session.files.locked
     assert second.finding('calibration').level == Level.ERROR
     assert 'is used by the node with process id' in second.finding('calibration').words
     commands = second.session.commands
     for command in (commands.fit, commands.save, commands.load):
         with pytest.raises(AccelCalibError, match='is used by the node with process id'):
-            command()
+            second.done(command())
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()
     second.session.tick()
     second.handle()
-    assert second.session.publishes
-    assert second.session.active.calibration is not None
+    assert second.session.files.locked
+    assert second.session.sensor.calibration is not None
     assert second.finding('calibration').level == Level.OK
 
 
@@ -232,9 +203,9 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     driver = Driver()
     rest = readings([[0, 0, 1]], dwell=6.0)
     driver.feed(rest[:100])
-    assert driver.session.live.detector.still
+    assert driver.session.sensor.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
-    assert not driver.session.live.detector.still
+    assert not driver.session.sensor.live.detector.still
     assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.foreign == 1
@@ -251,10 +222,10 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(driver.session.progress().still)
+        shown.append(state.progress(driver.session).still)
     assert not any(shown)
     driver.feed((np.array([0.6, 0.0, 0.8]) + noise[:150]) * per_g)
-    assert driver.session.progress().still
+    assert state.progress(driver.session).still
 
 
 def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
@@ -265,13 +236,13 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert driver.done(driver.session.commands.fit())
     driver.now += 3.0
     assert driver.feed(turned[:50], 'another') == 50
-    assert driver.session.sensor == 'another'
-    assert driver.session.active.calibration is None
-    assert len(driver.session.live.book.poses()) < 2
+    assert driver.session.name == 'another'
+    assert driver.session.sensor.calibration is None
+    assert len(driver.session.sensor.live.book.poses()) < 2
     assert "now have frame_id 'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
-    assert driver.session.active.calibration is not None
+    assert driver.session.sensor.calibration is not None
     assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
 
 
@@ -281,12 +252,12 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     rest = readings([[0, 0, 1]], dwell=6.0)
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match='no Imu message yet'):
-            getattr(driver.session.commands, name)()
+            driver.done(getattr(driver.session.commands, name)())
     driver.feed(rest[:150])
     driver.now += 6.0
     for name in ('capture_pose', 'set_level'):
         with pytest.raises(AccelCalibError, match=r'arrived 6\.0 s ago, expected one within'):
-            getattr(driver.session.commands, name)()
+            driver.done(getattr(driver.session.commands, name)())
     driver.feed(rest[150:160])
     assert driver.done(driver.session.commands.capture_pose()).startswith('1 pose:')
     assert 'levelled by this pose' in driver.done(driver.session.commands.set_level())
@@ -302,17 +273,17 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
     flat, nose_down = mounting @ [0.0, 0.0, 1.0], mounting @ [-0.6, 0.0, 0.8]
     driver.feed(readings([nose_down], dwell=6.0)[:200])
     with pytest.raises(InputError, match=r'not levelled; .*~/set_level first'):
-        driver.session.commands.set_heading()
+        driver.done(driver.session.commands.set_heading())
 
     def yaw() -> float:
-        x = driver.session.active.calibration.rotation[:, 0]  # type: ignore[union-attr]
+        x = driver.session.sensor.calibration.rotation[:, 0]  # type: ignore[union-attr]
         return float(np.degrees(np.arccos(x @ mounting[:, 0])))
 
     driver.feed(readings([flat], dwell=6.0)[:200])
     driver.done(driver.session.commands.set_level())
     assert yaw() > 50.0
     with pytest.raises(InputError, match=r'within 10° of the flat pose'):
-        driver.session.commands.set_heading()
+        driver.done(driver.session.commands.set_heading())
     driver.feed(readings([nose_down], dwell=6.0)[:200])
     assert 'the heading is set by this pose' in driver.done(driver.session.commands.set_heading())
     assert yaw() < 1.0
@@ -335,7 +306,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
                                     covariance=covariance))
     driver = Driver(calibration_file=str(path))
     for temperature, level in ((25.0, Level.OK), (40.0, Level.WARN)):
-        driver.session.set_temperature(temperature)
+        driver.session.statistics.temperature = temperature
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
         assert driver.finding('calibration').level == level
     assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
@@ -356,7 +327,7 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
     with pytest.raises(AccelCalibError) as refusal:
         driver.done(driver.session.commands.refine())
     assert '\n' not in str(refusal.value)
-    assert driver.session.active.calibration is None
+    assert driver.session.sensor.calibration is None
     assert not list(home.glob('*.yaml'))
 
 
@@ -366,9 +337,9 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
 def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(5)))
-    before = driver.session.advice
+    before = driver.session.sensor.advice
     driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
-    assert driver.session.advice == before
+    assert driver.session.sensor.advice == before
     assert driver.logged('info').count('this rest repeats an earlier pose') == 1
 
 
@@ -376,11 +347,11 @@ def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
     driver = Driver()
     for count, direction in enumerate(spread_directions(12), 1):
         driver.feed(readings([direction]))
-        if 'call ~/fit' not in driver.session.advice:
+        if 'call ~/fit' not in driver.session.sensor.advice:
             assert count < 12
             continue
         assert driver.done(driver.session.commands.fit())
-    assert driver.session.advice == 'the calibration uses these poses'
+    assert driver.session.sensor.advice == 'the calibration uses these poses'
 
 
 def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> None:
@@ -398,14 +369,14 @@ def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
         home: Path, readings: Readings) -> None:
     driver = Driver(auto_fit=True)
     driver.feed(readings(spread_directions(12)))
-    first = driver.session.active.calibration
+    first = driver.session.sensor.calibration
     assert first is not None
     driver.feed(readings(spread_directions(31)[:8]))
     driver.now += 60.0
     driver.session.tick()
     driver.handle()
-    assert driver.session.fitted_poses > 12  # a fit has been made, and agrees
-    assert driver.session.active.calibration is first
+    assert driver.session.sensor.fitted_poses > 12  # a fit has been made, and agrees
+    assert driver.session.sensor.calibration is first
     assert len(list(home.glob('*.before*'))) == 1
 
 
@@ -413,13 +384,13 @@ def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Rea
     driver = Driver(auto_fit=True, auto_fit_poses=30)
     driver.feed(readings(spread_directions(14)))
     assert driver.done(driver.session.commands.fit())
-    fitted = driver.session.active.calibration
+    fitted = driver.session.sensor.calibration
     refined = replace(fitted, model=Model({**fitted.model.values, 'quadratic': np.zeros(3)}),
                       covariance=np.eye(len(fitted.covariance) + 3) * 1e-8)
     driver.session.adopt(refined)
     driver.feed(readings(spread_directions(33)))
-    assert driver.session.fitted_poses >= 30
-    assert driver.session.active.calibration is refined
+    assert driver.session.sensor.fitted_poses >= 30
+    assert driver.session.sensor.calibration is refined
 
 
 # The stream
@@ -521,8 +492,8 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
     for each in warm:
         driver.feed(still, temperature=each)
-    calibration, rest = driver.session.active.calibration, driver.session.active.rest
-    gravity = driver.session.active.gravity
+    calibration, rest = driver.session.sensor.calibration, driver.session.sensor.rest
+    gravity = driver.session.sensor.gravity
     assert calibration is not None
     assert rest is not None
     assert gravity is not None
@@ -536,9 +507,9 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     assert abs(expected[2] - plain[2]) > 0.15
     slow = np.append(values['offset_temperature'][:3], [2.0 * lag, of_sensor])
     offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
-    driver.session.preview = offered
-    driver.session.set_temperature(warm[-1])
+    driver.session.sensor.offered = offered
+    driver.session.statistics.temperature = warm[-1]
     corrected = offered.apply(np.tile(still, (900, 1)), time=time,
                               temperature=np.repeat(warm, 10))[-1]
-    assert driver.session.progress().corrected == pytest.approx(
+    assert state.progress(driver.session).corrected == pytest.approx(
         np.linalg.norm(corrected) / GRAVITY, abs=1e-3)

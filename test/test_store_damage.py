@@ -16,6 +16,7 @@ from typing import Any
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
+from accel_calib.session import state
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.units import units_of
 from faults.sample import sample
@@ -136,8 +137,8 @@ def works(path: Path, readings: Readings) -> None:
     driver.session.close()
     after = Driver(calibration_file=str(path))
     after.feed(readings([[0, 0, 1]])[:10])
-    assert after.session.active.calibration is not None
-    assert len(after.session.live.book.poses()) >= 10
+    assert after.session.sensor.calibration is not None
+    assert len(after.session.sensor.live.book.poses()) >= 10
     assert not after.logged()
     after.session.close()
 
@@ -155,8 +156,8 @@ def test_whatever_is_in_place_of_a_file_is_kept_and_replaced(
     assert path.name in driver.logged()
     assert 'kept as' in driver.logged() or (
         'is renamed when' in driver.logged() and not of_poses)
-    assert (driver.session.active.calibration is not None) is of_poses
-    assert len(driver.session.live.book.poses()) == (0 if of_poses else 12)
+    assert (driver.session.sensor.calibration is not None) is of_poses
+    assert len(driver.session.sensor.live.book.poses()) == (0 if of_poses else 12)
     driver.session.close()
     works(store.calibration, readings)
     assert found in [kept(each) for each in store.calibration.parent.iterdir()]
@@ -173,7 +174,7 @@ def test_the_calibrator_starts_with_files_of_which_bytes_were_changed(
         path.write_bytes(bytes(data))
     driver = Driver(calibration_file=str(store.calibration))
     driver.feed(np.tile([0.0, 0.0, 9.8], (20, 1)))
-    used = driver.session.active.calibration
+    used = driver.session.sensor.calibration
     assert (used is None) == ('known.yaml' in driver.logged())
     assert used is None or any('edited by hand' in line for line in used.warnings)
     driver.session.close()
@@ -218,7 +219,7 @@ def refuses(path: Path, kind: str, readings: Readings) -> None:
     driver.feed(readings(spread_directions(10)))
     with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
         driver.done(driver.session.commands.fit())
-    assert driver.session.active.calibration is not None
+    assert driver.session.sensor.calibration is not None
     driver.session.close()
 
 
@@ -250,10 +251,10 @@ def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
     driver = Driver(calibration_file=str(inner / 'imu.yaml'))
     assert 'Permission denied' in driver.logged()
     driver.feed(readings(spread_directions(10)))
-    assert driver.session.health().writable is False
+    assert state.health(driver.session).writable is False
     with pytest.raises(InputError, match='in use but could not be stored'):
         driver.done(driver.session.commands.fit())
-    assert driver.session.active.calibration is not None
+    assert driver.session.sensor.calibration is not None
     driver.session.close()
     inner.chmod(0o700)
     assert (inner / 'imu_poses.csv').read_text() == 'ax,ay,az\n1,2,words\n'
@@ -266,7 +267,7 @@ def test_a_full_disk_is_reported_and_leaves_the_files_as_they_are(store: SensorS
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))  # every write fails
     try:
         driver = Driver(calibration_file=str(store.calibration))
-        loaded = driver.session.active.calibration
+        loaded = driver.session.sensor.calibration
         driver.feed(readings(spread_directions(10)))
         with pytest.raises(InputError, match='in use but could not be stored'):
             driver.done(driver.session.commands.fit())
@@ -289,7 +290,7 @@ def test_a_path_that_no_file_can_have_is_reported(name: str, tmp_path: Path, rea
     (tmp_path / 'loop').symlink_to('loop')
     driver = Driver(calibration_file=str(tmp_path / name))
     driver.feed(readings(spread_directions(10)))
-    assert driver.session.health().writable is (name[0] == 'x')
+    assert state.health(driver.session).writable is (name[0] == 'x')
     with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
         driver.done(driver.session.commands.fit())
     driver.session.close()
@@ -316,7 +317,7 @@ def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
     Lock(store).release()
     assert kept(lock) == before
     assert precious.read_text() == 'kept'
-    assert Driver(calibration_file=str(store.calibration)).session.active.calibration
+    assert Driver(calibration_file=str(store.calibration)).session.sensor.calibration
 
 
 def test_undo_passes_over_what_is_not_a_step(store: SensorStore) -> None:

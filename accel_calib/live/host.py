@@ -16,7 +16,7 @@ the server in its thread, and they pass the work on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 import math
 from queue import Empty, SimpleQueue
@@ -33,8 +33,19 @@ from ..errors import AccelCalibError, InputError, system_error
 from ..messages.one_reading import Triple
 from ..rating import rate, Rating
 from ..report.page import calibration_page, STORED
-from ..session import BATCH, CalibratorSettings, Health, Job, Log, LogFilter, Session, ShowPoses
-from ..session.work import Severity
+from ..session import (
+    BATCH,
+    CalibratorSettings,
+    Compute,
+    Health,
+    Log,
+    LogFilter,
+    Session,
+    ShowPoses,
+    state,
+    Task,
+)
+from ..session.events import Severity
 from ..session.worker import Answer, CallSoon, Worker
 from ..stored.exports import export, Exported
 from ..table import Floats
@@ -88,8 +99,8 @@ class Exchange:
     # The session has news
 
     def show_progress(self, reading: Triple | None = None) -> None:
-        """Show the progress; the parameter is as in `Session.progress`."""
-        self.show(messages.progress(monotonic(), self._session.progress(reading)))
+        """Show the progress; the parameter is as in `state.progress`."""
+        self.show(messages.progress(monotonic(), state.progress(self._session, reading)))
 
     def show_poses(self, event: ShowPoses) -> None:
         """Show the poses."""
@@ -103,29 +114,27 @@ class Exchange:
     def show_state(self, health: Health | None = None) -> None:
         """Show the state; the server sends it only if it has changed."""
         session = self._session
-        if session.commands.present is not self._shown:
-            self._take(session.commands.present)
+        if session.sensor.present is not self._shown:
+            self._take(session.sensor.present)
         self.show(messages.state(
-            session.health() if health is None else health, self.problem, shown=self._shown,
-            preview=session.preview is not None, busy=next(iter(self._worker.running), ''),
+            state.health(session) if health is None else health, self.problem, shown=self._shown,
+            preview=session.sensor.offered is not None, busy=next(iter(self._worker.running), ''),
             rating=self._rating, page=self._number))
 
     def _take(self, calibration: Calibration | None) -> None:
         """Show another calibration, and rate it in the worker process."""
         self._shown, self._rating = calibration, None
         self._number += 1
-        if calibration is None:
-            return
+        if calibration is not None:
+            self._worker.run(self._rated(calibration), lambda success, words: (
+                success or self._log(Log('warning', words))))
 
-        def finish(found: Rating) -> str:
-            if self._shown is calibration:
-                self._rating = found
-                self.show_state()
-            return ''
-
-        self._worker.run(
-            Job(lambda compute: compute(rate, calibration), finish, computes=True),
-            lambda success, words: success or self._log(Log('warning', words)))
+    def _rated(self, calibration: Calibration) -> Task:
+        """Show the rating of a calibration."""
+        rating: Rating = yield Compute(rate, calibration)
+        if self._shown is calibration:
+            self._rating = rating
+            self.show_state()
 
     # The page asks; these are called in the thread of the server
 
@@ -146,18 +155,23 @@ class Exchange:
             answer(False, f'{name} is still running; wait for its answer')
             return
 
-        def command() -> str | Job:
-            self._flush()
-            return _command(self._session, name)
-
         def done(success: bool, words: str) -> None:
             self._log(Log('info' if success else 'warning', words))
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
-        self._worker.do(name, command, done)
+        self._worker.do(name, self._command(name), done)
         if self._worker.running:
             self.show_state()
+
+    def _command(self, name: str) -> Task:
+        """Run a command of the page after all samples so far."""
+        self._flush()
+        commands = self._session.commands
+        if name in ('enable', 'disable'):
+            return commands.enable(name == 'enable')
+        command = getattr(commands, name)
+        return (yield from command(offered=True) if name in messages.OFFERED else command())
 
     def _draw(self, answer: Answer) -> None:
         """Draw the calibration page, unless it is drawn already."""
@@ -174,7 +188,7 @@ class Exchange:
             return
         self._drawing = number
         store = self._session.files.store
-        given = calibration, self._session.topic, store.calibration.name if store else STORED
+        drawing = self._drawn(calibration, store.calibration.name if store else STORED)
 
         def answer_all(success: bool, words: str) -> None:
             self._page, self._drawing = (number if success else -1, words), -1
@@ -182,35 +196,23 @@ class Exchange:
             for each in waiting:
                 each(success, words)
 
-        self._worker.run(Job(lambda compute: compute(drawn, *given), str, computes=True),
-                         answer_all)
+        self._worker.run(drawing, answer_all)
+
+    def _drawn(self, calibration: Calibration, stored: str) -> Task:
+        """Return the calibration page."""
+        return (yield Compute(drawn, calibration, self._session.topic, stored))
 
     def _export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
-        session, made = self._session, list[Exported]()
-        calibration = session.active.calibration
+        self._worker.do('export', self._exported(name), lambda success, found: answer(found))
 
-        def command() -> Job:
-            if session.preview is not None:
-                raise InputError('a new calibration waits', 'accept it or take it back first')
-            if calibration is None:
-                raise _NO_CALIBRATION
-            return Job(lambda compute: compute(export, calibration, name), finish, computes=True)
-
-        def finish(found: Exported) -> str:
-            made.append(found)
-            return ''
-
-        self._worker.do('export', command,
-                        lambda success, words: answer(made[0] if success else words))
-
-
-def _command(session: Session, name: str) -> str | Job:
-    """Call a command of the page."""
-    if name in ('enable', 'disable'):
-        return session.commands.enable(name == 'enable')
-    command = getattr(session.commands, name)
-    found: str | Job = command(offered=True) if name in messages.OFFERED else command()
-    return found
+    def _exported(self, name: str) -> Task:
+        """Return an export of the calibration in use."""
+        session = self._session
+        if session.sensor.offered is not None:
+            raise InputError('a new calibration waits', 'accept it or take it back first')
+        if session.sensor.calibration is None:
+            raise _NO_CALIBRATION
+        return (yield Compute(export, session.sensor.calibration, name))
 
 
 def drawn(calibration: Calibration, source: str, stored: str) -> str:
@@ -407,7 +409,7 @@ class Host:
         """Pass the last known temperature to the session."""
         known = temperatures[np.isfinite(temperatures)]
         if len(known):
-            self.session.set_temperature(float(known[-1]))
+            self.session.statistics.temperature = float(known[-1])
 
     def _handle_events(self) -> None:
         """Show and log what the session reports."""
@@ -417,7 +419,7 @@ class Host:
             elif isinstance(event, ShowPoses):
                 self.exchange.show_poses(event)
                 self.exchange.show_state()
-            elif isinstance(event, Job):
+            elif isinstance(event, Generator):
                 self._worker.run(event, lambda success, words: self._log(
                     Log('info' if success else 'warning', words)))
 

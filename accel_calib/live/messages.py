@@ -25,9 +25,9 @@ from ..calibrate import Calibration
 from ..calibrate.pose_planning import words_of
 from ..errors import InputError
 from ..rating import Rating
+from ..session.events import Severity
 from ..session.guidance import Progress
 from ..session.health import findings, Health, Level
-from ..session.work import Severity
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
 from ..units import MG

@@ -37,13 +37,14 @@ from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings,
     Event,
-    Job,
     Log,
     LogFilter,
     Mounting,
     Session,
     ShowPoses,
+    state,
     Still,
+    Task,
 )
 from ..session.worker import Worker
 
@@ -143,10 +144,9 @@ class Calibrator:
         """Return a command of the session that first processes all messages so far."""
         command = getattr(self.session.commands, name)
 
-        def call() -> str | Job:
+        def call() -> Task:
             self.stream.flush()
-            found: str | Job = command()
-            return found
+            return (yield from command())
 
         return call
 
@@ -171,7 +171,7 @@ class Calibrator:
         self.session.tick()
         self._on_transforms()
         self._handle_events()
-        health = self.session.health()
+        health = state.health(self.session)
         array = DiagnosticArray(status=statuses_of(health, self._name))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
@@ -183,7 +183,7 @@ class Calibrator:
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
-        health = self.session.health()
+        health = state.health(self.session)
         response.id = health.sensor
         response.status = self_test_of(health, self._name)
         passed = all(status.level == b'\x00' for status in response.status)
@@ -199,8 +199,8 @@ class Calibrator:
         due = monotonic() - self._progress_at >= _PROGRESS_EVERY
         if shown or (due and self._progress.get_subscription_count()):
             self._progress_at = monotonic()
-            self._progress.publish(progress_of(self.session.progress(), self._name,
-                                               self.session.sensor))
+            self._progress.publish(progress_of(state.progress(self.session), self._name,
+                                               self.session.name))
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Log):
@@ -218,7 +218,7 @@ class Calibrator:
 
     def _broadcast(self, event: Mounting) -> None:
         """Publish the levelled frame as a child of the frame of the sensor."""
-        calibration = self.session.active.calibration
+        calibration = self.session.sensor.calibration
         if self._broadcaster is None or calibration is None or not event.frame_id:
             return
         child = output_frame(calibration, event.frame_id, self.session.settings.output_frame_id)

@@ -4,10 +4,10 @@
 """
 Services that respond with the result of a command.
 
-A command returns an answer or a `Job`, or raises an error. For an error the response is ``success:
-false`` with the message of the error. For a job the response is sent when the job is done, so that
-no callback waits. This works with every executor. Coroutines as service callbacks, which rclpy
-offers for this purpose, do not work with EventsExecutor.
+A command is a `Task`, which returns an answer or raises an error. For an error the response is
+``success: false`` with the message of the error. The response is sent when the task is done, so
+that no callback waits. This works with every executor. Coroutines as service callbacks, which
+rclpy offers for this purpose, do not work with EventsExecutor.
 
 """
 
@@ -20,7 +20,7 @@ from typing import Any, TYPE_CHECKING
 
 from std_srvs.srv import Trigger
 
-from ..session import Job, Log
+from ..session import Log, Task
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -57,7 +57,7 @@ class Services:
     node : Node
         The node.
     worker : Worker
-        Worker that runs the jobs.
+        Worker that runs the commands.
     log : callable
         Function that logs the responses.
 
@@ -66,14 +66,14 @@ class Services:
     def __init__(self, node: Node, worker: Worker, log: Callable[[Log], None]) -> None:
         self._node, self._worker, self._log = node, worker, log
 
-    def serve(self, name: str, command: Callable[[], str | Job]) -> None:
+    def serve(self, name: str, command: Callable[[], Task]) -> None:
         """Create the service ``~/name``."""
         service = self._node.create_service(Trigger, f'~/{name}',
                                             lambda request, response: response)
         send = service.send_response
 
         def send_response(response: Any, header: Any) -> None:
-            self._worker.do(name, command, lambda success, words: send(
+            self._worker.do(name, command(), lambda success, words: send(
                 self._response(success, words), header))
 
         service.send_response = send_response

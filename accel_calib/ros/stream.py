@@ -68,8 +68,8 @@ class Output:
 
     def prepare(self, layout: Layout, calibration: Calibration | None, session: Session) -> None:
         """Prepare the correction of messages by this calibration, unless it is prepared."""
-        settings, active = session.settings, session.active
-        fills = settings.fill_covariance and active.noise is not None
+        settings, sensor = session.settings, session.sensor
+        fills = settings.fill_covariance and sensor.noise is not None
         made_for = layout, calibration, settings, fills
         if self._made_for and all(map(operator.is_, made_for, self._made_for)):
             return
@@ -78,8 +78,8 @@ class Output:
             frame_id = output_frame(calibration, layout.frame_id, settings.output_frame_id)
             self.rewriter = Rewriter(
                 layout, calibration, output_scale(calibration, settings.gravity),
-                settings.gravity, frame_id, active.noise if fills else None,
-                active.temperatures.stream(calibration.model))
+                settings.gravity, frame_id, sensor.noise if fills else None,
+                sensor.temperatures.stream(calibration.model))
 
 
 class Stream:
@@ -124,7 +124,7 @@ class Stream:
         """Set the temperature of the following messages [°C]; NaN is ignored."""
         if math.isfinite(temperature):
             self._temperature = temperature
-            self._session.set_temperature(temperature)
+            self._session.statistics.temperature = temperature
 
     @property
     def newest(self) -> Triple | None:
@@ -147,8 +147,9 @@ class Stream:
                 return
             data = usual
         session = self._session
-        if (due or session.active.applied is not self._applied
-                or session.preview is not self._offered or session.settings is not self._settings):
+        sensor = session.sensor
+        if (due or sensor.applied is not self._applied or sensor.offered is not self._offered
+                or session.settings is not self._settings):
             self._prepare()
         if self._listened:
             self._send(data)
@@ -162,13 +163,13 @@ class Stream:
     def _prepare(self) -> None:
         """Count the subscribers, and prepare the corrections."""
         session = self._session
-        self._applied, self._offered = session.active.applied, session.preview
+        self._applied, self._offered = session.sensor.applied, session.sensor.offered
         self._settings = session.settings
         outputs = self._calibrated, self._preview, self._motion
         for output in outputs:
             output.count()
         self._listened = self._active and any(output.listeners for output in outputs)
-        gyro = session.active.gyro if session.settings.gyro_bias else None
+        gyro = session.sensor.gyro if session.settings.gyro_bias else None
         bias = _NO_BIAS if gyro is None else gyro.at(self._temperature)
         for output, calibration in ((self._calibrated, self._applied),
                                     (self._preview, self._offered)):
@@ -188,7 +189,7 @@ class Stream:
             data = _usual(data)
             layout = layout_of(data)
         if layout is None:
-            self._session.drop_unreadable(len(data))
+            self._session.reports.unreadable(len(data))
             return None
         if layout != self._layout:
             self.flush()
@@ -200,12 +201,12 @@ class Stream:
     def _send(self, data: bytes) -> None:
         """Publish the corrected message, or the raw message if so configured."""
         session = self._session
-        active = session.active
-        if not session.publishes:
-            return
-        if session.preview is not None and self._preview.listeners:
+        sensor = session.sensor
+        if session.files.problem:
+            return  # another node uses the files
+        if sensor.offered is not None and self._preview.listeners:
             self._rewrite(data, self._preview)
-        if not active.enabled or (active.calibration is None and session.settings.passthrough):
+        if not session.enabled or (sensor.calibration is None and session.settings.passthrough):
             if math.isfinite(sum(THREE.unpack_from(data, self._layout.place(ACCELERATION)))):
                 self._calibrated.publish(data)
         elif self._calibrated.listeners or self._motion.listeners:
@@ -219,13 +220,13 @@ class Stream:
         try:
             corrected = rewriter(data, self._temperature)
         except AccelCalibError as error:
-            self._session.drop_corrected(error)
+            self._session.reports.uncorrected(error)
             return
         if corrected is None:
             return
         if output.listeners:
             output.publish(corrected)
-        gravity = self._session.active.gravity
+        gravity = self._session.sensor.gravity
         if self._motion.listeners and gravity is not None and output is self._calibrated:
             self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
 

@@ -4,20 +4,22 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the entry point, and `commands` contains what the user can ask for. `live_capture`
-captures poses, `guidance` says which pose is next, and `active_calibration` contains the
-calibration in use. `store` manages files, and `sensor_files` locks them. `work` contains the
-computations, which run in `worker_process`. `stream_statistics` and `health` describe the stream
-and the state. `settings` defines the parameters.
+`session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
+belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
+`store` manages files, and `sensor_files` locks them. `work` contains the computations, and
+`worker` runs the tasks. `stream` describes the messages, `state` and `health` the state, `reports`
+has log lines. `settings` defines the parameters.
 
 """
 
+from . import state
+from .events import Event, Log, LogFilter, Mounting, ShowPoses, Still
 from .guidance import Progress
 from .health import Finding, findings, Health, Level, worst
 from .session import BATCH, Session
 from .settings import CalibratorSettings, WEB_PORT
-from .work import Event, Job, Log, LogFilter, Mounting, ShowPoses, Still
+from .worker import Compute, Files, Step, Task
 
-__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Event', 'Finding', 'Health', 'Job',
-           'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses', 'Still',
-           'findings', 'worst']
+__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Compute', 'Event', 'Files', 'Finding',
+           'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
+           'Step', 'Still', 'Task', 'findings', 'state', 'worst']

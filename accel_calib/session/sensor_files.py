@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The files of the sensor of a session, which only one node can use at a time.
+The files of the sensor of a session: what they contain, and the lock for one node at a time.
 
 A lock on the files is held until it is released or the process ends.
 
@@ -11,13 +11,24 @@ A lock on the files is held until it is released or the process ends.
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 import fcntl
 import os
+from pathlib import Path
 import stat
 
 from .settings import CalibratorSettings
-from .store import Identity, Store, store_of
-from ..errors import AccelCalibError, InputError
+from .store import aside, Identity, Store, store_of, writing_advice
+from ..calibrate import Calibration
+from ..disk import remove_leftovers
+from ..errors import (
+    AccelCalibError,
+    crash_words,
+    DamagedCalibrationError,
+    InputError,
+    StoredCalibrationError,
+)
+from ..table import Poses
 
 _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """A link is not followed, because the lock would empty its target; a pipe does not block."""
@@ -150,3 +161,76 @@ class SensorFiles:
         if self._lock is not None:
             self._lock.release()
         self._lock = None
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """
+    The content of a store.
+
+    Parameters
+    ----------
+    calibration, poses
+        Usable calibration and poses; None without them.
+    problem : str
+        Reason why the calibration cannot be used; empty if it is usable or does not exist.
+    notes : tuple of str
+        Notes for the user.
+
+    """
+
+    calibration: Calibration | None
+    poses: Poses | None
+    problem: str = ''
+    notes: tuple[str, ...] = ()
+
+
+def load(store: Store) -> Loaded:
+    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
+    notes = _tidied(store)
+    calibration, poses, problem = None, None, ''
+    try:
+        calibration = store.load_calibration()
+    except Exception as error:  # the node starts in any case
+        problem = f'{_words(error)}; {_after(store.calibration, error)}'
+    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
+                     f'{store.identity.topic}')
+    try:
+        poses = store.load_poses()
+    except Exception as error:
+        notes.append(f'{_words(error)}; {_renamed(store.poses)}')
+    return Loaded(calibration, poses, problem, tuple(notes))
+
+
+def _tidied(store: Store) -> list[str]:
+    """Remove leftovers of writing; return log lines about what fails."""
+    try:
+        failed = [error for path in (store.calibration, store.poses)
+                  for error in remove_leftovers(path)]
+    except OSError as error:
+        return [f'the folder {store.calibration.parent} could not be tidied: {error}; '
+                f'{writing_advice(error)}']
+    return [f'the temporary file {error.filename} could not be removed: {error.strerror}; '
+            'remove it by hand' for error in failed]
+
+
+def _after(path: Path, error: Exception) -> str:
+    """Return what happens to a calibration that cannot be used; a damaged one is renamed."""
+    sound = isinstance(error, OSError | StoredCalibrationError)
+    if sound and not isinstance(error, DamagedCalibrationError):
+        return 'it is renamed when the next calibration is stored'
+    return _renamed(path)
+
+
+def _words(error: Exception) -> str:
+    """Return one line about an error, also about one that nobody expected."""
+    return str(error) if isinstance(error, AccelCalibError | OSError) else crash_words(error)
+
+
+def _renamed(path: Path) -> str:
+    """Rename a file that cannot be used, and return a text about it."""
+    try:
+        return f'kept as {aside(path, "damaged")}'
+    except OSError as error:
+        return f'it could not be renamed ({error})'

@@ -4,11 +4,8 @@
 """
 The parameters of the calibrator.
 
-Each field defines a parameter: name, default, description and limits. The node declares and checks
-the parameters (`accel_calib.session.settings`), and ``config/calibrator.yaml`` is generated from
-them.
-
-**Declaration.** Parameters of a node as fields of a dataclass, and as a parameter file.
+Each field defines a parameter: name, default, description and limits. The node declares them
+(`accel_calib.ros.declare`), and ``config/calibrator.yaml`` lists them with their defaults.
 
 Types are checked here and not by rclpy. rclpy refuses ``5`` for ``5.0`` and ``model:=10`` for
 ``'10'``, and ends the node with a traceback.
@@ -17,10 +14,9 @@ Types are checked here and not by rclpy. rclpy refuses ``5`` for ``5.0`` and ``m
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, Field, field, fields, MISSING, replace
 import math
-from textwrap import wrap
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
@@ -33,9 +29,6 @@ if TYPE_CHECKING:
 
 WEB_PORT = 8080
 """Usual port of the live page."""
-
-_WIDTH = 99
-_COMMENT = '    # '
 
 Settings = TypeVar('Settings', bound='DataclassInstance')
 """A dataclass whose fields are made by `parameter`."""
@@ -142,25 +135,6 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
     known = {each.name: each for each in fields(settings)}
     given = {name: checked(known[name], value) for name, value in values.items() if name in known}
     return replace(settings, **given)
-
-
-def yaml_lines(settings: type[Any]) -> Iterable[str]:
-    """Yield the lines of a parameter file with all defaults, for any node name."""
-    yield '# Parameters of the calibrator with their defaults; generated from'
-    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
-    yield '/**:'
-    yield '  ros__parameters:'
-    for each in fields(settings):
-        live = ' *' if each.metadata['live'] else ''
-        words = f"{each.metadata['words']} ({expected(each)}){live}"
-        yield from wrap(words, _WIDTH, initial_indent=_COMMENT, subsequent_indent=_COMMENT)
-        yield f'    {each.name}: {_yaml_value(default_of(each))}'
-
-
-def _yaml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value)
 
 
 _MODELS = tuple(name for name in MODEL_NAMES if name != '12')  # needs known orientations

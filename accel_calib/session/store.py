@@ -27,10 +27,9 @@ import stat
 import numpy as np
 
 from ..calibrate import Calibration, check_sensor
-from ..disk import check_regular, copy_atomically, remove_leftovers
+from ..disk import check_regular, copy_atomically
 from ..errors import (
     AccelCalibError,
-    crash_words,
     DamagedCalibrationError,
     FREE_SPACE,
     InputError,
@@ -44,7 +43,6 @@ from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
 _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
-_UNSAFE_OF_VERSION_1 = re.compile(r'[^A-Za-z0-9._-]+')
 _NAMELESS = 'imu'
 _LONGEST = 120
 _NUMBER = re.compile('[1-9][0-9]{0,17}')
@@ -291,6 +289,11 @@ class Store:
         self.poses.parent.mkdir(parents=True, exist_ok=True)
         write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
 
+    def save(self, calibration: Calibration, poses: Poses) -> None:
+        """Write the calibration and the poses; raise OSError if it fails."""
+        self.save_calibration(calibration)
+        self.save_poses(poses)
+
     def set_aside(self) -> list[Path]:
         """Rename both files, and return the new paths; raise OSError if it fails."""
         if _exists(self.calibration):
@@ -304,73 +307,6 @@ class Store:
             folder = folder.parent
         rights = os.W_OK | os.X_OK
         return folder.is_dir() and os.access(folder, rights, effective_ids=True)
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """
-    The content of a store.
-
-    Parameters
-    ----------
-    calibration, poses
-        Usable calibration and poses; None without them.
-    problem : str
-        Reason why the calibration cannot be used; empty if it is usable or does not exist.
-    notes : tuple of str
-        Notes for the user.
-
-    """
-
-    calibration: Calibration | None
-    poses: Poses | None
-    problem: str = ''
-    notes: tuple[str, ...] = ()
-
-
-def load(store: Store) -> Loaded:
-    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
-    notes = _tidied(store)
-    calibration, poses, problem = None, None, ''
-    try:
-        calibration = store.load_calibration()
-    except Exception as error:  # the node starts in any case
-        problem = f'{_words(error)}; {_after(store.calibration, error)}'
-    if calibration is not None and calibration.stream not in ('', store.identity.topic):
-        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
-                     f'{store.identity.topic}')
-    try:
-        poses = store.load_poses()
-    except Exception as error:
-        notes.append(f'{_words(error)}; {_renamed(store.poses)}')
-    return Loaded(calibration, poses, problem, tuple(notes))
-
-
-def _tidied(store: Store) -> list[str]:
-    """Take over files of version 0.1, and remove leftovers; return log lines about it."""
-    notes = []
-    try:
-        notes = take_over(store)
-        failed = [error for path in (store.calibration, store.poses)
-                  for error in remove_leftovers(path)]
-    except OSError as error:
-        return [*notes, f'the folder {store.calibration.parent} could not be tidied: {error}; '
-                f'{writing_advice(error)}']
-    return [*notes, *(f'the temporary file {error.filename} could not be removed: '
-                      f'{error.strerror}; remove it by hand' for error in failed)]
-
-
-def _after(path: Path, error: Exception) -> str:
-    """Return what happens to a calibration that cannot be used; a damaged one is renamed."""
-    sound = isinstance(error, OSError | StoredCalibrationError)
-    if sound and not isinstance(error, DamagedCalibrationError):
-        return 'it is renamed when the next calibration is stored'
-    return _renamed(path)
-
-
-def _words(error: Exception) -> str:
-    """Return one line about an error, also about one that nobody expected."""
-    return str(error) if isinstance(error, AccelCalibError | OSError) else crash_words(error)
 
 
 def _exists(path: Path) -> bool:
@@ -392,14 +328,6 @@ def _check_sizes(poses: Poses, path: Path) -> None:
         if np.any(bad):
             raise InputError(f'{path}: row {int(np.argmax(bad)) + 1} has an impossible {key}, '
                              f'expected less than {LARGEST:g}', 'new poses start a new table')
-
-
-def _renamed(path: Path) -> str:
-    """Rename a file that cannot be used, and return a text about it."""
-    try:
-        return f'kept as {aside(path, "damaged")}'
-    except OSError as error:
-        return f'it could not be renamed ({error})'
 
 
 def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:
@@ -429,34 +357,6 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
                              'folder', 'state the whole path') from error
         return Store(path.absolute(), identity, units)
     return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units)
-
-
-def take_over(store: Store) -> list[str]:
-    """
-    Rename the files that version 0.1 named by the frame_id alone; return log lines about it.
-
-    Several sensors may have shared such a name. The first sensor that finds the files takes them
-    if the calibration has its frame_id, or if there is no calibration and the name is unambiguous.
-
-    """
-    sensor = store.identity.sensor
-    name = _UNSAFE_OF_VERSION_1.sub('_', sensor).strip('._') or _NAMELESS
-    former = replace(store, calibration=store.calibration.with_name(f'{name}.yaml'))
-    own = ros_home() / 'accel_calib' / store.identity.file_name
-    if (store.calibration != own or former.calibration == store.calibration
-            or _exists(store.calibration) or _exists(store.poses)):
-        return []
-    try:
-        found = former.load_calibration()
-    except (AccelCalibError, OSError):
-        return []
-    ours = found.sensor == sensor if found is not None else name == sensor
-    lines = []
-    for old, new in ((former.calibration, store.calibration), (former.poses, store.poses)):
-        if ours and old.exists():
-            old.rename(new)
-            lines.append(f'{old} is now {new}')
-    return lines
 
 
 def aside(path: Path, word: str) -> Path:

@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import islice
 import math
-from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +84,7 @@ class StreamStatistics:
 
     """
 
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+    def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self.messages = self.not_finite = self.foreign = self.implausible = 0
         self.stamp = self.temperature = self.spread = math.nan
@@ -140,6 +139,18 @@ class StreamStatistics:
         span = self._batches[-1].arrived - self._batches[0].arrived
         count = sum(batch.messages for batch in self._batches) - self._batches[0].messages
         return count / span if span > 0.0 else 0.0
+
+    @property
+    def context(self) -> dict[str, float]:
+        """Present time [s] and temperature [°C], if known."""
+        known = {'time': self.stamp, 'temperature': self.temperature}
+        return {key: value for key, value in known.items() if math.isfinite(value)}
+
+    def length_g(self, units: Units) -> float:
+        """Return |a| of the last messages [g]; NaN if not known."""
+        if self.reading is None or units.name == 'native':
+            return math.nan
+        return float(np.linalg.norm(self.reading)) / units.per_g
 
     @property
     def stamp_fault(self) -> str:

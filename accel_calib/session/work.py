@@ -1,20 +1,18 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session asks for: the events for the node, and its computations with their texts."""
+"""The computations of a session, with their texts; most run in the worker process."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 import math
-from time import monotonic
-from typing import Any, Literal
 
 import numpy as np
 
-from .active_calibration import gyro_bias_of_rest
 from .guidance import Plan
+from .sensor import gyro_bias_of_rest
 from .settings import CalibratorSettings
 from ..calibrate import (
     Calibration,
@@ -24,12 +22,11 @@ from ..calibrate import (
     level,
     lies_in_cone,
     next_pose,
-    NextPose,
     PRIOR,
 )
 from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
-from ..effects import Context, Model
+from ..effects import Context, LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_4
 from ..estimate.geometry import coverage, pose_noise
@@ -41,98 +38,6 @@ from ..table import Floats, Poses
 from ..text import counted, listed, now
 from ..units import MG, Units
 
-Compute = Callable[..., Any]
-"""Function and its arguments -> result, as in `worker_process.WorkerProcess.call`."""
-
-Severity = Literal['info', 'warning', 'error']
-
-
-@dataclass(frozen=True)
-class Job:
-    """
-    Long work that must not delay the stream.
-
-    Parameters
-    ----------
-    run : callable
-        Function of a `Compute`. It does not use the session, and can raise AccelCalibError or
-        OSError.
-    finish : callable
-        Function of the result of `run`, called in the thread of the session. It returns an answer,
-        or the job that continues, and can raise AccelCalibError. An empty answer is not logged.
-    computes : bool
-        Whether `run` computes and uses no files. Commands and other jobs run at the same time.
-        Only such a job calls its `Compute`.
-
-    """
-
-    run: Callable[[Compute], Any]
-    finish: Callable[[Any], str | Job]
-    computes: bool = False
-
-
-@dataclass(frozen=True)
-class Log:
-    """A log line; if `once_in` is not 0, it is logged at most once in this time [s]."""
-
-    severity: Severity
-    words: str
-    once_in: float = 0.0
-
-
-@dataclass(frozen=True)
-class Still:
-    """A change of whether the sensor is still."""
-
-    still: bool
-
-
-@dataclass(frozen=True)
-class ShowPoses:
-    """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
-
-    up: Floats
-    asked: NextPose
-    frame_id: str
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
-
-    rotation: Floats
-    frame_id: str
-
-
-class LogFilter:
-    """
-    Decide which lines are logged: not empty, and not again within their `once_in`.
-
-    Parameters
-    ----------
-    clock : callable
-        Steady clock [s].
-
-    """
-
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self._clock = clock
-        self._last: dict[str, float] = {}
-
-    def passes(self, line: Log) -> bool:
-        """Return whether to log a line, and note it."""
-        if not line.once_in:
-            return bool(line.words)
-        kind, now = line.words[:20], self._clock()
-        if now - self._last.get(kind, -line.once_in) < line.once_in:
-            return False
-        self._last[kind] = now
-        return True
-
-
-Event = Log | Mounting | Still | ShowPoses | Job
-
-
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
 
@@ -141,6 +46,21 @@ _FEWEST_IN_CONE = 4
 
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
+
+
+def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
+        before: Calibration | None, known: Mapping[str, float]
+        ) -> tuple[Calibration, list[str], bool]:
+    """
+    Return a fit, what to answer, and whether an automatic fit replaces the calibration before it.
+
+    Parameters and errors are as in `fitted`; `known` has the present values of the context.
+
+    """
+    context = {key: np.array([value]) for key, value in known.items()}
+    calibration = fitted(poses, units, settings, sensor, before, context)
+    return (calibration, [summary(calibration), change_words(before, calibration)],
+            replaces(before, calibration))
 
 
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
@@ -231,9 +151,18 @@ def change_words(before: Calibration | None, after: Calibration) -> str:
     return f'changes {", ".join(words)}'
 
 
-def has_changed(before: Calibration | None, after: Calibration) -> bool:
-    """Return whether a fit differs from the calibration by more than its own uncertainty."""
-    if before is None or is_partial(before):
+def replaces(before: Calibration | None, after: Calibration) -> bool:
+    """
+    Return whether an automatic fit replaces a calibration.
+
+    It does if it differs by more than its own uncertainty, and the other has only offset and gain.
+
+    """
+    if before is None:
+        return True
+    if any(name not in LADDER for name in before.model.effects):
+        return False
+    if is_partial(before):
         return True
     up = spread_directions(_DIRECTIONS)
     (gain, offset), (gain_before, offset_before) = (
@@ -243,9 +172,10 @@ def has_changed(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Refinement:
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
+            ) -> tuple[Refinement, list[str]]:
     """
-    Return the refinement of a calibration.
+    Return the refinement of a calibration, and what to answer.
 
     Parameters
     ----------
@@ -266,8 +196,12 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
         If the readings are clearly in another unit.
 
     """
-    return refine(poses, units, base='auto' if before is None else before, sensor=sensor,
-                  date=now())
+    refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
+                        date=now())
+    words = [story(refinement)]
+    if not refinement.refusal:
+        words.append(change_words(before, refinement.calibration))
+    return refinement, words
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
@@ -344,10 +278,3 @@ def story(refinement: Refinement) -> str:
     if refinement.disturbed_poses:
         lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
     return '; '.join([*lines, *refinement.calibration.warnings, *refinement.advice])
-
-
-def title(calibration: Calibration) -> str:
-    """Return a short description of a calibration."""
-    return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
-            f'{calibration.quality.rms_after_mg:.3f} mg, '
-            f'{"levelled" if calibration.is_levelled else "not levelled"}')

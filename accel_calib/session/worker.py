@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A separate process for computations, and the order of the jobs of a session.
+A separate process for computations, and the order of the tasks of a session.
 
 **Process.** In a thread of the node, fits, refinements and the next pose would share the
 interpreter with the stream, and messages would wait up to 5 ms. The process has its own
@@ -14,11 +14,11 @@ Functions, arguments and results are pickled between the processes and never sto
 ends with the node in all cases, because its standard input is then closed. If the process cannot
 be started or dies, the node does the computation itself.
 
-**Order.** Jobs that use files run in one thread, one after the other. Jobs that compute run in
-another one, which waits for the worker process. Both finish in the thread of the session, so that
-only this thread changes the session.
+**Order.** A task is a generator of steps. Steps that use files run in one thread, one after the
+other. Steps that compute run in another one, which waits for the worker process. Between its steps
+a task runs in the thread of the session, so that only this thread changes the session.
 
-A command begins when no job uses the files, so that it sees what the commands before it did. It
+A command begins when no step uses the files, so that it sees what the commands before it did. It
 does not wait for computations: a fit computes while other commands are answered, and is discarded
 if one of them changed the calibration.
 
@@ -27,8 +27,9 @@ if one of them changed the calibration.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from importlib import import_module
 import os
 import pickle
@@ -42,7 +43,6 @@ from traceback import format_exc
 from typing import Any, BinaryIO, cast, TypeVar
 
 from .store import writing_advice
-from .work import Job
 from ..errors import AccelCalibError, InputError
 
 Found = TypeVar('Found')
@@ -195,8 +195,53 @@ def _answer(call: Any) -> tuple[bool, Any]:
         return False, error
 
 
-Answer = Callable[[bool, str], object]
-"""Function of the success of a command, and of a text about its result."""
+class Step:
+    """
+    What a task waits for: the result of a function.
+
+    Parameters
+    ----------
+    function : callable, optional
+        The function. It does not use the session, and can raise AccelCalibError or OSError, which
+        are raised in the task. None: the task only waits until the steps before it are done.
+    *given
+        Its arguments.
+
+    """
+
+    def __init__(self, function: Callable[..., Any] | None = None, *given: Any) -> None:
+        self._function, self._given = function, given
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; `call` is `WorkerProcess.call`."""
+        return None if self._function is None else call(self._function, *self._given)
+
+
+class Files(Step):
+    """A function that uses files; other functions that use files and commands wait for it."""
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; it does not need the worker process."""
+        return super().run(lambda function, *given: function(*given))
+
+
+class Compute(Step):
+    """A function that computes, in the worker process; commands and files do not wait for it."""
+
+
+Task = Generator[Step, Any, Any]
+"""
+Steps whose results are sent back, in the thread of the session; the returned value is the answer.
+
+An empty answer is not logged. A task can raise AccelCalibError.
+
+"""
+
+Part = Generator[Step, Any, Found]
+"""A part of a task, for ``yield from``."""
+
+Answer = Callable[[bool, Any], object]
+"""Function of the success of a task, and of its answer or the words of its error."""
 
 CallSoon = Callable[[Callable[[], None]], None]
 """Function that lets the thread of the session call a function, one after the other."""
@@ -204,14 +249,14 @@ CallSoon = Callable[[Callable[[], None]], None]
 
 class Worker:
     """
-    The threads for the jobs of a session.
+    The threads for the tasks of a session.
 
     Parameters
     ----------
     call_soon : callable
         Function that lets the thread of the session call a function.
     on_events : callable
-        Function that is called after each job, in the thread of the session.
+        Function that is called after each step of a task, in the thread of the session.
     report : callable
         Function that logs an unexpected error.
 
@@ -228,90 +273,88 @@ class Worker:
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
         self._process = WorkerProcess()
-        self._computed: deque[Callable[[], None]] = deque()
-        self._jobs: deque[tuple[Job, Answer]] = deque()
-        self._commands: deque[tuple[Callable[[], str | Job], Answer]] = deque()
+        self._steps: deque[tuple[Files, Task, Answer]] = deque()
+        self._computed: deque[tuple[Task, Answer, Future[Any]]] = deque()
+        self._commands: deque[tuple[Task, Answer]] = deque()
         self.running: list[str] = []
         self._is_busy = self._closed = False
 
-    def do(self, name: str, command: Callable[[], str | Job], answer: Answer) -> None:
-        """Call a command when the jobs before it are done, run its job, and call `answer`."""
-        def done(success: bool, words: str) -> None:
+    def do(self, name: str, command: Task, answer: Answer) -> None:
+        """Begin a command when no files are used, run its steps, and call `answer`."""
+        def done(success: bool, found: Any) -> None:
             self.running.remove(name)
-            answer(success, words)
+            answer(success, found)
 
         self.running.append(name)
         self._commands.append((command, done))
         self._advance()
 
-    def run(self, job: Job, answer: Answer) -> None:
-        """Run a job in a thread, finish it in that of the session, and call `answer`."""
-        if job.computes:
-            self._submit(self._computation, job, lambda done: self._later(
-                lambda: self._finish(job, answer, done)))
-        else:
-            self._jobs.append((job, answer))
-            self._advance()
-
-    def _later(self, finish: Callable[[], None]) -> None:
-        """Finish a computation when no files are used."""
-        self._computed.append(finish)
-        self._advance()
-
-    def _submit(self, pool: ThreadPoolExecutor, job: Job,
-                then: Callable[[Future[Any]], None]) -> None:
-        future = pool.submit(job.run, self._process.call)
-        future.add_done_callback(lambda done: self._call_soon(lambda: then(done)))
+    def run(self, task: Task, answer: Answer) -> None:
+        """Begin a task now, run its steps, and call `answer`."""
+        self._proceed(task, answer, self._outcome(task))
 
     def _advance(self) -> None:
-        """Begin what waits, until a job uses the files; jobs come first, commands last."""
+        """Begin what waits, until a step uses the files; such steps come first, commands last."""
         while not self._is_busy and not self._closed:
-            if self._jobs:
-                self._store(*self._jobs.popleft())
+            if self._steps:
+                self._use_files(*self._steps.popleft())
             elif self._computed:
-                self._in_turn(self._computed.popleft())
+                self._resume(*self._computed.popleft())
             elif self._commands:
-                command, answer = self._commands.popleft()
-                self._in_turn(lambda command=command, answer=answer:  # type: ignore[misc]
-                              self._settle(command, answer))
+                self._resume(*self._commands.popleft())
             else:
                 return
 
-    def _in_turn(self, function: Callable[[], None]) -> None:
-        """Call a function during which nothing else begins."""
-        self._is_busy = True
-        try:
-            function()
-        finally:
-            self._is_busy = False
-
-    def _store(self, job: Job, answer: Answer) -> None:
-        """Run a job that uses files."""
-        def stored(done: Future[Any]) -> None:
-            self._in_turn(lambda: self._finish(job, answer, done))
+    def _use_files(self, step: Files, task: Task, answer: Answer) -> None:
+        def then(done: Future[Any]) -> None:
+            self._resume(task, answer, done)
             self._advance()
 
         self._is_busy = True
-        self._submit(self._files, job, stored)
+        self._submit(self._files, step, then)
 
-    def _finish(self, job: Job, answer: Answer, done: Future[Any]) -> None:
-        """Finish a job and call `answer`, or run the job that continues."""
-        if not self._closed:  # otherwise rclpy may have destroyed the publishers
-            self._settle(lambda: job.finish(done.result()), answer)
+    def _later(self, task: Task, answer: Answer, done: Future[Any]) -> None:
+        """Continue a task that computed when no files are used."""
+        self._computed.append((task, answer, done))
+        self._advance()
 
-    def _settle(self, function: Callable[[], str | Job], answer: Answer) -> None:
-        """Call a function, and run its job or call `answer`."""
-        success, found = self._outcome(function)
-        self._on_events()  # first, so that a command is answered after its poses are stored
-        if isinstance(found, Job):
-            self.run(found, answer)
+    def _submit(self, pool: ThreadPoolExecutor, step: Step,
+                then: Callable[[Future[Any]], None]) -> None:
+        future = pool.submit(step.run, self._process.call)
+        future.add_done_callback(lambda done: self._call_soon(lambda: then(done)))
+
+    def _resume(self, task: Task, answer: Answer, done: Future[Any] | None = None) -> None:
+        """Continue a task with the result of its step; nothing else begins meanwhile."""
+        if self._closed:
+            return  # rclpy may have destroyed the publishers
+        self._is_busy = True
+        try:
+            outcome = self._outcome(task, done)
+            self._on_events()  # first, so that a command is answered after its poses are stored
+            self._proceed(task, answer, outcome)
+        finally:
+            self._is_busy = False
+
+    def _proceed(self, task: Task, answer: Answer, outcome: tuple[bool, Any]) -> None:
+        """Run the next step of a task, or call `answer`."""
+        success, found = outcome
+        if isinstance(found, Files):
+            self._steps.append((found, task, answer))
+            self._advance()
+        elif isinstance(found, Step):
+            self._submit(self._computation, found, partial(self._later, task, answer))
         else:
             answer(success, found)
 
-    def _outcome(self, function: Callable[[], Found]) -> tuple[bool, Found | str]:
-        """Return success, and a result or words; unexpected errors are logged."""
+    def _outcome(self, task: Task, done: Future[Any] | None = None) -> tuple[bool, Any]:
+        """Return success, and the next step, answer or words; unexpected errors are logged."""
         try:
-            return True, function()
+            if done is None:
+                return True, next(task)
+            error = done.exception()
+            return True, task.send(done.result()) if error is None else task.throw(error)
+        except StopIteration as end:
+            return True, end.value
         except AccelCalibError as error:
             return False, str(error)
         except OSError as error:
@@ -326,6 +369,6 @@ class Worker:
         self._closed = True
         self._process.close()
         self._computation.shutdown(wait=True)
-        for job, _ in self._jobs:
-            self._files.submit(job.run, self._process.call)
+        for step, _, _ in self._steps:
+            self._files.submit(step.run, self._process.call)
         self._files.shutdown(wait=True)

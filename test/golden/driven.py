@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 import struct
 from typing import Any
@@ -14,13 +14,14 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import CalibratorSettings, findings, Job, Log, Session, ShowPoses
+from accel_calib.session import CalibratorSettings, findings, Log, Session, ShowPoses, state, Task
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
 from inside import figures as health_figures
 from inside import frame_ids, layout_with, Model, stamps_of
 import numpy as np
+from shared import answer_of
 
 SENSOR: dict[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array(
     [0.01, -0.02, 0.015]), 'cross_axis': np.array([0.004, 0.002, -0.003])}
@@ -41,18 +42,17 @@ class _Driver:
 
     def _handle(self) -> None:
         for event in self.session.events():
-            if isinstance(event, Job):
+            if isinstance(event, Generator):
                 self._done(event)
             elif isinstance(event, Log):
                 self.log.append(f'{event.severity}: {event.words}')
             elif isinstance(event, ShowPoses):
                 self.shown = event
 
-    def _done(self, job: Any) -> Any:
-        while isinstance(job, Job):
-            job = job.finish(job.run(lambda function, *given: function(*given)))
+    def _done(self, task: Task) -> Any:
+        answer = answer_of(task)
         self._handle()
-        return job
+        return answer
 
     def ask(self, *names: str) -> Any:
         """Return the answers of commands, or their refusals."""
@@ -69,7 +69,7 @@ class _Driver:
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 9), np.nan)
                 rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
-                self.session.set_temperature(t)
+                self.session.statistics.temperature = t
                 self.session.push(rows, self.now)
             self._handle()
         self.session.tick()
@@ -77,9 +77,9 @@ class _Driver:
 
     def state(self) -> Any:
         """Return progress, diagnostics, findings and poses."""
-        health = self.session.health()
-        return [self.session.progress(), dict(health_figures(health)), findings(health),
-                self.shown, self.session.live.book.poses(), self.session.active.drift]
+        health = state.health(self.session)
+        return [state.progress(self.session), dict(health_figures(health)), findings(health),
+                self.shown, self.session.sensor.live.book.poses(), self.session.sensor.drift]
 
     def lines(self) -> Any:
         return self.log

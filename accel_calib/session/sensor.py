@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibration in use, and its comparison with the rests since the fit.
+What belongs to one sensor; all of it is replaced when the sensor changes.
 
 Gravity is the mean corrected force of the last rest. It is subtracted while the sensor moves
 (Intan RHD2000 application note). This is accurate for motion near the orientation of that rest.
@@ -21,8 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from .live_capture import LONG_REST, overlap
-from .stream import TemperatureHistory
+from .guidance import Guide
+from .live_capture import LiveCapture, LONG_REST, overlap
+from .settings import CalibratorSettings, capture_settings
+from .stream import NewestReading, StreamStatistics, TemperatureHistory
 from ..calibrate import Calibration, GyroBias, SampleNoise
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rests_of
@@ -43,49 +45,102 @@ _LARGEST_BIAS_STEP = 0.02
 """Largest change of a stored bias from rest to rest [rad/s]."""
 
 
-class ActiveCalibration:
+class Sensor:
     """
-    The calibration in use, its drift, and the last rest.
+    The poses, the plan, the calibration, its drift, and the last rest of one sensor.
 
     Parameters
     ----------
-    gravity : float
-        Local gravity [m/s²].
-    rotates : bool
-        Whether corrected messages are turned into the levelled frame.
+    settings : CalibratorSettings
+        The parameters.
+    units : Units
+        Unit of the readings.
 
     Attributes
     ----------
+    live : LiveCapture
+        Stillness detector and poses.
+    guide : Guide
+        The next pose.
+    temperatures : TemperatureHistory
+        Temperatures of the stream, for lags.
+    newest : NewestReading
+        Correction of single readings.
     calibration : Calibration or None
         The calibration in use.
     applied : Calibration or None
         The calibration that corrects messages: without the mounting if `rotates` is false.
+    offered : Calibration or None
+        A calibration that waits for ~/save or ~/undo.
+    changes : int
+        Number of changes of the calibration in use or offered.
+    fitted_poses : int
+        Number of poses of the last fit; 0 if more poses are asked for.
+    auto_fit_waits : bool
+        Whether poses wait for an automatic fit.
+    owners : set of str
+        Sensors that the stored files name.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
     scale : float
         m/s² per unit of corrected force.
+    rest : Dwell or None
+        The last rest.
     gravity : (3,) array or None
         Corrected force of the last rest [m/s²].
-    temperatures : TemperatureHistory
-        Temperatures of the stream, for lags.
 
     """
 
-    def __init__(self, gravity: float, *, rotates: bool = True) -> None:
-        self._g, self._rotates = gravity, rotates
-        self._past: Drift | None = None
-        self._counted: Dwell | None = None
-        self.drift: Drift | None = None
+    def __init__(self, settings: CalibratorSettings, units: Units) -> None:
+        self.live = LiveCapture(capture_settings(settings), units)
+        self.guide, self.temperatures = Guide(), TemperatureHistory()
+        self.newest = NewestReading(units)
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None
+        self.offered: Calibration | None = None
+        self.changes = self.fitted_poses = 0
+        self.auto_fit_waits = False
+        self.owners: set[str] = set()
+        self.drift: Drift | None = None
         self.scale = 1.0
-        self.enabled = True
         self.rest: Dwell | None = None
         self.gravity: Floats | None = None
-        self.temperatures = TemperatureHistory()
+        self._g, self._rotates = settings.gravity, settings.rotate
+        self._past: Drift | None = None
+        self._counted: Dwell | None = None
+        self._stillness = math.nan, math.nan
+
+    @property
+    def present(self) -> Calibration | None:
+        """Return the calibration that a command starts from: the offered one, or that in use."""
+        return self.offered or self.calibration
+
+    @property
+    def all_fitted(self) -> bool:
+        """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
+        return 0 < self.guide.poses == self.fitted_poses
+
+    @property
+    def advice(self) -> str:
+        """Return what to do next with the poses."""
+        return 'the calibration uses these poses' if self.all_fitted else self.guide.advice
+
+    def stillness(self, statistics: StreamStatistics) -> float:
+        """Return the spread of the last samples relative to the largest of a still sensor."""
+        arrived, stillness = self._stillness
+        if arrived != statistics.arrived:  # the threshold takes longer than all the rest
+            stillness = statistics.spread / self.live.detector.threshold
+            self._stillness = statistics.arrived, stillness
+        return stillness
+
+    def offer(self, calibration: Calibration | None) -> None:
+        """Publish this calibration on ~/preview only; None: discard the offered one."""
+        self.offered = calibration
+        self.changes += 1
 
     def adopt(self, calibration: Calibration | None) -> None:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
+        self.offer(None)
         if not _only_levelled(self.calibration, calibration):
             self._past = None if calibration is None else monitor(calibration)
             self._counted = self.rest
@@ -170,7 +225,6 @@ class ActiveCalibration:
         return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
-        """Return the state of the drift monitor after one more rest."""
         context = self._context(rest)
         if self._past is None or self.calibration is None or context is None:
             return self._past
@@ -255,3 +309,10 @@ def _only_levelled(before: Calibration | None, after: Calibration | None) -> boo
             and np.array_equal(before.model.vector, after.model.vector)
             and np.array_equal(before.covariance, after.covariance)
             and not np.array_equal(before.model.rotation, after.model.rotation))
+
+
+def title(calibration: Calibration) -> str:
+    """Return a short description of a calibration."""
+    return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
+            f'{calibration.quality.rms_after_mg:.3f} mg, '
+            f'{"levelled" if calibration.is_levelled else "not levelled"}')
