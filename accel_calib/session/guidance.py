@@ -250,7 +250,7 @@ class Guide:
         if not added:
             return '' if done else f'this rest repeats an earlier pose; next: {self.advice}'
         noise = ''
-        if poses.noise is not None and units.name != 'native':
+        if poses.noise is not None and not units.is_native:
             latest = poses.noise[int(np.argmax(poses['time']))]
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
         if done and len(poses) > asked.total:

@@ -106,7 +106,7 @@ class Session:
         self.computing = 0
         _check_frames(settings)
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
-        self._largest = (_LARGEST_NATIVE if self.units.name == 'native'
+        self._largest = (_LARGEST_NATIVE if self.units.is_native
                          else _LARGEST_G * self.units.per_g)
         self._events: list[Event] = []
         if settings.sensor or settings.calibration_file:

@@ -148,7 +148,7 @@ class StreamStatistics:
 
     def length_g(self, units: Units) -> float:
         """Return |a| of the last messages [g]; NaN if not known."""
-        if self.reading is None or units.name == 'native':
+        if self.reading is None or units.is_native:
             return math.nan
         return float(np.linalg.norm(self.reading)) / units.per_g
 
@@ -221,7 +221,7 @@ class NewestReading:
         """
         force = None if calibration is None else self._force(calibration, reading, known)
         corrected = math.nan if force is None else math.hypot(*force)
-        if self._units.name != 'native':
+        if not self._units.is_native:
             length = math.hypot(*reading)
             return Newest(_unit(reading, length), length / self._units.per_g, corrected)
         if calibration is None or force is None:

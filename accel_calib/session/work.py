@@ -93,7 +93,7 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
     """
     full = before is not None and not is_partial(before)
     up = poses_up(poses, units)
-    few = units.name != 'native' and len(up) >= _FEWEST_IN_CONE and lies_in_cone(up)
+    few = not units.is_native and len(up) >= _FEWEST_IN_CONE and lies_in_cone(up)
     if few and not full:
         calibration = fit_partial(poses, units, sensor=sensor, date=now())
     else:
@@ -214,7 +214,7 @@ def poses_up(poses: Poses, units: Units) -> Floats:
         Unit vectors; n = 0 if the centre of native readings is not known.
 
     """
-    if units.name == 'native' and len(poses) < _FEWEST_NATIVE:
+    if units.is_native and len(poses) < _FEWEST_NATIVE:
         return np.zeros((0, 3))
     try:
         return directions_of(poses, units)
@@ -232,7 +232,7 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
     """
     up = poses_up(poses, units)
     noise, noise_g = pose_noise(poses.noise, up), None
-    if noise is not None and len(noise) and units.name != 'native':
+    if noise is not None and len(noise) and not units.is_native:
         noise_g = float(np.median(units.to_g(noise)))
     fitted_model = '10' if model == 'auto' else model
     asked = next_pose(up, fitted_model, noise, noise_g=noise_g)
@@ -246,7 +246,7 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
 
 def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
     """Return the centre of native readings; empty for readings whose zero is known."""
-    if units.name != 'native':
+    if not units.is_native:
         return ()
     return tuple(fit_4(poses.reading)[1].tolist())
 
