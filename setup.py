@@ -91,9 +91,9 @@ setup(
     entry_points={
         'console_scripts': [
             'accel-calib = accel_calib.cli.main:main',
-            'calibrator = accel_calib.ros.calibrator:main',
-            'calibrator_lifecycle = accel_calib.ros.calibrator_lifecycle:main',
-            'simulator = accel_calib.ros.simulator:main',
+            'calibrator = accel_calib.ros.run:calibrator',
+            'calibrator_lifecycle = accel_calib.ros.run:calibrator_lifecycle',
+            'simulator = accel_calib.ros.run:simulator',
         ],
     },
 )

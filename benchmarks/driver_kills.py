@@ -158,8 +158,9 @@ class World:
         if name == 'calibrator':
             with (folder / 'calibrator.log').open('ab') as log:
                 self.running[name] = subprocess.Popen(
-                    [sys.executable, '-X', 'faulthandler', '-m', 'accel_calib.ros.calibrator',
-                     '--ros-args', '-p', 'passthrough:=true'], cwd=folder, stdout=log, stderr=log)
+                    [sys.executable, '-X', 'faulthandler', '-m', 'accel_calib.ros.run',
+                     'calibrator', '--ros-args', '-p', 'passthrough:=true'], cwd=folder,
+                    stdout=log, stderr=log)
             return
         target, given = {
             'driver': (clients.drive, (self.trial, self.sent, RATE)),

@@ -185,5 +185,5 @@ def relay(kind: str) -> list[str]:
 def node(calibration: Path, *parameters: str) -> list[str]:
     """Return the command of the node with a stored calibration."""
     given = [part for parameter in parameters for part in ('-p', parameter)]
-    return ['-m', 'accel_calib.ros.calibrator', '--ros-args', '--log-level', 'error', '-p',
+    return ['-m', 'accel_calib.ros.run', 'calibrator', '--ros-args', '--log-level', 'error', '-p',
             f'calibration_file:={calibration}', *given]

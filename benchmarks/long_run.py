@@ -232,7 +232,7 @@ def look(node: int, bare: int) -> Sample:
 @contextmanager
 def calibrator(environment: dict[str, str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run the node, and write what it prints to a file."""
-    command = [sys.executable, '-m', 'accel_calib.ros.calibrator', '--ros-args', '-p',
+    command = [sys.executable, '-m', 'accel_calib.ros.run', 'calibrator', '--ros-args', '-p',
                'passthrough:=true']
     with log.open('wb') as printed:
         running = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=printed,

@@ -145,7 +145,7 @@ from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
 from accel_calib.report.sections import linear_figures
 from accel_calib.report.sheet import snippets
-from accel_calib.ros.domain import own_domain
+from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store
 from accel_calib.session import worker
 from accel_calib.session.guidance import Guide, next_action, Plan
@@ -176,7 +176,7 @@ COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""
 
 NODES = {
-    name: ('-m', f'accel_calib.ros.{name}')
+    name: ('-m', 'accel_calib.ros.run', name)
     for name in ('calibrator', 'calibrator_lifecycle', 'simulator')}
 """Arguments of Python that run a node, by its name."""
 

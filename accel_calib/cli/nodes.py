@@ -31,16 +31,16 @@ CHECK_FAILED = 1
 
 def run_node(args: argparse.Namespace) -> Done:
     """Run the calibrator until it is ended."""
-    from ..ros.calibrator import main
+    from ..ros.run import calibrator
 
-    return Done(status=main([args.command, *args.for_ros]))
+    return Done(status=calibrator([args.command, *args.for_ros]))
 
 
 def run_simulator(args: argparse.Namespace) -> Done:
     """Run the simulator until it is ended."""
-    from ..ros.simulator import main
+    from ..ros.run import simulator
 
-    return Done(status=main([args.command, *args.for_ros]))
+    return Done(status=simulator([args.command, *args.for_ros]))
 
 
 def run_live(args: argparse.Namespace) -> Done:

@@ -4,8 +4,8 @@
 """
 The ROS nodes. They only convert messages, call other parts, and publish the results.
 
-`calibrator` and `simulator` are the executables, and `calibrator_node` and `simulator_node` the
-nodes; `run` starts, spins and ends them. In the calibrator, `stream` processes Imu messages,
+`calibrator_node`, `managed_node` and `simulator_node` are the nodes; `run` has the executables,
+which start, spin and end them. In the calibrator, `stream` processes Imu messages,
 `services` answers service calls and runs jobs, `display` makes diagnostics and markers,
 `declare` declares parameters, and `qos` defines the quality of service. `demo` runs both nodes.
 

@@ -6,7 +6,7 @@ The calibrator node: it converts messages, calls the session, and publishes its 
 
 `accel_calib.session` contains the state, and `stream` processes Imu messages. Diagnostics use a
 steady clock, so they are also published without ``/clock``. `Calibrator` is the same for the plain
-node and for the managed node (`calibrator_lifecycle`).
+node and for the managed node (`managed_node`).
 
 """
 

@@ -40,7 +40,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from . import qos
-from .domain import own_domain
+from .run import own_domain
 from ..effects import parse_effect
 from ..errors import AccelCalibError
 from ..stored import read_calibration

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibrator as a managed node; see `calibrator_lifecycle`."""
+"""The calibrator as a managed node; see `run`."""
 
 from __future__ import annotations
 

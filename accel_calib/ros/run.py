@@ -2,19 +2,34 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Start, spin and shut down a node, also after Ctrl-C and other signals.
+The executables: start, spin and shut down a node, also after Ctrl-C and other signals.
 
 A signal stops the executor, and the node then ends between two callbacks. The handlers of rclpy
 would shut down ROS in another thread, so that a callback could fail at every line that uses ROS.
+
+``calibrator_lifecycle`` is the calibrator as a managed node:
+
+==============  ==========================================================================
+transition      effect
+==============  ==========================================================================
+``configure``   reads the parameters and loads the calibration; poses can be captured
+``activate``    publishes corrected messages
+``deactivate``  stops publishing them
+``cleanup``     closes the files
+==============  ==========================================================================
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import gc
 from importlib import import_module
 import os
+import random
 import signal
+from socket import AF_INET, SOCK_DGRAM, socket
 import sys
 from threading import Thread
 from typing import TYPE_CHECKING
@@ -37,6 +52,25 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _SWITCH = 1e-4
 """Switch interval of the interpreter [s]; the longest wait of a message for another thread."""
+
+
+def calibrator(args: Sequence[str] | None = None) -> int:
+    """Run the calibrator until it is ended; parameters and exit status as `run`."""
+    return run('.calibrator_node:CalibratorNode', args)
+
+
+def calibrator_lifecycle(args: Sequence[str] | None = None) -> int:
+    """Run the managed calibrator until it is ended; parameters and exit status as `run`."""
+    return run('.managed_node:ManagedCalibrator', args)
+
+
+def simulator(args: Sequence[str] | None = None) -> int:
+    """Run the simulator until it is ended; parameters and exit status as `run`."""
+    return run('.simulator_node:SimulatorNode', args)
+
+
+EXECUTABLES = {each.__name__: each for each in (calibrator, calibrator_lifecycle, simulator)}
+"""The executables by name: ``python -m accel_calib.ros.run calibrator``."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
@@ -137,3 +171,40 @@ def _executor() -> Executor:
 def _refuse(line: str) -> int:
     print(f'accel-calib: {line}', file=sys.stderr)
     return _BAD_INPUT
+
+
+_DOMAINS = range(1, 102)
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """
+    Yield a DDS domain that nobody else on this machine uses.
+
+    Of the UDP ports of a domain, DDS does not use the third one. This process holds it, so that
+    other processes with a domain of this function have another one. A domain in which somebody
+    else has a first participant is left out, too.
+
+    Raises
+    ------
+    AccelCalibError
+        If all domains are in use.
+
+    """
+    for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):
+        ports = 7400 + 250 * domain
+        with socket(AF_INET, SOCK_DGRAM) as held, socket(AF_INET, SOCK_DGRAM) as participant:
+            try:
+                held.bind(('127.0.0.1', ports + 2))
+                participant.bind(('', ports + 10))
+            except OSError:
+                continue
+            participant.close()
+            yield domain
+            return
+    raise AccelCalibError('the DDS domains 1 to 101 are all in use',
+                          'end demonstrations or tests that still run')
+
+
+if __name__ == '__main__':
+    sys.exit(EXECUTABLES[sys.argv[1]](sys.argv[1:]))
