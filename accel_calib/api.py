@@ -25,11 +25,11 @@ from .compare import Comparison
 from .effects import model_with, simulate_poses, simulate_recording
 from .errors import InputError
 from .finding import Finding
+from .findings import rate, Rating
 from .geometry import spread_directions
 from .intake import nothing_still, poses_of
 from .logs import LogOptions, open_log, read_log
 from .logs import read_recording as read_whole_recording
-from .rating import rate, Rating
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration

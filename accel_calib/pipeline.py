@@ -18,7 +18,7 @@ from .calibrate import (
 )
 from .effects import PROCESSES
 from .errors import RefusedFitError
-from .rating import rate, Rating
+from .findings import rate, Rating
 from .refine import refine, refine_with_fleet, Refinement
 from .table import Poses
 from .text import now, short

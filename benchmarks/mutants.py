@@ -38,8 +38,8 @@ from cosmic_ray.plugins import get_operator, operator_names
 import coverage
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'messages', 'monitor',
-           'rating', 'refine')
+FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings',
+           'messages', 'refine')
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
                    r'|OrWithAnd)')
 ELSEWHERE = re.compile(

@@ -31,7 +31,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.rating import Expected, GOOD_MG, rate, rate_refinement, Rating  # noqa: E402
+from accel_calib.findings import Expected, GOOD_MG, rate, rate_refinement, Rating  # noqa: E402
 from accel_calib.refine import refine  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402

@@ -20,8 +20,8 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 from accel_calib.effects import EFFECTS  # noqa: E402
+from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
-from accel_calib.rating import LIMITS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 import api_page  # noqa: E402
 

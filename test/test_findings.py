@@ -10,7 +10,7 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level
 from accel_calib.finding import Finding, KINDS, ranked, without
-from accel_calib.rating import rate, Rating
+from accel_calib.findings import rate, Rating
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of

@@ -13,7 +13,7 @@ from accel_calib.calibrate import verify
 from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.finding import Finding
-from accel_calib.rating import rate, rate_comparison, rate_verification, Rating
+from accel_calib.findings import rate, rate_comparison, rate_verification, Rating
 from accel_calib.report import write_history_page
 from inside import (
     calibration_page,

@@ -10,7 +10,7 @@ from accel_calib.effects import effect_named, EFFECTS, empirical_name, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import variance_factor
 from accel_calib.finding import has
-from accel_calib.rating import rate
+from accel_calib.findings import rate
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
 from inside import (

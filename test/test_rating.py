@@ -8,8 +8,7 @@ from dataclasses import replace
 import accel_calib as ac
 from accel_calib.calibrate import fit_partial, fit_poses, mounting_only, verify
 from accel_calib.capture import capture
-from accel_calib.logs import read_poses, read_recording
-from accel_calib.rating import (
+from accel_calib.findings import (
     Expected,
     GOOD_MG,
     rate,
@@ -17,6 +16,7 @@ from accel_calib.rating import (
     rate_refinement,
     rate_verification,
 )
+from accel_calib.logs import read_poses, read_recording
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import spread_directions

@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, findings, Level, Log, Session, state, Task
+from accel_calib.session import CalibratorSettings, checks, Level, Log, Session, state, Task
 from accel_calib.stored import read_calibration, write_calibration
 from inside import (
     Identity,
@@ -84,7 +84,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in findings(state.health(self.session)) if each.name == name)
+        return next(each for each in checks(state.health(self.session)) if each.name == name)
 
 
 @pytest.mark.parametrize(('one', 'other'), [

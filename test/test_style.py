@@ -24,7 +24,7 @@ LAYERS = (
     ('calibrate',),
     ('refine',),
     ('compare', 'noise'),
-    ('rating',),
+    ('findings',),
     ('stored',),
     ('messages',),
     ('intake', 'pipeline'),

@@ -20,7 +20,7 @@ from .frame import Done, plain, table, working
 from .inputs import intake_for, rows_between
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
-from ..rating import rate_comparison, rate_verification
+from ..findings import rate_comparison, rate_verification
 from ..stored import read_calibration
 from ..table import check_units
 from ..text import short

@@ -28,8 +28,8 @@ from ..calibrate import (
 from ..effects import effect_named, LADDER, value_unit
 from ..errors import InputError
 from ..estimate.closed_form import sensing_axes
+from ..findings import rate, Rating
 from ..intake import Intake
-from ..rating import rate, Rating
 from ..stored import write_calibration
 from ..table import Floats, Poses
 from ..text import counted, now, short, with_sd

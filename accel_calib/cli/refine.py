@@ -18,7 +18,7 @@ from .frame import Done, Output, working
 from .inputs import intake, intake_for, prior, rows_between
 from ..calibrate import Calibration
 from ..effects import effect_named
-from ..rating import rate_refinement
+from ..findings import rate_refinement
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
 from ..report import write_figures, write_page

@@ -30,8 +30,8 @@ from .messages import PERIOD
 from .server import PageServer
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
+from ..findings import rate, Rating
 from ..messages.one_reading import Triple
-from ..rating import rate, Rating
 from ..report.page import calibration_page, STORED
 from ..session import (
     BATCH,

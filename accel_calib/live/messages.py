@@ -24,10 +24,10 @@ from .. import __version__
 from ..calibrate import Calibration
 from ..calibrate.pose_planning import words_of
 from ..errors import InputError
-from ..rating import Rating
+from ..findings import Rating
 from ..session.events import Severity
 from ..session.guidance import Progress
-from ..session.health import findings, Health, Level
+from ..session.health import checks, Health, Level
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
 from ..units import MG
@@ -184,7 +184,7 @@ def state(health: Health, problem: str, *, shown: Calibration | None, preview: b
 
 def _problem(health: Health) -> str:
     """Return the most severe finding, other than that there is no calibration yet."""
-    found = [each for each in findings(health) if each.level > Level.OK and (
+    found = [each for each in checks(health) if each.level > Level.OK and (
         each.name != 'calibration' or health.calibration or health.problem)]
     return max(found, key=lambda each: each.level).words if found else ''
 

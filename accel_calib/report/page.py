@@ -22,12 +22,12 @@ from .residuals import Residuals, residuals_of
 from .sheet import heading, listing, section, sheet
 from .. import __version__
 from ..disk import write_atomically
-from ..rating import rate_refinement
+from ..findings import rate_refinement
 from ..refine.words import verdict_words
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration, Verification
-    from ..rating import Rating
+    from ..findings import Rating
     from ..refine import Refinement
     from ..table import Poses
 

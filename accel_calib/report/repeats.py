@@ -40,14 +40,14 @@ from ..compare import Comparison, History
 from ..compare.comparison import Parameter
 from ..disk import write_atomically
 from ..effects import value_unit
-from ..rating import rate_comparison
+from ..findings import rate_comparison
 from ..table import Floats
 from ..text import short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration
-    from ..rating import Rating
+    from ..findings import Rating
 
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
 _BAND = 1.96

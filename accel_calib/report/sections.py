@@ -54,7 +54,7 @@ from ..units import MG
 
 if TYPE_CHECKING:
     from ..calibrate import Verification
-    from ..rating import Rating
+    from ..findings import Rating
     from ..refine import Refinement, Step
 
 _STEP = 1e-6

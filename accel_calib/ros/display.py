@@ -18,7 +18,7 @@ import numpy as np
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ..session import Finding, findings, Health, worst
+from ..session import Check, checks, Health, worst
 from ..session.health import figures, Level
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def statuses_of(health: Health, node: str) -> list[DiagnosticStatus]:
 
 
 def self_test_of(health: Health, node: str) -> list[DiagnosticStatus]:
-    """Return one status for each finding; the test passes if all are OK."""
-    return [_status(finding, node, health.sensor) for finding in findings(health)]
+    """Return one status for each check; the test passes if all are OK."""
+    return [_status(check, node, health.sensor) for check in checks(health)]
 
 
 def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
@@ -47,9 +47,9 @@ def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
                             message=progress.advice, values=_values(progress.figures()))
 
 
-def _status(finding: Finding, node: str, sensor: str) -> DiagnosticStatus:
-    return DiagnosticStatus(level=bytes([finding.level]), name=f'{node}: {finding.name}',
-                            message=finding.words, hardware_id=sensor)
+def _status(check: Check, node: str, sensor: str) -> DiagnosticStatus:
+    return DiagnosticStatus(level=bytes([check.level]), name=f'{node}: {check.name}',
+                            message=check.words, hardware_id=sensor)
 
 
 def _values(named: Iterable[tuple[str, str]]) -> list[KeyValue]:

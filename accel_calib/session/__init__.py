@@ -15,11 +15,11 @@ has log lines. `settings` defines the parameters.
 from . import state
 from .events import Event, Log, LogFilter, Mounting, ShowPoses, Still
 from .guidance import Progress
-from .health import Finding, findings, Health, Level, worst
+from .health import Check, checks, Health, Level, worst
 from .session import BATCH, Session
 from .settings import CalibratorSettings, WEB_PORT
 from .worker import Compute, Files, Step, Task
 
-__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Compute', 'Event', 'Files', 'Finding',
-           'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
-           'Step', 'Still', 'Task', 'findings', 'state', 'worst']
+__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Check', 'Compute', 'Event', 'Files',
+           'Finding', 'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session',
+           'ShowPoses', 'Step', 'Still', 'Task', 'checks', 'state', 'worst']

@@ -121,7 +121,7 @@ class Health:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Check:
     """The result of one check: name, severity and text."""
 
     name: str
@@ -129,26 +129,26 @@ class Finding:
     words: str
 
 
-def findings(health: Health) -> list[Finding]:
-    """Return the findings of all checks, one for each concern."""
+def checks(health: Health) -> list[Check]:
+    """Return the results of all checks, one for each concern."""
     return [_stream(health), _calibration(health), _drift(health), _storage(health)]
 
 
-def worst(health: Health) -> Finding:
-    """Return the most severe finding, or the state if all findings are OK."""
-    found = max(findings(health), key=lambda finding: finding.level)
+def worst(health: Health) -> Check:
+    """Return the most severe check, or the state if all are OK."""
+    found = max(checks(health), key=lambda check: check.level)
     if found.level == Level.OK:
-        return Finding('state', Level.OK, health.state)
-    return Finding('state', found.level, found.words)
+        return Check('state', Level.OK, health.state)
+    return Check('state', found.level, found.words)
 
 
-def _stream(health: Health) -> Finding:
+def _stream(health: Health) -> Check:
     """Return the first fault of the stream, or its rate."""
     fault = stream_fault(health.statistics, health.length, health.topic, health.publishers,
                          health.mismatches)
     if fault:
-        return Finding('stream', Level.WARN, fault)
-    return Finding('stream', Level.OK, f'{health.statistics.rate:.1f} Hz on {health.topic}')
+        return Check('stream', Level.WARN, fault)
+    return Check('stream', Level.OK, f'{health.statistics.rate:.1f} Hz on {health.topic}')
 
 
 def stream_fault(statistics: StreamStatistics, length: float, topic: str,
@@ -203,31 +203,31 @@ def _wrong_unit(statistics: StreamStatistics, length: float) -> str:
             f'units:={likely}')
 
 
-def _calibration(health: Health) -> Finding:
+def _calibration(health: Health) -> Check:
     if health.problem:
-        return Finding('calibration', Level.ERROR, health.problem)
+        return Check('calibration', Level.ERROR, health.problem)
     if not health.calibration:
-        return Finding('calibration', Level.WARN, 'no calibration yet, captured '
-                       f'{counted(health.poses, "pose")}: {health.next_pose or "turn the sensor"}')
+        return Check('calibration', Level.WARN, 'no calibration yet, captured '
+                     f'{counted(health.poses, "pose")}: {health.next_pose or "turn the sensor"}')
     if health.outside:
-        return Finding('calibration', Level.WARN, f'{health.outside}: {USES_LIMIT}; '
-                       'capture poses there and call ~/refine')
-    return Finding('calibration', Level.OK, health.calibration)
+        return Check('calibration', Level.WARN, f'{health.outside}: {USES_LIMIT}; '
+                     'capture poses there and call ~/refine')
+    return Check('calibration', Level.OK, health.calibration)
 
 
-def _drift(health: Health) -> Finding:
+def _drift(health: Health) -> Check:
     if health.drift is None:
-        return Finding('drift', Level.OK, 'no calibration yet')
+        return Check('drift', Level.OK, 'no calibration yet')
     changed = health.drift.change is not None
-    return Finding('drift', Level.WARN if changed else Level.OK, status(health.drift))
+    return Check('drift', Level.WARN if changed else Level.OK, status(health.drift))
 
 
-def _storage(health: Health) -> Finding:
+def _storage(health: Health) -> Check:
     if health.writable:
-        return Finding('storage', Level.OK, health.file)
-    return Finding('storage', Level.ERROR, f'{health.file} cannot be written: correct the '
-                                           'permissions, or restart the node with another '
-                                           'calibration_file')
+        return Check('storage', Level.OK, health.file)
+    return Check('storage', Level.ERROR, f'{health.file} cannot be written: correct the '
+                                         'permissions, or restart the node with another '
+                                         'calibration_file')
 
 
 def figures(health: Health) -> Iterable[tuple[str, str]]:

@@ -30,8 +30,8 @@ from ..effects import Context, LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate.closed_form import fit_4
 from ..estimate.geometry import coverage, pose_noise
+from ..findings import rate, rate_refinement
 from ..geometry import spread_directions
-from ..rating import rate, rate_refinement
 from ..refine import refine, Refinement
 from ..refine.words import residual_words, verdict_words
 from ..table import Floats, Poses

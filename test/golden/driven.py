@@ -14,7 +14,7 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import CalibratorSettings, findings, Log, Session, ShowPoses, state, Task
+from accel_calib.session import CalibratorSettings, checks, Log, Session, ShowPoses, state, Task
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
@@ -76,9 +76,9 @@ class _Driver:
         self._handle()
 
     def state(self) -> Any:
-        """Return progress, diagnostics, findings and poses."""
+        """Return progress, diagnostics, checks and poses."""
         health = state.health(self.session)
-        return [state.progress(self.session), dict(health_figures(health)), findings(health),
+        return [state.progress(self.session), dict(health_figures(health)), checks(health),
                 self.shown, self.session.sensor.live.book.poses(), self.session.sensor.drift]
 
     def lines(self) -> Any:

@@ -22,7 +22,7 @@ from accel_calib.calibrate import (
 from accel_calib.compare import monitor
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
-from accel_calib.rating import Expected, rate
+from accel_calib.findings import Expected, rate
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units

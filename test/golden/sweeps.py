@@ -37,7 +37,7 @@ from accel_calib.estimate import (
     variance_factor,
 )
 from accel_calib.finding import Finding, LEVELS
-from accel_calib.rating import Expected, LIMITS, rate
+from accel_calib.findings import Expected, LIMITS, rate
 from accel_calib.table import check_units, numbered, Poses
 from accel_calib.units import units_of
 from golden.driven import messages

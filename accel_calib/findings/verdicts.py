@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING
 
 from .expected import directions_in, Expected
 from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
-from .shortcomings import (
-    advice_of,
-    degrees,
-    findings_of,
-    mg,
-    number,
-    temperature_words,
-)
+from .rules import advice_of, degrees, findings_of, mg, number, temperature_words
 from ..calibrate import Calibration, Verification
 from ..estimate.geometry import coverage
 from ..finding import Finding, Level, ranked

@@ -14,12 +14,7 @@ from ..calibrate import Calibration, in_g, next_pose, NextPose, PRIOR
 from ..calibrate.gate import deviations_g
 from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict
 from ..estimate.equations import variance_factor
-from ..estimate.geometry import (
-    error_left_in,
-    free_parameters,
-    identifiability,
-    pose_noise,
-)
+from ..estimate.geometry import error_left_in, free_parameters, identifiability, pose_noise
 from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG
