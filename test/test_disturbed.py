@@ -3,8 +3,10 @@
 
 """Outliers are found, and clean poses are kept."""
 
+import accel_calib as ac
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import RefusedFitError
+from accel_calib.finding import has
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import Model, simulate_poses, spread_directions
@@ -105,3 +107,13 @@ def test_poses_that_count_once_are_too_few_for_the_model():
     poses = knocked(6, 8, 0)
     with pytest.raises(RefusedFitError, match='14 poses have 8 directions'):
         fit_poses(with_copies(poses, [0, 1, 2, 3, 4, 5]), G, model='10')
+
+
+def test_a_region_that_only_outliers_cover_is_named():
+    up = spread_directions(60)
+    up = np.vstack([up[up[:, 2] < -0.2], [[0.0, 0.0, 1.0]]])
+    poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, directions=up, units='g')
+    poses.reading[-1] *= 1.2
+    found = fit_poses(poses, G, model='10')
+    assert [each.row for each in found.rejected] == [len(up)]
+    assert has(found.noted, 'uncovered')

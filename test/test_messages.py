@@ -222,6 +222,11 @@ def random_message(rng, frame_id=None):
     return b'\0\1\0\0' + head + rng.bytes(-len(head) % 8) + doubles.tobytes()
 
 
+@pytest.mark.parametrize('name', ['', 'imu_link', 'robot/imü'])
+def test_a_layout_has_the_frame_id_of_its_messages(name):
+    assert layout_of(random_message(np.random.default_rng(1), name)).frame_id == name
+
+
 def swapped(data):
     """Return a little-endian message as a big-endian machine writes it."""
     begin = layout_of(data).begin
