@@ -72,7 +72,7 @@ setup(
         'test-fleet': [*FLEET, 'flask>=2.2.5,<4', 'flask-cors>=4,<7', 'moto[s3]>=5,<6',
                        's3fs>=2024.2,<2027'],
         # What changes operators, and which tests execute a line: make mutants.
-        'mutants': ['cosmic-ray>=8.4,<9', 'pytest-cov>=5,<8'],
+        'mutants': ['cosmic-ray>=8.4.1,<9', 'pytest-cov>=5,<8'],
         'dev': [
             'flake8',
             'flake8-builtins',
