@@ -39,6 +39,16 @@ def test_noisy_poses_give_the_same_result_in_counts_and_in_g(name):
     np.testing.assert_allclose((v_counts - 30000) / 16384, v_g, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize('name', NAMES)
+def test_repeated_poses_give_the_result_of_one_of_each(name):
+    rng = np.random.default_rng(6)
+    reading = predict(sensor(rng, *MODELS[name]), random_directions(30, rng), {})
+    reading = reading + rng.normal(size=reading.shape) * 0.002
+    once, often = closed_form(name, reading), closed_form(name, np.tile(reading, (600, 1)))
+    np.testing.assert_allclose(often[0], once[0], atol=1e-9)
+    np.testing.assert_allclose(often[1], once[1], atol=1e-9)
+
+
 @pytest.mark.parametrize('method', ['ml', 'algebraic'])
 def test_poses_on_a_hyperboloid_are_refused(method):
     grid = np.linspace(-1.0, 1.0, 7)

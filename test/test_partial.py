@@ -309,3 +309,10 @@ def test_a_partial_fit_is_better_than_none_and_refine_completes_it():
     assert not found.refusal
     assert found.remaining_gap_mg < 0.5
     assert verify(found.calibration, far).rms_after_mg < 0.5
+
+
+def test_a_partial_fit_has_the_name_that_is_given_or_that_of_the_poses():
+    up = np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.2, 1.0]])
+    poses = replace(simulate_poses(Model({}), up, np.random.default_rng(1)), sensor='left')
+    assert fit_partial(poses, G).sensor == 'left'
+    assert fit_partial(poses, G, sensor='right').sensor == 'right'
