@@ -21,5 +21,5 @@ from .settings import CalibratorSettings, WEB_PORT
 from .worker import Compute, Files, Step, Task
 
 __all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Check', 'Compute', 'Event', 'Files',
-           'Finding', 'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session',
-           'ShowPoses', 'Step', 'Still', 'Task', 'checks', 'state', 'worst']
+           'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
+           'Step', 'Still', 'Task', 'checks', 'state', 'worst']

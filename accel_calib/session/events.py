@@ -19,10 +19,11 @@ Severity = Literal['info', 'warning', 'error']
 
 @dataclass(frozen=True)
 class Log:
-    """A log line; if `once_in` is not 0, it is logged at most once in this time [s]."""
+    """A log line; lines of one kind, if it has one, are logged at most once in `once_in` [s]."""
 
     severity: Severity
     words: str
+    kind: str = ''
     once_in: float = 0.0
 
 
@@ -52,7 +53,7 @@ class Mounting:
 
 class LogFilter:
     """
-    Decide which lines are logged: not empty, and not again within their `once_in`.
+    Decide which lines are logged: not empty, and none of the same kind within `once_in`.
 
     Parameters
     ----------
@@ -67,12 +68,12 @@ class LogFilter:
 
     def passes(self, line: Log) -> bool:
         """Return whether to log a line, and note it."""
-        if not line.once_in:
+        if not line.kind:
             return bool(line.words)
-        kind, now = line.words[:20], self._clock()
-        if now - self._last.get(kind, -line.once_in) < line.once_in:
+        now = self._clock()
+        if now - self._last.get(line.kind, -line.once_in) < line.once_in:
             return False
-        self._last[kind] = now
+        self._last[line.kind] = now
         return True
 
 

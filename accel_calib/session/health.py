@@ -144,20 +144,23 @@ def worst(health: Health) -> Check:
 
 def _stream(health: Health) -> Check:
     """Return the first fault of the stream, or its rate."""
-    fault = stream_fault(health.statistics, health.length, health.topic, health.publishers,
-                         health.mismatches)
-    if fault:
-        return Check('stream', Level.WARN, fault)
+    faults = stream_faults(health.statistics, health.length, health.topic, health.publishers,
+                           health.mismatches)
+    if faults:
+        return Check('stream', Level.WARN, '; '.join(faults.values()))
     return Check('stream', Level.OK, f'{health.statistics.rate:.1f} Hz on {health.topic}')
 
 
-def stream_fault(statistics: StreamStatistics, length: float, topic: str,
-                 publishers: Sequence[str] | None, mismatches: Sequence[str] = ()) -> str:
-    """Return what is wrong with the messages, and what to do; arguments as in `Health`."""
+def stream_faults(statistics: StreamStatistics, length: float, topic: str,
+                  publishers: Sequence[str] | None, mismatches: Sequence[str] = ()
+                  ) -> dict[str, str]:
+    """Return by kind what is wrong with the messages; arguments as in `Health`."""
     silence = '' if mismatches else _silence(statistics, topic, publishers)
-    faults = (_publishers(topic, publishers), *mismatches, silence, statistics.stamp_fault,
-              _dropped(statistics), _wrong_unit(statistics, length))
-    return '; '.join(filter(None, faults))
+    faults = {
+        'publishers': _publishers(topic, publishers), 'mismatches': '; '.join(mismatches),
+        'silence' if publishers else 'no_publisher': silence, 'stamps': statistics.stamp_fault,
+        **_dropped(statistics), 'unit': _wrong_unit(statistics, length)}
+    return {kind: words for kind, words in faults.items() if words}
 
 
 def _publishers(topic: str, names: Sequence[str] | None) -> str:
@@ -181,16 +184,18 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
             'imu/data_raw to its topic')
 
 
-def _dropped(statistics: StreamStatistics) -> str:
+def _dropped(statistics: StreamStatistics) -> dict[str, str]:
     if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
-        return ''
-    return '; '.join(words for count, words in (
-        (statistics.not_finite, f'dropped {counted(statistics.not_finite, "message")} with NaN, '
-                                'infinite or absurd readings: check the driver'),
-        (statistics.foreign, f'dropped {counted(statistics.foreign, "message")} of another '
-                             'sensor: use a separate topic for each sensor'),
-        (statistics.implausible, f'dropped {counted(statistics.implausible, "corrected message")} '
-                                 'with implausible values: check the calibration')) if count)
+        return {}
+    absurd, foreign, implausible = (
+        statistics.not_finite, statistics.foreign, statistics.implausible)
+    return {
+        'not_finite': f'dropped {counted(absurd, "message")} with NaN, infinite or absurd '
+                      'readings: check the driver' if absurd else '',
+        'foreign': f'dropped {counted(foreign, "message")} of another sensor: use a separate '
+                   'topic for each sensor' if foreign else '',
+        'implausible': f'dropped {counted(implausible, "corrected message")} with implausible '
+                       'values: check the calibration' if implausible else ''}
 
 
 def _wrong_unit(statistics: StreamStatistics, length: float) -> str:

@@ -134,9 +134,9 @@ class Session:
         found, self._events = self._events, []
         return found
 
-    def log(self, severity: Severity, words: str, *, once_in: float = 0.0) -> None:
-        """Add a log line to the events."""
-        self._events.append(Log(severity, words, once_in))
+    def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
+        """Add a log line to the events; parameters as in `Log`."""
+        self._events.append(Log(severity, words, kind, once_in))
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
@@ -362,7 +362,7 @@ class Session:
             yield Files() if store is None else Files(store.save_poses, poses)
         except OSError as error:
             self.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
-                     once_in=AGAIN)
+                     'not_stored', AGAIN)
         # Computed even where only an average has changed, so that the lines keep their order.
         plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
         if due and not len(poses):  # without the start of the worker process
