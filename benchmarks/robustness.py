@@ -180,7 +180,7 @@ def of_wiring(job: Job) -> bool:
             return 'm/s2' in error.advice
         return False
     found = fit_poses(case.poses.with_columns(reading=reading), G)
-    reported = [text for text in found.warnings if 'wrong sign' in text or 'swapped' in text]
+    reported = [each.text for each in found.noted if each.kind == 'wiring']
     return not reported if fault == 'none' else bool(reported) and words in reported[0]
 
 

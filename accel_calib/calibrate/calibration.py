@@ -164,7 +164,7 @@ class Calibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return the findings as lines of text."""
+        """What was noted, as lines of text."""
         return tuple(each.words for each in self.noted)
 
     @property

@@ -148,8 +148,7 @@ def _history_result(paths: Sequence[Path], history: History) -> dict[str, Any]:
             'from': number, 'to': number + 1, 'agree': comparison.agree,
             'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
             'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
-            'change': change.change, 'change_sd': change.sd, 'rating': rating.name,
-            'rating_reason': rating.reason})
+            'change': change.change, 'change_sd': change.sd, **rated(rating)})
     return {
         'agree': history.whole.agree, 'p_value': history.whole.p_value,
         'runs': [{'file': paths[moment.index], 'date': moment.when and moment.when.isoformat(),

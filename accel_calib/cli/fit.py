@@ -50,7 +50,7 @@ def run_fit(args: argparse.Namespace) -> Done:
         calibration = _fit(args, found, rows_between(found.poses, args.rows))
         calibration = level_by_rows(calibration, found.poses, args.frame, args.flat,
                                     args.nose_down)
-    rating = rate(calibration)
+    rating, ahead = rate(calibration), outlook(calibration, args.model)
     stored = [] if args.output is None else [_store(args, calibration, rating)]
     if args.report is not None:
         from ..report import write_calibration_page
@@ -60,9 +60,9 @@ def run_fit(args: argparse.Namespace) -> Done:
                                    stored=str(args.output or 'calibration.yaml'),
                                    notes=found.lines)
         stored.append(f'stored in {args.report}')
-    return Done({'file': args.poses, **calibration_result(calibration, args.model),
+    return Done({'file': args.poses, **calibration_result(calibration, ahead),
                  **rated(rating), 'read_lines': found.lines},
-                [*_shown(args, found, calibration), *stored, *rating.lines],
+                [*_shown(found, calibration, ahead), *stored, *rating.lines],
                 BAD_RATING if rating.name == 'BAD' else 0)
 
 
@@ -86,11 +86,11 @@ def _fit(args: argparse.Namespace, found: Intake, chosen: Poses) -> Calibration:
     return fit_with_fleet(chosen, found.units, fleet, sensor=args.sensor, date=now())
 
 
-def _shown(args: argparse.Namespace, found: Intake, calibration: Calibration) -> Iterator[Any]:
+def _shown(found: Intake, calibration: Calibration, ahead: Outlook) -> Iterator[Any]:
     yield from found.lines
     yield from calibration_lines(calibration)
     yield f'model {calibration.name}: {calibration.reason}'
-    yield f'next pose: {outlook(calibration, args.model).next_pose.words}'
+    yield f'next pose: {ahead.next_pose.words}'
 
 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
@@ -123,9 +123,10 @@ def run_calibrate(args: argparse.Namespace) -> Done:
                              frame=args.frame, sensor=args.sensor, refined=args.refined,
                              fleet=prior(args))
     stored = _stored_outcome(args, found, outcome)
+    ahead = outlook(outcome.calibration, 'auto')
     refinement, rating = outcome.refinement, outcome.rating
     return Done(
-        {'file': args.log, **calibration_result(outcome.calibration, 'auto'), **rated(rating),
+        {'file': args.log, **calibration_result(outcome.calibration, ahead), **rated(rating),
          'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_result(refinement)},
         [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
@@ -177,8 +178,8 @@ def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
     yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
 
 
-def calibration_result(calibration: Calibration, asked: str) -> dict[str, Any]:
-    """Return a calibration for JSON; `asked` is the requested model."""
+def calibration_result(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
+    """Return a calibration for JSON, with what its poses determine."""
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -190,7 +191,7 @@ def calibration_result(calibration: Calibration, asked: str) -> dict[str, Any]:
         'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
         **asdict(calibration.quality), 'reason': calibration.reason,
         'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
-        **_outlook(outlook(calibration, asked))}
+        **_outlook(ahead)}
 
 
 def _rest_noise(calibration: Calibration) -> dict[str, Any]:

@@ -31,8 +31,9 @@ def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
     result = _refined(args)
     stored = list(_stored(args, result))
-    found = {'file': args.poses, **refinement_result(result), **rated(rate_refinement(result))}
-    return Done(found, _shown(args, result, stored),
+    rating = rate_refinement(result)
+    return Done({'file': args.poses, **refinement_result(result), **rated(rating)},
+                [*_shown(args, result, stored), *rating.lines],
                 refusal=result.refusal if args.output else ())
 
 
@@ -89,7 +90,6 @@ def _shown(args: argparse.Namespace, result: Refinement, stored: list[Path]) -> 
         yield f'these data cannot show: {names}'
     for path in stored:
         yield f'stored in {path}'
-    yield from rate_refinement(result).lines
 
 
 def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
