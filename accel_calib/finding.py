@@ -11,22 +11,55 @@ level and its rows are data. Its text is for people, and no code reads it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import get_args, Literal
 
 Level = Literal['GOOD', 'USABLE', 'BAD']
 LEVELS: tuple[Level, ...] = get_args(Level)
 """Levels, the best first: a note, less accurate than it could be, not fit for use."""
 
-KINDS = (
-    'refused', 'wiring', 'flat_pose', 'error', 'no_gain', 'disagreement', 'changed', 'mounting',
-    'edited', 'mounting_alone', 'partial', 'outlier_not_certain', 'no_check', 'few_checks',
-    'outliers', 'not_covered', 'doubtful', 'beyond_noise', 'settling', 'not_corrected', 'omitted',
-    'new_orientations', 'far_from_poses', 'left_out', 'hardly_checked', 'noise', 'placement',
-    'heading', 'uncovered', 'noise_not_known', 'residuals', 'uncertainty', 'undetermined',
-    'copies', 'unlike_fleet', 'open', 'correction_in_file', 'note')
-"""Kinds of findings, the most informative reason for a rating first."""
+KINDS: Mapping[str, str] = MappingProxyType({
+    'refused': 'the refined calibration does not pass the gate',
+    'wiring': 'known orientations show swapped axes, wrong signs or a rotation',
+    'flat_pose': 'the flat pose is not near the expected axis',
+    'error': 'the error is larger than a limit',
+    'no_gain': 'the readings are as good without the calibration',
+    'disagreement': 'calibrations of one sensor do not agree',
+    'changed': 'the sensor has changed since the fit',
+    'mounting': 'the mountings of calibrations differ',
+    'edited': 'the file was edited by hand',
+    'mounting_alone': 'offset and gain are not calibrated',
+    'partial': 'the poses lie near one direction',
+    'outlier_not_certain': 'other poses may be wrong instead of those left out',
+    'no_check': 'there are only as many poses as values',
+    'few_checks': 'few poses check the fit, and the noise is not known',
+    'outliers': 'few poses check the fit without the outliers',
+    'not_covered': 'a part of the sphere is far from all poses',
+    'doubtful': 'the sensor may have moved during poses that are used',
+    'beyond_noise': 'the residuals are larger than the noise explains',
+    'settling': 'the readings changed with time, and may change again',
+    'not_corrected': 'an effect cannot be corrected in single samples',
+    'omitted': 'a smaller model omits what the poses do not determine',
+    'new_orientations': 'the error in new orientations is larger than a limit',
+    'far_from_poses': 'the error is large where there is no pose',
+    'left_out': 'many poses were left out',
+    'hardly_checked': 'a mistake in these poses would not show',
+    'noise': 'the noise is too large to see an error of the size of the limit',
+    'placement': 'the known orientations are less accurate than the readings',
+    'heading': 'the heading of the mounting is arbitrary',
+    'noise_not_known': 'the poses have no std and count',
+    'uncertainty': 'the stated uncertainty is large in some directions',
+    'undetermined': 'the poses do not determine the largest model',
+    'copies': 'equal rows count as one pose',
+    'unlike_fleet': 'the sensor is unlike the fleet',
+    'open': 'what poses near one direction leave open',
+    'correction_in_file': 'an edited file states another correction than its effects',
+    'note': 'a note'})
+"""Kinds of findings and their meaning, the most informative reason for a rating first."""
+
+_RANKS = {kind: rank for rank, kind in enumerate(KINDS)}
 
 
 @dataclass(frozen=True)
@@ -58,7 +91,7 @@ class Finding:
     def __post_init__(self) -> None:
         if self.kind not in KINDS or self.level not in LEVELS:
             raise ValueError(f'finding is {self.kind!r} and {self.level!r}, expected one of '
-                             f'{KINDS} and one of {LEVELS}')
+                             f'{", ".join(KINDS)} and one of {", ".join(LEVELS)}')
 
     @property
     def words(self) -> str:
@@ -79,4 +112,4 @@ def has(findings: Iterable[Finding], kind: str) -> bool:
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings of the worst level first, and within a level in the order of `KINDS`."""
     return tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level),
-                                                    KINDS.index(each.kind))))
+                                                    _RANKS[each.kind])))

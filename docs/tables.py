@@ -20,6 +20,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 from accel_calib.effects import EFFECTS  # noqa: E402
+from accel_calib.finding import KINDS  # noqa: E402
 from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
@@ -56,6 +57,14 @@ def rating() -> Iterator[str]:
         yield f'| {limit.name} | {limit.value:g} {limit.unit} | {limit.meaning} |'
 
 
+def findings() -> Iterator[str]:
+    """Yield the kinds of findings."""
+    yield '| kind | meaning |'
+    yield '|---|---|'
+    for kind, meaning in KINDS.items():
+        yield f'| `{kind}` | {meaning} |'
+
+
 def names() -> Iterator[str]:
     """Yield the words and units of the names of columns in logs."""
     yield '| quantity | words in a name | units in a name |'
@@ -69,7 +78,8 @@ def names() -> Iterator[str]:
         yield f'| {ours} | {" ".join(words)} | {texts} |'
 
 
-TABLES = {'columns': columns, 'effects': effects, 'rating': rating, 'names': names}
+TABLES = {'columns': columns, 'effects': effects, 'findings': findings, 'names': names,
+          'rating': rating}
 REFERENCE = 'api.md'
 
 

@@ -116,4 +116,4 @@ def test_a_region_that_only_outliers_cover_is_named():
     poses.reading[-1] *= 1.2
     found = fit_poses(poses, G, model='10')
     assert [each.row for each in found.rejected] == [len(up)]
-    assert has(found.noted, 'uncovered')
+    assert has(found.noted, 'not_covered')

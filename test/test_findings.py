@@ -103,10 +103,11 @@ def test_the_verdict_is_the_level_of_the_first_finding() -> None:
 
 
 def test_findings_are_ranked_by_level_and_then_by_kind() -> None:
-    note, usable = Finding(KINDS[0], 'a'), Finding(KINDS[5], 'b', level='USABLE')
-    other, bad = Finding(KINDS[3], 'c', level='USABLE'), Finding(KINDS[-1], 'd', level='BAD')
-    assert ranked([note, usable, other, bad]) == (bad, other, usable, note)
-    assert without([note, bad], KINDS[0]) == (bad,)
+    first, other, *_, last = KINDS
+    note, usable = Finding(first, 'a'), Finding(last, 'b', level='USABLE')
+    better, bad = Finding(other, 'c', level='USABLE'), Finding(last, 'd', level='BAD')
+    assert ranked([note, usable, better, bad]) == (bad, better, usable, note)
+    assert without([note, bad], first) == (bad,)
 
 
 def test_a_kind_that_is_not_listed_is_refused() -> None:

@@ -256,7 +256,7 @@ _LARGE_CHI2 = 4.0
 """chi² per degree of freedom above which a fit warns."""
 
 
-OF_A_FIT = ('no_check', 'uncovered', 'noise_not_known', 'residuals', 'hardly_checked',
+OF_A_FIT = ('no_check', 'not_covered', 'noise_not_known', 'beyond_noise', 'hardly_checked',
             'outlier_not_certain')
 """Kinds of findings about one fit, which do not hold for another fit."""
 
@@ -268,7 +268,7 @@ def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
         found.append(Finding('no_check', 'there are only as many poses as free parameters: the '
                              'fit cannot be checked', 'take more poses'))
     if dilution > WEAK_DILUTION:
-        found.append(Finding('uncovered', 'the poses leave a region of the sphere uncovered: '
+        found.append(Finding('not_covered', 'the poses leave a region of the sphere uncovered: '
                              f'there the error is up to {dilution:.0f} times that of a pose',
                              'take the next pose that is suggested'))
     if not fit.noise_known:
@@ -278,9 +278,9 @@ def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
                              f'uncertainty comes from {known}'))
     elif fit.dof > 0 and fit.chi2 / fit.dof > _LARGE_CHI2:
         found.append(Finding(
-            'residuals', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise of '
-            'the pose means: poses repeat worse than the noise of their samples predicts, or the '
-            'model lacks an effect'))
+            'beyond_noise', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise '
+            'of the pose means: poses repeat worse than the noise of their samples predicts, or '
+            'the model lacks an effect'))
     return (*found, *_hardly_checked(fit))
 
 

@@ -341,7 +341,7 @@ def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
 def _finding(stated: Mapping[str, Any]) -> Finding:
     """Return a finding of a file."""
     rows = array_at(stated, 'rows', (len(list_at(stated, 'rows')),)).astype(int).tolist()
-    return Finding(choice_at(stated, 'kind', KINDS), text_at(stated, 'text'),
+    return Finding(choice_at(stated, 'kind', tuple(KINDS)), text_at(stated, 'text'),
                    text_at(stated, 'advice'), choice_at(stated, 'level', LEVELS), tuple(rows))
 
 
