@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import calibrate
-from .calibrate import FrameName, level_by_rows, Method, Verification
-from .calibrate.mounting import mounting_of
+from .calibrate import FrameName, level_by_rows, Method, mounting_of, Verification
 from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
@@ -33,7 +32,7 @@ from .logs import read_recording as read_whole_recording
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration
-from .table import columns_from, Floats, numbered, Poses, Recording, Table
+from .table import check_units, columns_from, Floats, numbered, Poses, Recording, Table
 from .text import counted, now
 from .units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -265,7 +264,7 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         path = Path('the recording')
         samples = _table(recording, Recording, 'the recording')
         known = _units(units, gravity, samples.units, 'the recording')
-        calibrate.check_units(samples, known)
+        check_units(samples, known)
         found = find_still(samples, known, settings_from(settings, known))
     if not len(found.poses):
         raise nothing_still(str(path), found.recorded)
@@ -397,7 +396,7 @@ def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibra
               else load(calibration))
     table = _poses(poses, _asked(units, stored), stored.units.per_g)
     known = _in_units_of(stored, table, units)
-    calibrate.check_units(table, known.units)
+    check_units(table, known.units)
     return calibrate.verify(known, table)
 
 

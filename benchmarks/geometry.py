@@ -27,9 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.effects import model_with, predict, sensor_force, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
-from accel_calib.estimate.closed_form import closed_form  # noqa: E402
-from accel_calib.estimate.fit import estimate  # noqa: E402
-from accel_calib.estimate.outliers import start_of  # noqa: E402
+from accel_calib.estimate import closed_form, estimate, start_of  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
-from accel_calib.estimate.geometry import pose_noise  # noqa: E402
+from accel_calib.estimate import pose_noise  # noqa: E402
 from accel_calib.table import Floats, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
 from directions import random_directions  # noqa: E402

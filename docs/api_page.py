@@ -16,8 +16,8 @@ import accel_calib as ac
 from accel_calib import errors
 from accel_calib.calibrate import GyroBias, Quality, Rejected, SampleNoise, Verification
 from accel_calib.capture import CaptureSettings
-from accel_calib.compare import Comparison
-from accel_calib.compare.comparison import Parameter, Run
+from accel_calib.compare import Comparison, Parameter
+from accel_calib.compare.comparison import Run
 from accel_calib.refine import PlannedPose, PosePlan, Stage, Step
 from accel_calib.units import Units
 

@@ -15,24 +15,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
-from accel_calib.calibrate.fleet_prior import posterior
-from accel_calib.calibrate.gate import sound_rows
-from accel_calib.calibrate.mounting import (
-    mounting,
-    mounting_figures,
-    with_heading,
-    with_heading_of,
-)
-from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
-from accel_calib.calibrate.pose_planning import (
+from accel_calib.calibrate import (
     determines,
-    missing_poses,
+    mounting_figures,
+    posterior,
     refuse_if_unfit,
-    shape_words,
-    unseen,
+    sound_rows,
     words_of,
 )
+from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
+from accel_calib.calibrate.mounting import mounting, with_heading, with_heading_of
+from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
+from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
 from accel_calib.capture.window import rounding_left
 from accel_calib.cli.commands import COMMANDS
 from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
@@ -40,14 +34,14 @@ from accel_calib.cli.frame import Output
 from accel_calib.cli.main import main, parser
 from accel_calib.cli.terminal import in_one_line, shown
 from accel_calib.cli.watch import changes, screen, state
+from accel_calib.compare import NAMES as PARAMETER_NAMES
+from accel_calib.compare import rotation_free
 from accel_calib.compare.drift import change, is_over
 from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
-from accel_calib.compare.parameters import NAMES as PARAMETER_NAMES
 from accel_calib.compare.parameters import (
     on_one_scale,
     outlier,
     p_values,
-    rotation_free,
     Runs,
     Scatter,
     scatter_of,
@@ -73,10 +67,8 @@ from accel_calib.effects import (
 )
 from accel_calib.effects.terms import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
-from accel_calib.estimate.equations import equations, kinds, noise_of
-from accel_calib.estimate.geometry import distinct
-from accel_calib.estimate.mistakes import unseen_mistakes
-from accel_calib.estimate.outliers import originals
+from accel_calib.estimate import distinct, kinds, noise_of, originals, unseen_mistakes
+from accel_calib.estimate.equations import equations
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
 from accel_calib.fleet.models import alike, estimated, priors_of
 from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects
@@ -160,7 +152,7 @@ from accel_calib.session.store import Store as SensorStore
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
-from accel_calib.stored import calibration_yaml, plain_yaml
+from accel_calib.stored import calibration_yaml, plain_yaml, write_plan
 from accel_calib.stored.calibration_yaml import _values_in as values_in
 from accel_calib.stored.calibration_yaml import (
     format_calibration,
@@ -170,7 +162,6 @@ from accel_calib.stored.exports import export, identifier
 from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
 from accel_calib.stored.exports import Options as ExportOptions
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
-from accel_calib.stored.plan_table import write_plan
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""

@@ -13,45 +13,63 @@ range of a calibration.
 
 """
 
-from .calibration import (
-    Calibration,
-    check_sensor,
-    converted,
-    Quality,
-    Rejected,
-    RejectedKind,
-)
+from .calibration import Calibration, check_sensor, converted, Quality, Rejected, RejectedKind
 from .context import joined_ranges, of_samples, Outside, outside, thermal_stream, USES_LIMIT
-from .fit import (
-    fit_poses,
-    level,
-    level_by_rows,
-    MODEL_NAMES,
-    set_heading,
-    with_given_mounting,
+from .fit import fit_poses, level, level_by_rows, MODEL_NAMES, set_heading, with_given_mounting
+from .fleet_prior import fit_with_fleet, FleetPrior, posterior
+from .gate import deviations_g, gated, sound_rows, sure_rows, uncertainty_g
+from .mounting import (
+    flat_direction,
+    FrameName,
+    FRAMES,
+    mounting_figures,
+    mounting_of,
+    mounting_words,
 )
-from .fleet_prior import fit_with_fleet, FleetPrior
-from .gate import gated
-from .mounting import flat_direction, FrameName, FRAMES
 from .partial import carried_words, fit_partial, mounting_only
-from .pose_planning import lies_in_cone, next_pose, NextPose, Outlook, outlook
-from .quality import in_g, Verification, verify, with_history
-from .rest_noise import (
-    gyro_bias_of,
-    GyroBias,
-    sample_noise_of,
-    SampleNoise,
-    with_rest_noise,
+from .pose_planning import (
+    determines,
+    lies_in_cone,
+    next_pose,
+    NextPose,
+    Outlook,
+    outlook,
+    refuse_if_unfit,
+    words_of,
 )
-from .unknown_orientation import directions_of, Method, METHODS, PRIOR, STORED_METHODS
-from ..table import check_units
+from .quality import (
+    errors_after,
+    errors_before,
+    fit_findings,
+    in_g,
+    OF_A_FIT,
+    quality_of,
+    Verification,
+    verify,
+    with_history,
+    with_previous,
+)
+from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
+from .unknown_orientation import (
+    directions_of,
+    fit_unknown,
+    FLEET,
+    Method,
+    METHODS,
+    only_norm,
+    PRIOR,
+    STORED_METHODS,
+)
 
-__all__ = ['FRAMES', 'METHODS', 'MODEL_NAMES', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT',
-           'Calibration', 'FleetPrior', 'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook',
-           'Outside', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise', 'Verification',
-           'carried_words', 'check_sensor', 'check_units', 'converted', 'directions_of',
-           'fit_partial', 'fit_poses', 'fit_with_fleet', 'flat_direction', 'gated',
+__all__ = ['FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR', 'STORED_METHODS',
+           'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias', 'Method',
+           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise',
+           'Verification', 'carried_words', 'check_sensor', 'converted', 'determines',
+           'deviations_g', 'directions_of', 'errors_after', 'errors_before', 'fit_findings',
+           'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated',
            'gyro_bias_of', 'in_g', 'joined_ranges', 'level', 'level_by_rows', 'lies_in_cone',
-           'mounting_only', 'next_pose', 'of_samples', 'outlook', 'outside', 'sample_noise_of',
-           'set_heading', 'thermal_stream', 'verify', 'with_given_mounting', 'with_history',
-           'with_rest_noise']
+           'mounting_figures', 'mounting_of', 'mounting_only', 'mounting_words', 'next_pose',
+           'of_samples', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of',
+           'refuse_if_unfit', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
+           'thermal_stream', 'uncertainty_g', 'verify', 'with_given_mounting', 'with_history',
+           'with_previous', 'with_rest_noise', 'words_of']

@@ -26,7 +26,7 @@ import numpy as np
 
 from .mounting import flat_direction
 from ..errors import RefusedFitError
-from ..estimate.closed_form import fit_12
+from ..estimate import fit_12
 from ..finding import Finding, Level
 from ..table import Floats
 

@@ -37,9 +37,7 @@ from .quality import in_g, quality_of
 from .rest_noise import with_rest_noise
 from .unknown_orientation import copies, FLEET, only_norm, rejected_by
 from ..errors import RefusedFitError
-from ..estimate.fit import Prior
-from ..estimate.least_squares import NotConvergedError
-from ..estimate.outliers import LARGEST_SHARE, originals
+from ..estimate import LARGEST_SHARE, NotConvergedError, originals, Prior
 from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses

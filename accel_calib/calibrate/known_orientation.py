@@ -33,10 +33,7 @@ from .unknown_orientation import (
 )
 from ..effects import force_slope, MODELS, parameter_basis, sensor_force, with_vector
 from ..errors import RefusedFitError
-from ..estimate.closed_form import faces, fit_12
-from ..estimate.fit import estimate, Fit
-from ..estimate.mistakes import covariance_with, rivals
-from ..estimate.outliers import outliers
+from ..estimate import covariance_with, estimate, faces, Fit, fit_12, outliers, rivals
 from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses

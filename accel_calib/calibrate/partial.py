@@ -59,10 +59,16 @@ from .rest_noise import with_rest_noise
 from .unknown_orientation import copies, only_norm, PRIOR, rejected_by
 from ..effects import EFFECTS, Model, MODELS, sensor_force, with_vector
 from ..errors import InputError, RefusedFitError
-from ..estimate.equations import variance_factor
-from ..estimate.fit import estimate, Fit, judge, Prior
-from ..estimate.least_squares import NotConvergedError
-from ..estimate.outliers import LARGEST_SHARE, originals
+from ..estimate import (
+    estimate,
+    Fit,
+    judge,
+    LARGEST_SHARE,
+    NotConvergedError,
+    originals,
+    Prior,
+    variance_factor,
+)
 from ..finding import Finding, without
 from ..geometry import unit
 from ..table import check_units, Floats, Poses

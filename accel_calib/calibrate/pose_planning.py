@@ -33,7 +33,7 @@ import numpy as np
 
 from .calibration import Calibration
 from ..errors import RefusedFitError
-from ..estimate.geometry import (
+from ..estimate import (
     Combination,
     dilution,
     distinct,

@@ -22,10 +22,7 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, check_sensor, Quality
 from ..effects import correct, Model, rate_at, sensor_force
-from ..estimate.equations import noise_of
-from ..estimate.fit import Fit, judge
-from ..estimate.geometry import coverage, WEAK_DILUTION
-from ..estimate.mistakes import Rival, unseen_mistakes
+from ..estimate import coverage, Fit, judge, noise_of, Rival, unseen_mistakes, WEAK_DILUTION
 from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses

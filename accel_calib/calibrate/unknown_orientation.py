@@ -28,20 +28,31 @@ from .pose_planning import refuse_if_unfit, unseen
 from .quality import fit_findings, in_g, quality_of, rival_findings
 from ..effects import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate.closed_form import closed_form, fit_4, lower_triangular, TIES
-from ..estimate.fit import estimate, Fit, judge
-from ..estimate.geometry import (
+from ..estimate import (
+    closed_form,
+    covariance_with,
     dilution,
+    estimate,
+    Fit,
+    fit_norm,
+    fit_sphere,
     free_parameters,
+    judge,
     LARGEST_DILUTION,
+    lower_triangular,
     NORM_MODELS,
+    NotConvergedError,
+    originals,
+    Point,
     pose_noise,
     poses_needed,
+    Rival,
+    rivals,
+    solve,
+    start_of,
+    TIES,
     WEAK_DILUTION,
 )
-from ..estimate.least_squares import NotConvergedError, Point, solve
-from ..estimate.mistakes import covariance_with, Rival, rivals
-from ..estimate.outliers import fit_norm, originals, start_of
 from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses
@@ -86,7 +97,7 @@ def directions_of(poses: Poses, units: Units) -> Floats:
     raw = unit(poses.reading)
     if not units.is_native and dilution('4', raw) > WEAK_DILUTION:
         return raw
-    return unit(poses.reading - fit_4(poses.reading)[1])
+    return unit(poses.reading - fit_sphere(poses.reading)[1])
 
 
 @dataclass(frozen=True)
@@ -152,7 +163,7 @@ def own_scale(poses: Poses, units: Units) -> Units:
         return units
     if len(poses) < free_parameters('4'):
         refuse_if_unfit('4', np.zeros((len(poses), 3)))
-    return Units('native', float(fit_4(poses.reading)[0][0, 0]))
+    return Units('native', float(fit_sphere(poses.reading)[0][0, 0]))
 
 
 def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method) -> NormFit:

@@ -27,7 +27,7 @@ from ..calibrate import (
 )
 from ..effects import effect_named, LADDER, value_unit
 from ..errors import InputError
-from ..estimate.closed_form import sensing_axes
+from ..estimate import sensing_axes
 from ..findings import rate, Rating
 from ..intake import Intake
 from ..stored import write_calibration

@@ -32,7 +32,7 @@ from rich.text import Text
 
 from .frame import Done, Output
 from .terminal import ended
-from ..calibrate.pose_planning import words_of
+from ..calibrate import words_of
 from ..errors import InputError, NEEDS_ROS
 from ..units import MG
 

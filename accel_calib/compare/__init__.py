@@ -12,10 +12,10 @@ calibration in use.
 
 """
 
-from .comparison import compare, Comparison
+from .comparison import compare, Comparison, Parameter
 from .drift import compared, Drift, monitor, rests_of, status
 from .history import Change, History, history_of, Moment
-from .parameters import LEVEL
+from .parameters import LEVEL, NAMES, rotation_free
 
-__all__ = ['LEVEL', 'Change', 'Comparison', 'Drift', 'History', 'Moment', 'compare', 'compared',
-           'history_of', 'monitor', 'rests_of', 'status']
+__all__ = ['LEVEL', 'NAMES', 'Change', 'Comparison', 'Drift', 'History', 'Moment', 'Parameter',
+           'compare', 'compared', 'history_of', 'monitor', 'rests_of', 'rotation_free', 'status']

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .parameters import Scatter, scatter_of
-from ..calibrate import Calibration
-from ..calibrate.unknown_orientation import fit_unknown
+from ..calibrate import Calibration, fit_unknown
 from ..effects import MODELS
 from ..errors import InputError, RefusedFitError
 from ..text import counted

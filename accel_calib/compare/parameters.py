@@ -52,10 +52,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibrate import Calibration, in_g
-from ..calibrate.quality import with_history
+from ..calibrate import Calibration, in_g, with_history
 from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
-from ..estimate.fit import Fit, judge
+from ..estimate import Fit, judge
 from ..table import Floats, Poses
 from ..units import STANDARD_GRAVITY
 

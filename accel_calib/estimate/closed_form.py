@@ -292,11 +292,11 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
 
     """
     if name == '4':
-        return fit_4(reading)
+        return fit_sphere(reading)
     return quadric(reading, DIAGONAL if name == '7' else SYMMETRIC)
 
 
-def fit_4(reading: Floats) -> tuple[Floats, Floats]:
+def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
     """
     Fit an offset and one gain for all axes (AN5286 eq. 10-14).
 

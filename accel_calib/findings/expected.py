@@ -10,11 +10,9 @@ import math
 
 import numpy as np
 
-from ..calibrate import Calibration, in_g, next_pose, NextPose, PRIOR
-from ..calibrate.gate import deviations_g
+from ..calibrate import Calibration, deviations_g, in_g, next_pose, NextPose, PRIOR
 from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict
-from ..estimate.equations import variance_factor
-from ..estimate.geometry import error_left_in, free_parameters, identifiability, pose_noise
+from ..estimate import error_left_in, free_parameters, identifiability, pose_noise, variance_factor
 from ..geometry import OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..units import MG

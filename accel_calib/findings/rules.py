@@ -25,8 +25,7 @@ from .limits import (
     TO_CHECK,
     WORST_ERROR,
 )
-from ..calibrate import Calibration
-from ..calibrate.mounting import flat_direction
+from ..calibrate import Calibration, flat_direction
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, ranked, without

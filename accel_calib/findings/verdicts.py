@@ -14,7 +14,7 @@ from .expected import directions_in, Expected
 from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
 from .rules import advice_of, degrees, findings_of, mg, number, temperature_words
 from ..calibrate import Calibration, Verification
-from ..estimate.geometry import coverage
+from ..estimate import coverage
 from ..finding import Finding, Level, ranked
 from ..table import Poses
 from ..text import counted

@@ -19,7 +19,7 @@ import numpy as np
 
 from .overview import OfModel, table_of
 from .store import Row
-from ..compare.parameters import NAMES
+from ..compare import NAMES
 from ..report.drawings import Drawing
 from ..report.repeats import CROSS, GAINS, in_words, label_dates, OFFSETS, scale_of
 from ..report.style import (

@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 
 from .store import Row
-from ..calibrate.fleet_prior import FleetPrior
+from ..calibrate import FleetPrior
 from ..effects import LADDER, MODELS, parameter_names
-from ..estimate.fit import Prior
+from ..estimate import Prior
 from ..table import Floats
 
 

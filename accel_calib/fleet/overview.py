@@ -31,7 +31,7 @@ import numpy as np
 
 from .models import alike, FEWEST
 from .store import Row
-from ..compare.parameters import NAMES
+from ..compare import NAMES
 from ..effects import LADDER
 from ..report.repeats import scale_of
 from ..table import Floats

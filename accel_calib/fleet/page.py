@@ -32,8 +32,8 @@ from .models import alike
 from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
 from .store import Row, Store
 from .. import __version__
-from ..calibrate.fleet_prior import FleetPrior
-from ..compare.parameters import NAMES
+from ..calibrate import FleetPrior
+from ..compare import NAMES
 from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..report.drawings import Drawing

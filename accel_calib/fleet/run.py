@@ -25,10 +25,10 @@ from .page import write_fleet_page
 from .sensors import merge_sensor, read_sensors, write_sensors
 from .store import Row, Store
 from .task import calibrate_recording, Done, Options, unread_row
-from ..calibrate.fleet_prior import FleetPrior
+from ..calibrate import FleetPrior
 from ..errors import InputError
 from ..logs import Progress
-from ..stored.fleet_yaml import write_priors
+from ..stored import write_priors
 
 if TYPE_CHECKING:
     from distributed import Client

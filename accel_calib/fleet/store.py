@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from .inputs import as_folder
-from ..compare.parameters import NAMES
+from ..compare import NAMES
 from ..disk import write_atomically
 from ..errors import InputError
 

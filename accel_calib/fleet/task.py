@@ -26,10 +26,8 @@ import numpy as np
 from .inputs import as_folder, content_hash, date_of, Input, matched, on_disk, sensor_of, UNKNOWN
 from .store import Row, Store
 from .. import __version__
-from ..calibrate import Calibration, fit_poses
-from ..calibrate.pose_planning import determines
-from ..calibrate.unknown_orientation import directions_of
-from ..compare.parameters import NAMES, rotation_free
+from ..calibrate import Calibration, determines, directions_of, fit_poses
+from ..compare import NAMES, rotation_free
 from ..disk import write_atomically
 from ..effects import MODELS
 from ..errors import AccelCalibError, crash_words, RefusedFitError, system_error

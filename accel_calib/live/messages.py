@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibrate import Calibration
-from ..calibrate.pose_planning import words_of
+from ..calibrate import Calibration, words_of
 from ..errors import InputError
 from ..findings import Rating
 from ..session.events import Severity

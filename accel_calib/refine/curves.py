@@ -46,7 +46,7 @@ from ..effects import (
     MODES,
     VARIABLES,
 )
-from ..estimate.fit import Fit, judge
+from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
 _MOST_MODES = 10

@@ -45,8 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects import Context, effect_named, Model
-from ..estimate.equations import Equations
-from ..estimate.fit import Fit
+from ..estimate import Equations, Fit
 from ..table import Floats
 
 WORTH = 4.0

@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .state import beginning, State
-from ..calibrate.quality import with_history
+from ..calibrate import with_history
 from ..capture.window import rounding_left
 from ..effects import Model
-from ..estimate.fit import judge
-from ..estimate.least_squares import NotConvergedError
+from ..estimate import judge, NotConvergedError
 from ..table import Floats, Poses
 
 _QUIET = 0.7

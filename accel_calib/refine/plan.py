@@ -37,8 +37,7 @@ from .records import attitude_words, attitudes, ENOUGH, plan_lines, PlannedPose,
 from .rivals import LEAST, probabilities
 from .state import fitted_state
 from ..effects import effect_named, Model, WANDER
-from ..estimate.equations import kinds
-from ..estimate.fit import Fit, judge
+from ..estimate import Fit, judge, kinds
 from ..geometry import spread_directions
 from ..table import Floats, Poses
 

@@ -14,8 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..calibrate import Calibration
-from ..calibrate.pose_planning import words_of
+from ..calibrate import Calibration, words_of
 from ..effects import EMPIRICAL
 from ..geometry import unit
 from ..table import Floats, Poses

@@ -31,22 +31,23 @@ from .words import advice_for, change_words, curve_words, not_testable, where
 from ..calibrate import (
     Calibration,
     check_sensor,
+    fit_findings,
     fit_poses,
     gated,
     in_g,
+    OF_A_FIT,
+    quality_of,
+    refuse_if_unfit,
     Rejected,
+    sound_rows,
+    sure_rows,
+    uncertainty_g,
+    with_history,
     with_rest_noise,
 )
-from ..calibrate.gate import sound_rows, sure_rows, uncertainty_g
-from ..calibrate.pose_planning import refuse_if_unfit
-from ..calibrate.quality import fit_findings, OF_A_FIT, quality_of, with_history
 from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, Model, WANDER
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate.closed_form import fit_4
-from ..estimate.equations import variance_factor
-from ..estimate.fit import judge
-from ..estimate.geometry import LARGEST_DILUTION
-from ..estimate.least_squares import NotConvergedError
+from ..estimate import fit_sphere, judge, LARGEST_DILUTION, NotConvergedError, variance_factor
 from ..finding import Finding, without
 from ..geometry import unit
 from ..table import check_units, Floats, Poses
@@ -74,7 +75,7 @@ def ideal(poses: Poses, units: Units) -> Calibration:
     """Return the ideal sensor; for native readings with a fitted offset and scale."""
     values: dict[str, Floats] = {}
     if units.is_native:
-        mat_w, vec_v = fit_4(poses.reading)
+        mat_w, vec_v = fit_sphere(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
         values = {'offset': vec_v / units.per_g}
     poses_g = in_g(poses, units)

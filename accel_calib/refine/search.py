@@ -32,10 +32,9 @@ from .linear import LEVEL, Linear, linearised, Set
 from .output import Clipped, off_grid, unclipped
 from .sets import accepted, explored, names_of, simpler
 from .state import beginning, changes_beside, fitted_state, is_noise, State
-from ..calibrate.quality import with_previous
+from ..calibrate import with_previous
 from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, Model, WANDER
-from ..estimate.equations import kinds
-from ..estimate.fit import judge
+from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses
 

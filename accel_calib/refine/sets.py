@@ -24,8 +24,7 @@ import numpy as np
 
 from .linear import Block, LEVEL, Linear, Set
 from ..effects import effect_named, fitted_places
-from ..estimate.fit import by_pose
-from ..estimate.outliers import outliers_among
+from ..estimate import by_pose, outliers_among
 
 LARGEST = 5
 """Largest number of effects in a set."""

@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .linear import held_out, Linear, linearised, Set
-from ..calibrate.quality import with_history
+from ..calibrate import with_history
 from ..effects import CHANGES, Model
-from ..estimate.fit import estimate, Fit
-from ..estimate.least_squares import NotConvergedError
+from ..estimate import estimate, Fit, NotConvergedError
 from ..table import Floats, Poses
 from ..units import MG
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..calibrate import Calibration, in_g
 from ..effects import CHANGES, effect_named, Model, parameter_names
-from ..estimate.fit import estimate, judge
+from ..estimate import estimate, judge
 from ..finding import has
 from ..geometry import unit
 from ..table import COLUMNS, Floats, Poses

@@ -25,13 +25,22 @@ from .records import PosePlan, Refinement, Stage
 from .refinement import refine
 from .state import is_noise
 from .words import not_testable
-from ..calibrate import Calibration, fit_with_fleet, FleetPrior, gated, in_g, with_rest_noise
-from ..calibrate.fleet_prior import posterior
-from ..calibrate.quality import quality_of, with_history
-from ..calibrate.unknown_orientation import FLEET, only_norm
+from ..calibrate import (
+    Calibration,
+    fit_with_fleet,
+    FLEET,
+    FleetPrior,
+    gated,
+    in_g,
+    only_norm,
+    posterior,
+    quality_of,
+    with_history,
+    with_rest_noise,
+)
 from ..effects import Model, MODELS, PROCESSES, with_vector
 from ..errors import RefusedFitError
-from ..estimate.fit import Fit, judge
+from ..estimate import Fit, judge
 from ..geometry import unit
 from ..table import Poses
 from ..text import counted

@@ -32,7 +32,7 @@ from ..effects import (
     VARIABLES,
     WANDER,
 )
-from ..estimate.equations import kinds
+from ..estimate import kinds
 from ..table import COLUMNS, Floats, Poses
 from ..text import counted, short
 from ..units import MG

@@ -41,7 +41,7 @@ from .style import (
     SEQUENTIAL,
     styled,
 )
-from ..estimate.geometry import uncovered
+from ..estimate import uncovered
 from ..table import Floats
 
 _HEIGHT_INCHES = 3.3

@@ -36,8 +36,7 @@ from .style import (
     THIRD,
 )
 from .. import __version__
-from ..compare import Comparison, History
-from ..compare.comparison import Parameter
+from ..compare import Comparison, History, Parameter
 from ..disk import write_atomically
 from ..effects import value_unit
 from ..findings import rate_comparison

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .style import Mark
-from ..calibrate import Calibration, in_g
-from ..calibrate.quality import errors_after, errors_before, with_history
+from ..calibrate import Calibration, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
 from ..geometry import unit
 from ..table import Floats, Poses

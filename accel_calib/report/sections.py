@@ -32,8 +32,7 @@ from .sheet import (
     section,
     snippets,
 )
-from ..calibrate import Calibration, outlook
-from ..calibrate.mounting import mounting_figures
+from ..calibrate import Calibration, mounting_figures, outlook
 from ..effects import (
     AXES,
     effect_named,
@@ -45,7 +44,7 @@ from ..effects import (
     VARIABLES,
     with_vector,
 )
-from ..estimate.geometry import coverage
+from ..estimate import coverage
 from ..refine.records import percent
 from ..refine.words import chance, values_of, verdict_words
 from ..table import Floats

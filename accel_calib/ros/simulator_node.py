@@ -29,8 +29,7 @@ from std_srvs.srv import Trigger
 
 from . import qos
 from .declare import declared
-from ..calibrate import of_samples, thermal_stream
-from ..calibrate.mounting import mounting_of
+from ..calibrate import mounting_of, of_samples, thermal_stream
 from ..effects import model_with, parse_effect, predict, turn_between
 from ..geometry import spread_directions
 from ..session.settings import parameter

@@ -29,9 +29,9 @@ from ..calibrate import (
     carried_words,
     level,
     mounting_only,
+    mounting_words,
     set_heading,
 )
-from ..calibrate.mounting import mounting_words
 from ..capture import Dwell, poses_from
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..text import counted, now

@@ -30,8 +30,7 @@ from .store import Store, writing_advice
 from .stream import SILENT, StreamStatistics
 from .work import plan_for
 from .worker import Compute, Files, Task
-from ..calibrate import Calibration, with_given_mounting
-from ..calibrate.mounting import mounting_of, mounting_words
+from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
 from ..compare import status
 from ..errors import InputError
 from ..table import Floats, Poses

@@ -15,8 +15,7 @@ from .health import Health
 from .sensor import title
 from .stream import Newest, SILENT
 from .work import is_partial
-from ..calibrate import Outside, outside
-from ..calibrate.mounting import mounting_words
+from ..calibrate import mounting_words, Outside, outside
 from ..messages.one_reading import Triple
 
 if TYPE_CHECKING:

@@ -19,17 +19,16 @@ from ..calibrate import (
     directions_of,
     fit_partial,
     fit_poses,
+    flat_direction,
     level,
     lies_in_cone,
     next_pose,
     PRIOR,
 )
-from ..calibrate.mounting import flat_direction
 from ..capture import Dwell, poses_from
 from ..effects import Context, LADDER, Model
 from ..errors import RefusedFitError
-from ..estimate.closed_form import fit_4
-from ..estimate.geometry import coverage, pose_noise
+from ..estimate import coverage, fit_sphere, pose_noise
 from ..findings import rate, rate_refinement
 from ..geometry import spread_directions
 from ..refine import refine, Refinement
@@ -248,7 +247,7 @@ def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
     """Return the centre of native readings; empty for readings whose zero is known."""
     if not units.is_native:
         return ()
-    return tuple(fit_4(poses.reading)[1].tolist())
+    return tuple(fit_sphere(poses.reading)[1].tolist())
 
 
 def summary(calibration: Calibration) -> str:

@@ -173,9 +173,12 @@ def main() -> None:
     Thread(target=_read, args=(sys.stdin.buffer, calls), daemon=True).start()
     for name in _IMPORTED:
         import_module(name)
-    while True:
-        answers.write(pickle.dumps(_answer(calls.get())))
-        answers.flush()
+    try:
+        while True:
+            answers.write(pickle.dumps(_answer(calls.get())))
+            answers.flush()
+    except BrokenPipeError:  # the node has ended
+        os._exit(0)
 
 
 def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:

@@ -45,13 +45,13 @@ from ..calibrate import (
     GyroBias,
     in_g,
     MODEL_NAMES,
+    mounting_figures,
     Quality,
     Rejected,
     RejectedKind,
     SampleNoise,
     STORED_METHODS,
 )
-from ..calibrate.mounting import mounting_figures
 from ..disk import check_regular, write_atomically
 from ..effects import CHANGES, Effect, effect_named, is_effect, Model, PROCESSES
 from ..errors import (
@@ -61,7 +61,7 @@ from ..errors import (
     RefusedFitError,
     StoredCalibrationError,
 )
-from ..estimate.fit import judge
+from ..estimate import judge
 from ..finding import Finding, KINDS, LEVELS, without
 from ..table import check_values, COLUMNS, Floats, LARGEST, Poses
 from ..units import UNIT_NAMES, Units

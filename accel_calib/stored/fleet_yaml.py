@@ -13,11 +13,11 @@ import numpy as np
 import yaml
 
 from .plain_yaml import list_at, read_plain
-from ..calibrate.fleet_prior import FleetPrior
+from ..calibrate import FleetPrior
 from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..errors import InputError
-from ..estimate.fit import Prior
+from ..estimate import Prior
 
 _FORMAT = 1
 _NAMES = parameter_names(MODELS['10'])

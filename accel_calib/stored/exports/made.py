@@ -23,9 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from ...calibrate import Calibration, in_g
-from ...calibrate.gate import uncertainty_g
-from ...calibrate.quality import with_history
+from ...calibrate import Calibration, in_g, uncertainty_g, with_history
 from ...effects import (
     AtContext,
     Context,
