@@ -5,7 +5,8 @@
 Findings: what is worth knowing about a result, and how much it matters.
 
 A finding is made where it is found, carried by the calibration, and stored with it. Its kind, its
-level and its rows are data. Its text is for people, and no code reads it.
+level and its rows are data. Its text is for people, and no code reads it. What to do next is one
+step of a known kind, which every surface shows with its own command.
 
 """
 
@@ -14,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import get_args, Literal
+from typing import Any, get_args, Literal
 
 Level = Literal['GOOD', 'USABLE', 'BAD']
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -59,7 +60,49 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'note': 'a note'})
 """Kinds of findings and their meaning, the most informative reason for a rating first."""
 
+STEPS: Mapping[str, str] = MappingProxyType({
+    'connect': 'no samples arrive: check the driver, its topic and the cable',
+    'unit': 'the readings are in another unit than the stated one',
+    'still': 'the sensor moves: hold it still',
+    'poses': 'take poses, or take some of them again',
+    'fit': 'fit the poses',
+    'refine': 'look for the effect that the model lacks',
+    'level': 'level the mounting by a pose with the robot level',
+    'accept': 'use the offered calibration, or discard it',
+    'save': 'store the calibration',
+    'verify': 'check the calibration with new poses',
+    'done': 'nothing more needs to be done'})
+"""Kinds of next steps and their meaning, in the order of a calibration."""
+
+_STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify'}
+"""Step by kind of finding; for other kinds, poses are to be taken."""
+
 _RANKS = {kind: rank for rank, kind in enumerate(KINDS)}
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """
+    What to do next.
+
+    Parameters
+    ----------
+    kind : str
+        One of `STEPS`.
+    text : str
+        What to do, without a full stop.
+    rows : tuple of int
+        Row of the flat pose that is suggested, 1-based; may be empty.
+
+    """
+
+    kind: str
+    text: str
+    rows: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in STEPS:
+            raise ValueError(f'step is {self.kind!r}, expected one of {", ".join(STEPS)}')
 
 
 @dataclass(frozen=True)
@@ -79,6 +122,8 @@ class Finding:
         The best rating that a result with this finding can have.
     rows : tuple of int
         Rows of the poses that it is about, 1-based.
+    step : str
+        Kind of the step that the advice is, one of `STEPS`; empty: that of the kind.
 
     """
 
@@ -87,11 +132,23 @@ class Finding:
     advice: str = ''
     level: Level = 'GOOD'
     rows: tuple[int, ...] = ()
+    step: str = ''
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS or self.level not in LEVELS:
             raise ValueError(f'finding is {self.kind!r} and {self.level!r}, expected one of '
                              f'{", ".join(KINDS)} and one of {", ".join(LEVELS)}')
+
+    @property
+    def next(self) -> NextStep:  # noqa: A003, the name in JSON
+        """Return what to do about it."""
+        return NextStep(self.step or _STEP_OF.get(self.kind, 'poses'), self.advice)
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Return the finding as it is stored, and as it stands in JSON."""
+        return {'kind': self.kind, 'text': self.text, 'advice': self.advice, 'level': self.level,
+                'rows': list(self.rows)}
 
     @property
     def words(self) -> str:

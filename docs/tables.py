@@ -11,7 +11,8 @@ page ``api.md``. Tests compare both with the code. The package need not be insta
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 import re
 import sys
@@ -20,7 +21,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 from accel_calib.effects import EFFECTS  # noqa: E402
-from accel_calib.finding import KINDS  # noqa: E402
+from accel_calib.finding import KINDS, STEPS  # noqa: E402
 from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
@@ -57,11 +58,11 @@ def rating() -> Iterator[str]:
         yield f'| {limit.name} | {limit.value:g} {limit.unit} | {limit.meaning} |'
 
 
-def findings() -> Iterator[str]:
-    """Yield the kinds of findings."""
+def kinds(meanings: Mapping[str, str]) -> Iterator[str]:
+    """Yield kinds with their meanings."""
     yield '| kind | meaning |'
     yield '|---|---|'
-    for kind, meaning in KINDS.items():
+    for kind, meaning in meanings.items():
         yield f'| `{kind}` | {meaning} |'
 
 
@@ -78,8 +79,8 @@ def names() -> Iterator[str]:
         yield f'| {ours} | {" ".join(words)} | {texts} |'
 
 
-TABLES = {'columns': columns, 'effects': effects, 'findings': findings, 'names': names,
-          'rating': rating}
+TABLES = {'columns': columns, 'effects': effects, 'findings': partial(kinds, KINDS),
+          'names': names, 'rating': rating, 'steps': partial(kinds, STEPS)}
 REFERENCE = 'api.md'
 
 

@@ -12,7 +12,7 @@ import accel_calib as ac
 from accel_calib.calibrate import verify
 from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
-from accel_calib.finding import Finding
+from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, rate_comparison, rate_verification, Rating
 from accel_calib.report import write_history_page
 from inside import (
@@ -109,7 +109,7 @@ def test_hostile_names_are_text(calibration, poses):
     labelled = poses.with_columns(label=np.array([HOSTILE] * len(poses)))
     hostile = replace(calibration, sensor=HOSTILE, date=HOSTILE, reason=HOSTILE, poses=labelled,
                       noted=(Finding('note', HOSTILE),))
-    rating = Rating('GOOD', HOSTILE, HOSTILE, HOSTILE)
+    rating = Rating('GOOD', HOSTILE, HOSTILE, NextStep('done', HOSTILE))
     text = calibration_page(hostile, rating, HOSTILE, stored=HOSTILE, notes=(HOSTILE,))
     found = parsed(text)
     assert not found.open

@@ -8,6 +8,7 @@ from dataclasses import replace
 import accel_calib as ac
 from accel_calib.calibrate import fit_partial, fit_poses, mounting_only, verify
 from accel_calib.capture import capture
+from accel_calib.finding import NextStep
 from accel_calib.findings import (
     Expected,
     GOOD_MG,
@@ -102,7 +103,7 @@ def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_
     assert true_error_mg(calibration) < GOOD_MG
     assert rating.name == 'USABLE'
     assert 'far from all poses' in rating.reason
-    assert rating.next
+    assert rating.next.kind == 'poses'
 
 
 @pytest.mark.parametrize(('effects', 'context'), [
@@ -113,14 +114,14 @@ def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, con
     rating = rate(ac.fit(table))
     assert rating.name == 'USABLE'
     assert 'are not noise' in rating.reason
-    assert 'refine' in rating.next
+    assert rating.next.kind == 'refine'
     result = ac.refine(table)
     assert [step.effect for step in result.steps] == list(effects)
     assert rate_refinement(result).name == 'GOOD'
     base = rate(ac.fit(table), refinement=result)
     assert base.name == 'USABLE'
     assert next(iter(effects)) in base.reason
-    assert 'refined' in base.next
+    assert base.next.kind == 'refine'
 
 
 def test_a_hidden_effect_without_its_column_stays_usable_after_a_refinement():
@@ -169,7 +170,7 @@ def test_a_refused_refinement_is_bad_with_the_reason_of_the_gate():
     result = ac.refine(poses_of(poses=24))
     rating = rate_refinement(replace(result, refusal=('the covariance is not valid', 'fit again')))
     assert (rating.name, rating.reason) == ('BAD', 'the covariance is not valid')
-    assert 'fit again' in rating.next
+    assert rating.next == NextStep('poses', 'fit again')
 
 
 def test_a_fit_beside_a_refused_refinement_is_not_bad():
@@ -180,7 +181,7 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     rating = rate(ac.fit(table), refinement=refused)
     assert rating.name == 'USABLE'
     assert 'quadratic is missing' in rating.reason
-    assert 'take more poses' in rating.next
+    assert rating.next == NextStep('poses', 'take more poses')
     assert rate_refinement(refused).name == 'BAD'
 
 
@@ -192,7 +193,7 @@ def test_many_knocked_poses_are_usable_and_one_of_many_is_good():
     assert rate(ac.fit(one)).name == 'GOOD'
     rating = rate(ac.fit(many))
     assert rating.name == 'USABLE'
-    assert rating.next
+    assert rating.next.kind == 'poses'
 
 
 def test_a_calibration_that_is_worse_than_none_is_bad():
@@ -274,7 +275,7 @@ def test_a_sensor_that_changed_is_usable_with_the_advice_to_fit_again():
     rating = rate_verification(ac.verify(changed, calibration), calibration)
     assert rating.name == 'USABLE'
     assert 'the sensor has changed' in rating.reason
-    assert 'fit again' in rating.next
+    assert rating.next.kind == 'fit'
 
 
 def test_a_calibration_of_another_sensor_is_bad_on_new_poses():

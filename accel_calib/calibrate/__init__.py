@@ -15,7 +15,15 @@ range of a calibration.
 
 from .calibration import Calibration, check_sensor, converted, Quality, Rejected, RejectedKind
 from .context import joined_ranges, of_samples, Outside, outside, thermal_stream, USES_LIMIT
-from .fit import fit_poses, level, level_by_rows, MODEL_NAMES, set_heading, with_given_mounting
+from .fit import (
+    BASES,
+    fit_poses,
+    level,
+    level_by_rows,
+    MODEL_NAMES,
+    set_heading,
+    with_given_mounting,
+)
 from .fleet_prior import fit_with_fleet, FleetPrior, posterior
 from .gate import deviations_g, gated, sound_rows, sure_rows, uncertainty_g
 from .mounting import (
@@ -61,15 +69,15 @@ from .unknown_orientation import (
     STORED_METHODS,
 )
 
-__all__ = ['FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR', 'STORED_METHODS',
-           'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias', 'Method',
-           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise',
-           'Verification', 'carried_words', 'check_sensor', 'converted', 'determines',
-           'deviations_g', 'directions_of', 'errors_after', 'errors_before', 'fit_findings',
-           'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated',
-           'gyro_bias_of', 'in_g', 'joined_ranges', 'level', 'level_by_rows', 'lies_in_cone',
-           'mounting_figures', 'mounting_of', 'mounting_only', 'mounting_words', 'next_pose',
-           'of_samples', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of',
-           'refuse_if_unfit', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
-           'thermal_stream', 'uncertainty_g', 'verify', 'with_given_mounting', 'with_history',
-           'with_previous', 'with_rest_noise', 'words_of']
+__all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
+           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias',
+           'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
+           'SampleNoise', 'Verification', 'carried_words', 'check_sensor', 'converted',
+           'determines', 'deviations_g', 'directions_of', 'errors_after', 'errors_before',
+           'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet',
+           'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
+           'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of', 'mounting_only',
+           'mounting_words', 'next_pose', 'of_samples', 'only_norm', 'outlook', 'outside',
+           'posterior', 'quality_of', 'refuse_if_unfit', 'sample_noise_of', 'set_heading',
+           'sound_rows', 'sure_rows', 'thermal_stream', 'uncertainty_g', 'verify',
+           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise', 'words_of']

@@ -30,6 +30,8 @@ from ..text import listed
 from ..units import Units
 
 MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
+BASES = ('auto', 'ideal', '4', '7', '10', '12')
+"""Models that a refinement can start from."""
 
 
 def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method = 'ml',

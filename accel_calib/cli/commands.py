@@ -15,9 +15,13 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 import re
-from typing import NamedTuple
+import shlex
+from typing import NamedTuple, TYPE_CHECKING
 
 from . import options
+
+if TYPE_CHECKING:
+    from ..finding import NextStep
 
 BAD_INPUT = 2
 """Exit status for invalid input."""
@@ -59,6 +63,46 @@ def add_options(made: options.Parser, command: Command) -> None:
     command.options(made)
     if {action.dest for action in made._actions} & {'output', 'json'}:
         options.share(made, '--force')
+
+
+_NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force')
+"""Options of one run, which a following command does not take over."""
+
+
+def command_line(name: str, args: argparse.Namespace, **changed: object) -> str:
+    """Return the line of a command with the options of another one, where it has them."""
+    made = options.Parser(add_help=False)
+    add_options(made, COMMANDS[name])
+    values = {**vars(args), **changed}
+    words = ['accel-calib', name]
+    for action in made._actions:
+        value = values.get(action.dest)
+        if action.dest not in _NOT_CARRIED and value not in (None, action.default):
+            words += [*action.option_strings[:1], *([] if action.nargs == 0 else _words(value))]
+    return shlex.join(words)
+
+
+def _words(value: object) -> list[str]:
+    """Return the value of an option as words of a command line."""
+    if isinstance(value, list):  # --columns
+        return [','.join('='.join(pair) for each in value for pair in each.items())]
+    return [str(value)]
+
+
+def next_command(step: NextStep, args: argparse.Namespace) -> str:
+    """Return the command of the next step after a command; empty if hands are needed."""
+    log = getattr(args, 'log', None) or getattr(args, 'poses', None)
+    stored = getattr(args, 'output', None) or getattr(args, 'calibration', None)
+    files = {'poses': log, 'log': log, 'output': stored or Path('calibration.yaml')}
+    match step.kind:
+        case 'fit' | 'refine' if log:
+            return command_line(step.kind, args, **files)
+        case 'level' if args.command in ('fit', 'calibrate', 'refine'):
+            name = 'calibrate' if args.command == 'refine' else args.command
+            return command_line(name, args, **files, flat=next(iter(step.rows), 'ROW'))
+        case 'verify' if stored:
+            return command_line('verify', args, poses='NEW_POSES', calibration=stored)
+    return ''
 
 
 def _flat(text: str) -> int | str:

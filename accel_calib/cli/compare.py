@@ -15,8 +15,8 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from .fit import error_line, rated, short_if_known
-from .frame import Done, plain, table, working
+from .fit import error_line, short_if_known
+from .frame import Done, plain, rated, rating_lines, table, working
 from .inputs import intake_for, rows_between
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
@@ -44,8 +44,9 @@ def run_verify(args: argparse.Namespace) -> Done:
             write_calibration_page(args.report, calibration, rating, str(args.poses),
                                    verification=(verification, poses),
                                    stored=str(args.calibration), notes=found.lines)
-    result = {'file': args.poses, 'poses': len(poses), **asdict(verification), **rated(rating),
-              'read_lines': found.lines, 'rating_lines': rating.lines}
+    result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
+              **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
+              'rating_lines': rating_lines(rating, args)}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     return Done(result, several_verify([plain(result)]), FAILED if above else 0)
 
@@ -78,8 +79,8 @@ def run_compare(args: argparse.Namespace) -> Done:
         with working('drawing the page'):
             write_comparison_page(args.report, comparison, rating, paths, calibrations)
     models = [calibration.name for calibration in calibrations]
-    return Done({**_comparison_result(paths, models, comparison), **rated(rating)},
-                [*_comparison_lines(paths, models, comparison), *rating.lines],
+    return Done({**_comparison_result(paths, models, comparison), **rated(rating, args)},
+                [*_comparison_lines(paths, models, comparison), *rating_lines(rating, args)],
                 0 if comparison.agree else FAILED)
 
 
@@ -136,19 +137,19 @@ def run_history(args: argparse.Namespace) -> Done:
 
         with working('drawing the page'):
             write_history_page(args.report, history, args.calibrations, calibrations)
-    return Done(_history_result(args.calibrations, history), _history_lines(args, history))
+    return Done(_history_result(args, history), _history_lines(args, history))
 
 
-def _history_result(paths: Sequence[Path], history: History) -> dict[str, Any]:
+def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any]:
     """Return the result for JSON; runs are numbered from 1, in order of date."""
-    changes = []
+    paths, changes = args.calibrations, []
     for number, change in enumerate(history.changes, 1):
         rating, comparison = rate_comparison(change.comparison), change.comparison
         changes.append({
             'from': number, 'to': number + 1, 'agree': comparison.agree,
             'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
             'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
-            'change': change.change, 'change_sd': change.sd, **rated(rating)})
+            'change': change.change, 'change_sd': change.sd, **rated(rating, args)})
     return {
         'agree': history.whole.agree, 'p_value': history.whole.p_value,
         'runs': [{'file': paths[moment.index], 'date': moment.when and moment.when.isoformat(),

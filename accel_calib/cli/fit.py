@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from rich.table import Table
 
-from .frame import console, Done, progress, table, working
+from .frame import console, Done, progress, rated, rating_lines, table, working
 from .inputs import given, intake, log_options, prior, rows_between, settings
 from ..calibrate import (
     Calibration,
@@ -61,8 +61,9 @@ def run_fit(args: argparse.Namespace) -> Done:
                                    notes=found.lines)
         stored.append(f'stored in {args.report}')
     return Done({'file': args.poses, **calibration_result(calibration, ahead),
-                 **rated(rating), 'read_lines': found.lines},
-                [*_shown(found, calibration, ahead), *stored, *rating.lines],
+                 **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines},
+                [*_shown(found, calibration, ahead), *stored,
+                 *rating_lines(rating, args)],
                 BAD_RATING if rating.name == 'BAD' else 0)
 
 
@@ -106,12 +107,6 @@ def error_line(result: dict[str, Any]) -> str:
     return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
 
 
-def rated(rating: Rating) -> dict[str, Any]:
-    """Return a rating for JSON."""
-    return {'rating': rating.name, 'rating_reason': rating.reason,
-            'findings': [asdict(each) for each in rating.findings]}
-
-
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
     from .refine import refinement_result
@@ -126,11 +121,11 @@ def run_calibrate(args: argparse.Namespace) -> Done:
     ahead = outlook(outcome.calibration, 'auto')
     refinement, rating = outcome.refinement, outcome.rating
     return Done(
-        {'file': args.log, **calibration_result(outcome.calibration, ahead), **rated(rating),
-         'read_lines': found.lines, 'refined': outcome.line,
+        {'file': args.log, **calibration_result(outcome.calibration, ahead), **rated(rating, args),
+         'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_result(refinement)},
         [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
-         *rating.lines], BAD_RATING if rating.name == 'BAD' else 0)
+         *rating_lines(rating, args)], BAD_RATING if rating.name == 'BAD' else 0)
 
 
 def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:

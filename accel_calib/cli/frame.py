@@ -36,7 +36,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from .commands import BAD_INPUT, COMMANDS
+from .commands import BAD_INPUT, COMMANDS, next_command
 from .terminal import shown
 from ..disk import write_atomically
 from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
@@ -45,6 +45,7 @@ from ..text import counted
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from ..findings import Rating
     from ..logs import Progress
 
 _INPUTS = ('poses', 'recording', 'log', 'calibration', 'calibrations', 'noise')
@@ -169,6 +170,20 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         return BAD_INPUT, {'file': str(args.poses), **_of_error(err)}
     refused = dict(zip(('error', 'advice'), done.refusal))
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
+
+
+def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
+    """Return a rating for JSON."""
+    return {'rating': rating.name, 'rating_reason': rating.reason,
+            'findings': [each.stated for each in rating.findings],
+            'next': {'kind': rating.next.kind, 'text': rating.next.text,
+                     'command': next_command(rating.next, args)}}
+
+
+def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
+    """Return a rating as lines of text, the last one the next command if there is one."""
+    command = next_command(rating.next, args)
+    return [*rating.lines, *([f'      {command}'] if command else [])]
 
 
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:

@@ -149,7 +149,7 @@ def add_mounting(made: Parser) -> None:
 
 def add_base(made: Parser) -> None:
     """Add the options for what a refinement starts from."""
-    from ..refine import BASES
+    from ..calibrate import BASES
 
     base = made.add_mutually_exclusive_group()
     add_stored(base, 'stored calibration to compare with and to start from')

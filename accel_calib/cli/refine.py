@@ -13,12 +13,13 @@ from typing import Any
 
 from rich.table import Table
 
-from .fit import error_line, rated
-from .frame import Done, Output, working
+from .fit import error_line
+from .frame import Done, Output, rated, rating_lines, working
 from .inputs import intake, intake_for, prior, rows_between
 from ..calibrate import Calibration
 from ..effects import effect_named
 from ..findings import rate_refinement
+from ..intake import Intake
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
 from ..report import write_figures, write_page
@@ -28,15 +29,16 @@ from ..text import counted, listed, now, short
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
-    result = _refined(args)
+    found, result = _refined(args)
     stored = list(_stored(args, result))
     rating = rate_refinement(result)
-    return Done({'file': args.poses, **refinement_result(result), **rated(rating)},
-                [*_shown(args, result, stored), *rating.lines],
+    return Done({'file': args.poses, **refinement_result(result), **rated(rating, args),
+                 'read_as': found.read_as},
+                [*_shown(args, result, stored), *rating_lines(rating, args)],
                 refusal=result.refusal if args.output else ())
 
 
-def _refined(args: argparse.Namespace) -> Refinement:
+def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     """Refine with one log; print how it was read."""
     base: str | Calibration = args.base
     if args.calibration is None:
@@ -49,8 +51,9 @@ def _refined(args: argparse.Namespace) -> Refinement:
     with working('refining'):
         fleet = prior(args)
         if fleet is not None:
-            return refine_with_fleet(poses, found.units, fleet, sensor=args.sensor, date=now())
-        return refine(poses, found.units, base=base, sensor=args.sensor, date=now())
+            return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
+                                            date=now())
+        return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now())
 
 
 def _stored(args: argparse.Namespace, result: Refinement) -> Iterator[Path]:
@@ -138,7 +141,7 @@ def _steps_table(result: Refinement) -> Table:
 
 def run_report(args: argparse.Namespace) -> Done:
     """Refine a calibration, and write the report and the figures."""
-    result = _refined(args)
+    _, result = _refined(args)
     _draw(args.output, args, result)
     lines = [f'{result.verdict}, stored in {args.output}']
     if args.figures is not None:

@@ -28,12 +28,14 @@ from .limits import (
 from ..calibrate import Calibration, flat_direction
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
-from ..finding import Finding, ranked, without
+from ..finding import Finding, NextStep, ranked, without
 from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..refine import Refinement
+
+_REFINE = NextStep('refine', 'run refine to find the missing effect')
 
 
 def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:
@@ -55,18 +57,18 @@ def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Find
 
 def _too_large(expected: Expected) -> Iterator[Finding]:
     """Yield a finding if the readings are as good without the calibration."""
-    own = expected.own_mg
+    own, remedy = expected.own_mg, _remedy(expected)
     before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
     if own > BAD_ERROR.value:
         yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
-                      f'{mg(BAD_ERROR.value)}', _remedy(expected), 'BAD')
+                      f'{mg(BAD_ERROR.value)}', remedy.text, 'BAD', step=remedy.kind)
     elif calibrated and before is not None and own > max(before, MATTERS.value) and (
             not expected.is_partial):
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
-                      'without the calibration', _remedy(expected),
-                      'BAD' if own > WORST_ERROR.value else 'USABLE')
+                      'without the calibration', remedy.text,
+                      'BAD' if own > WORST_ERROR.value else 'USABLE', step=remedy.kind)
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
@@ -118,14 +120,15 @@ def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator
     if noise is None or hidden < MATTERS.value or hidden < noise * math.sqrt(
             HIDDEN.value ** 2 - 1.0):
         return
-    begin = f'{mg(hidden)} of the residual are not noise'
+    begin, step = f'{mg(hidden)} of the residual are not noise', 'poses'
     if refinement is None:
         what = f'{begin}: an effect is missing, or poses moved'
-        advice = 'run refine to find the missing effect'
+        advice, step = _REFINE.text, _REFINE.kind
     elif refinement.steps and not _has(expected, refinement):
         names = ', '.join(step.effect for step in refinement.steps)
         what = f'{begin}: {names} is missing in the model'
         advice = refinement.refusal[1] if refinement.refusal else 'use the refined calibration'
+        step = 'poses' if refinement.refusal else 'refine'
     elif any(step.effect == WANDER for step in refinement.steps):
         what = f'{begin}: the offset changed slowly with time ({WANDER})'
         advice = 'let the sensor warm up, and take the poses within a few minutes'
@@ -133,7 +136,7 @@ def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator
         what = f'{begin}, and no effect explains them'
         advice = ('check what differs between the poses, clamp the sensor, and take the poses '
                   'again')
-    yield Finding('beyond_noise', what, advice, 'USABLE')
+    yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
 
 
 def _has(expected: Expected, refinement: Refinement) -> bool:
@@ -165,9 +168,10 @@ def _inexact(expected: Expected, error: float) -> Iterator[Finding]:
                           f'determine: the error may be {mg(error)}', _more_poses(expected),
                           'USABLE')
         else:
+            remedy = _remedy(expected)
             yield Finding('new_orientations', 'the error in new orientations is up to '
-                          f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}',
-                          _remedy(expected), 'USABLE')
+                          f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}', remedy.text,
+                          'USABLE', step=remedy.kind)
     elif expected.worst_mg > WORST_ERROR.value:
         yield Finding('far_from_poses', f'the error is up to {mg(expected.worst_mg)} where there '
                       f'is no pose, expected at most {mg(WORST_ERROR.value)}',
@@ -193,34 +197,29 @@ def _more_poses(expected: Expected) -> str:
     return f'take {counted(more, "more pose") if more > 0 else "more poses"}: {asked.words}'
 
 
-def _remedy(expected: Expected) -> str:
+def _remedy(expected: Expected) -> NextStep:
     """Return what reduces the larger part of the error."""
     if expected.hidden_mg <= BOUND * expected.stated_mg:
-        return _more_poses(expected)
+        return NextStep('poses', _more_poses(expected))
     if expected.noise_mg is None:
-        return ('hold the sensor still in each pose, record std and count, and run refine to find '
-                'what is missing')
-    return 'run refine to find the missing effect'
+        return NextStep('refine', 'hold the sensor still in each pose, record std and count, and '
+                        'run refine to find what is missing')
+    return _REFINE
 
 
-def advice_of(calibration: Calibration) -> str:
+def step_after(calibration: Calibration) -> NextStep:
     """Return what to do with a good calibration."""
-    return '; '.join(filter(None, [_level_words(calibration), temperature_words(calibration)]))
-
-
-def _level_words(calibration: Calibration) -> str:
-    """Return how to level a calibration that is not levelled."""
     if calibration.is_levelled:
-        return ''
-    poses = calibration.used_poses
-    again = 'put the robot on level ground and take its row as --flat'
-    if not len(poses):
-        return again
-    up = directions_in(poses, calibration) @ flat_direction(calibration.frame)
-    nearest = int(np.argmax(up))
-    if up[nearest] < math.cos(math.radians(NEAR_FLAT.value)):
-        return again
-    return f'if the robot was level in row {poses.row[nearest]}, take it as --flat'
+        return NextStep('done', f'use the calibration; {temperature_words(calibration)}')
+    poses, words = calibration.used_poses, 'place the robot level, and level the mounting by it'
+    if len(poses):
+        up = directions_in(poses, calibration) @ flat_direction(calibration.frame)
+        nearest = int(np.argmax(up))
+        if up[nearest] >= math.cos(math.radians(NEAR_FLAT.value)):
+            row = int(poses.row[nearest])
+            return NextStep('level', f'{words}; if it was level in row {row}, by this pose',
+                            (row,))
+    return NextStep('level', words)
 
 
 def temperature_words(calibration: Calibration) -> str:

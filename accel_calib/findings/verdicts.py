@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 from .expected import directions_in, Expected
 from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
-from .rules import advice_of, degrees, findings_of, mg, number, temperature_words
+from .rules import degrees, findings_of, mg, number, step_after
 from ..calibrate import Calibration, Verification
 from ..estimate import coverage
-from ..finding import Finding, Level, ranked
+from ..finding import Finding, Level, NextStep, ranked
 from ..table import Poses
 from ..text import counted
 from ..units import MG
@@ -38,8 +38,8 @@ class Rating:
         Reason, as one sentence without a full stop.
     figures : str
         The figures of the result.
-    next : str
-        What to do next; may be empty.
+    next : NextStep
+        What to do next.
     findings : tuple of Finding
         What is worth knowing, that which decides the verdict first.
 
@@ -48,7 +48,7 @@ class Rating:
     name: Level
     reason: str
     figures: str
-    next: str  # noqa: A003, the name of the second line
+    next: NextStep  # noqa: A003, the name in JSON
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -58,19 +58,18 @@ class Rating:
         lines: list[tuple[str, str]] = [(self.name, self.figures)]
         if self.name != 'GOOD':
             lines.append(('reason', self.reason))
-        if self.next:
-            lines.append(('next', self.next))
+        lines.append(('next', self.next.text))
         return tuple(f'{label:<{width}}  {text}' for label, text in lines)
 
 
-def _rated(findings: Iterable[Finding], good: str, figures: str, advice: str) -> Rating:
-    """Return the rating with the most informative of the worst findings."""
-    found = ranked(findings)
-    below = [each for each in found if each.level != 'GOOD']
+def _rated(findings: Iterable[Finding], good: str, figures: str, after: NextStep) -> Rating:
+    """Return the rating with the most informative of the worst findings; `after` a good one."""
+    ranks = ranked(findings)
+    below = [each for each in ranks if each.level != 'GOOD']
     if not below:
-        return Rating('GOOD', good, figures, advice, found)
-    remedies = list(dict.fromkeys(each.advice for each in below if each.advice))
-    return Rating(below[0].level, below[0].text, figures, '; '.join(remedies[:2]), found)
+        return Rating('GOOD', good, figures, after, ranks)
+    steps = [each.next for each in below if each.advice]
+    return Rating(below[0].level, below[0].text, figures, next(iter(steps), after), ranks)
 
 
 def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> Rating:
@@ -94,7 +93,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
             f'({degrees(expected.error_mg)} of tilt)')
     return _rated(findings_of(expected, refinement), good, _figures(expected),
-                  advice_of(calibration))
+                  step_after(calibration))
 
 
 def rate_refinement(result: Refinement) -> Rating:
@@ -148,7 +147,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
     if poses is not None:
         figures += f', {counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere'
     good = f'the error of these poses is {mg(error)} ({degrees(error)} of tilt)'
-    return _rated(found, good, figures, temperature_words(calibration))
+    return _rated(found, good, figures, step_after(calibration))
 
 
 def _on_new_poses(verification: Verification, expected: Expected, error: float
@@ -159,11 +158,11 @@ def _on_new_poses(verification: Verification, expected: Expected, error: float
     before = _without_noise(verification.rms_before_mg, floor)
     if error > BAD_ERROR.value:
         yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
-                      f'{mg(BAD_ERROR.value)}', again, 'BAD')
+                      f'{mg(BAD_ERROR.value)}', again, 'BAD', step='fit')
     elif not native and error > max(before, floor or 0.0):
         yield Finding('no_gain', f'the error of these poses is {mg(error)}, and {mg(before)} '
                       'without the calibration', again,
-                      'BAD' if error > MATTERS.value else 'USABLE')
+                      'BAD' if error > MATTERS.value else 'USABLE', step='fit')
     stated = expected.error_mg
     changed = error > max(CHANGED.value * stated, MATTERS.value)
     if changed and rate(expected.calibration).name == 'GOOD':
@@ -171,7 +170,7 @@ def _on_new_poses(verification: Verification, expected: Expected, error: float
                       f'{mg(stated)}: the sensor has changed', again, 'USABLE')
     elif error > GOOD_ERROR.value:
         yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
-                      f'{mg(GOOD_ERROR.value)}', again, 'USABLE')
+                      f'{mg(GOOD_ERROR.value)}', again, 'USABLE', step='fit')
     if floor is not None and floor > GOOD_ERROR.value:
         yield Finding('noise', f'the noise of these poses is {mg(floor)}, too large to see an '
                       f'error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in each pose',
@@ -205,7 +204,8 @@ def rate_comparison(comparison: Comparison) -> Rating:
         found.append(Finding(
             'disagreement', f'the calibrations differ by {mg(largest.rms_mg)}, which noise does '
             f'not explain{which}', 'use the latest calibration, or take the poses again'
-            if large else 'use the latest calibration', 'BAD' if large else 'USABLE'))
+            if large else 'use the latest calibration', 'BAD' if large else 'USABLE',
+            step='poses' if large else 'done'))
     elif largest.expected_mg > GOOD_ERROR.value:
         found.append(Finding('noise', 'the uncertainty of the differences is '
                              f'{mg(largest.expected_mg)}, too large to see a change of '
@@ -216,7 +216,7 @@ def rate_comparison(comparison: Comparison) -> Rating:
                              'check that the level ground is level, and that the sensor was not '
                              'mounted again', 'USABLE'))
     return _rated(found, 'the calibrations agree within their uncertainties', figures,
-                  next(iter(comparison.notes), ''))
+                  NextStep('done', 'use the latest calibration'))
 
 
 def _without_noise(residual_mg: float, noise_mg: float | None) -> float:

@@ -191,7 +191,7 @@ def _problem(health: Health) -> str:
 def _rating(rating: Rating) -> Message:
     """Return a rating; with a good one, the page itself knows the next action."""
     return {'rating': rating.name, 'reason': rating.reason,
-            'advice': rating.next if rating.name != 'GOOD' else ''}
+            'advice': rating.next.text if rating.name != 'GOOD' else ''}
 
 
 def _result(calibration: Calibration) -> Message:

@@ -16,8 +16,7 @@ poses that separate effects from their rivals. `with_fleet` includes the typical
 """
 
 from .records import PlannedPose, PosePlan, Refinement, Stage, Step
-from .refinement import BASES, refine
+from .refinement import refine
 from .with_fleet import refine_with_fleet
 
-__all__ = ['BASES', 'PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine',
-           'refine_with_fleet']
+__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine', 'refine_with_fleet']

@@ -29,6 +29,7 @@ from .state import fitted_state, is_noise, sample_words, sampled, State
 from .stored import beside_stored, with_changes, with_stored
 from .words import advice_for, change_words, curve_words, not_testable, where
 from ..calibrate import (
+    BASES,
     Calibration,
     check_sensor,
     fit_findings,
@@ -53,8 +54,6 @@ from ..geometry import unit
 from ..table import check_units, Floats, Poses
 from ..text import counted, listed
 from ..units import MG, Units
-
-BASES = ('auto', 'ideal', '4', '7', '10', '12')
 
 
 def base_of(poses: Poses, units: Units, name: str) -> Calibration:

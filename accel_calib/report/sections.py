@@ -81,8 +81,7 @@ def verdict_box(rating: Rating, more: str = '') -> str:
             f'<p><strong>{escape(rating.name)}</strong> '
             f'{escape(rating.figures.replace("->", "→"))}</p>\n'
             f'{paragraph(_sentence(rating.reason))}{paragraph(more)}'
-            + (f'<p><b>Next:</b> {escape(_sentence(rating.next))}</p>\n' if rating.next else '')
-            + '</div>\n')
+            f'<p><b>Next:</b> {escape(_sentence(rating.next.text))}</p>\n</div>\n')
 
 
 def _sentence(text: str) -> str:

@@ -136,8 +136,7 @@ def format_calibration(calibration: Calibration) -> str:
         'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality), **_rest_noise(calibration),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
-        'findings': [{**asdict(each), 'rows': list(each.rows)}
-                     for each in without(calibration.noted, *OF_FILE)],
+        'findings': [each.stated for each in without(calibration.noted, *OF_FILE)],
         'poses': {'row': calibration.poses.row.tolist(),
                   **{key: calibration.poses[key].tolist() for key, column in COLUMNS.items()
                      if key in calibration.poses and not column.made}},
@@ -352,8 +351,7 @@ def _from_version_2(content: Mapping[str, Any]) -> Mapping[str, Any]:
     texts = [text_at({'warning': each}, 'warning') for each in list_at(content, 'warnings')]
     rejected = [mapping_at({'rejected': each}, 'rejected')
                 for each in list_at(content, 'rejected')]
-    return {**content, 'findings': [{**asdict(Finding('note', text)), 'rows': []}
-                                    for text in texts],
+    return {**content, 'findings': [Finding('note', text).stated for text in texts],
             'rejected': [{**each, 'kind': 'outlier' if text_at(each, 'reason')[:7] == 'outlier'
                           else 'implausible'} for each in rejected]}
 
