@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TextIO
+from typing import TextIO, TYPE_CHECKING
 
 from ..disk import write_atomically
-from ..refine import PosePlan
 from ..units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from ..refine import PosePlan
 
 _CONTEXT = {'temperature': 'temperature', 'supply_voltage': 'supply_voltage', 'std': 'vibration',
             'time': 'wait'}
