@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import calibrate
-from .calibrate import FrameName, level_by_rows, Method, mounting_of, Verification
+from .calibrate import FrameName, Method, mounting_of, Verification
 from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
@@ -29,6 +29,7 @@ from .geometry import spread_directions
 from .intake import nothing_still, poses_of
 from .logs import LogOptions, open_log, read_log
 from .logs import read_recording as read_whole_recording
+from .pipeline import calibrated, Plan
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration
@@ -316,9 +317,9 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     """
     table = _poses(poses, units, gravity)
     known = _units(units, gravity, table.units, 'the pose table')
-    calibration = calibrate.fit_poses(table, known, model=model, method=method, sensor=sensor,
-                                      date=now())
-    return _public(level_by_rows(calibration, table, frame, flat, nose_down))
+    plan = Plan(model=model, method=method, refined=False, flat=flat, nose_down=nose_down,
+                frame=frame, sensor=sensor)
+    return _public(calibrated(table, known, plan).calibration)
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',

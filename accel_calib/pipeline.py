@@ -1,12 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From poses to a rated calibration: fit, refine, level, rate."""
+"""From poses to a rated calibration: fit, refine, level, rate; the one way of all surfaces."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from functools import cached_property
+from typing import Literal, TYPE_CHECKING
 
 from .calibrate import (
     Calibration,
@@ -15,17 +16,59 @@ from .calibrate import (
     FleetPrior,
     FrameName,
     level_by_rows,
+    Method,
 )
 from .effects import PROCESSES
 from .errors import RefusedFitError
 from .findings import rate, Rating
-from .refine import refine, refine_with_fleet, Refinement
 from .table import Poses
 from .text import now, short
 from .units import Units
 
+if TYPE_CHECKING:
+    from .refine import Refinement
+
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    How poses become a calibration.
+
+    Parameters
+    ----------
+    model : {'auto', '4', '7', '9', '10', '12'}
+        The model to fit.
+    method : {'ml', 'algebraic'}
+        Maximum likelihood, or the cost functions of the documents.
+    rows : slice, optional
+        The poses to fit, by default all; the flat pose can be another one.
+    refined : bool
+        Look for effects that the calibration lacks, and add them.
+    fleet : FleetPrior, optional
+        Typical values of sensors of the same model, for few poses; then model 10 is fitted.
+    flat : int, 'first', 'last' or None
+        Pose with the robot level.
+    nose_down : int, optional
+        Row of a pose with the nose of the robot tilted down.
+    frame : {'ros', 'ned', 'android', 'win8'}
+        The levelled frame.
+    sensor : str
+        Name of the sensor; by default the name in the poses.
+
+    """
+
+    model: str = 'auto'
+    method: Method = 'ml'
+    rows: slice | None = None
+    refined: bool = True
+    fleet: FleetPrior | None = None
+    flat: Flat = None
+    nose_down: int | None = None
+    frame: FrameName = 'ros'
+    sensor: str = ''
 
 
 @dataclass(frozen=True)
@@ -37,8 +80,6 @@ class Outcome:
     ----------
     calibration : Calibration
         The fitted or refined calibration.
-    rating : Rating
-        Whether it is good.
     refinement : Refinement or None
         The search for effects; None if it was not asked for, or not possible.
     line : str
@@ -47,16 +88,18 @@ class Outcome:
     """
 
     calibration: Calibration
-    rating: Rating
     refinement: Refinement | None = field(repr=False)
     line: str
 
+    @cached_property
+    def rating(self) -> Rating:
+        """Return whether the calibration is good, and the next step."""
+        return rate(self.calibration, refinement=self.refinement)
 
-def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
-               nose_down: int | None = None, frame: FrameName = 'ros', sensor: str = '',
-               refined: bool = True, fleet: FleetPrior | None = None) -> Outcome:
+
+def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
     """
-    Fit, refine if the poses can carry it, level and rate.
+    Fit, refine if the poses can carry it, and level.
 
     Parameters
     ----------
@@ -64,18 +107,8 @@ def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
         The poses.
     units : Units
         Unit of the readings.
-    flat : int, 'first', 'last' or None
-        Pose with the robot level.
-    nose_down : int, optional
-        Row of a pose with the nose of the robot tilted down.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
-    sensor : str
-        Name of the sensor; by default the name in the poses.
-    refined : bool
-        Look for effects that the calibration lacks, and add them.
-    fleet : FleetPrior, optional
-        Typical values of sensors of the same model, for few poses.
+    plan : Plan
+        The model, the mounting, and whether to refine.
 
     Raises
     ------
@@ -85,16 +118,19 @@ def calibrated(poses: Poses, units: Units, *, flat: Flat = None,
         If the readings are clearly in another unit, or a row does not exist.
 
     """
-    date = now()
-    calibration = (fit_poses(poses, units, sensor=sensor, date=date) if fleet is None
-                   else fit_with_fleet(poses, units, fleet, sensor=sensor, date=date))
+    date, chosen = now(), poses if plan.rows is None else poses.take(plan.rows)
+    calibration = (
+        fit_poses(chosen, units, model=plan.model, method=plan.method, sensor=plan.sensor,
+                  date=date) if plan.fleet is None
+        else fit_with_fleet(chosen, units, plan.fleet, sensor=plan.sensor, date=date))
     refinement, line = None, 'not refined, as asked'
-    if refined:
-        refinement, line = _refinement(poses, units, sensor, date, fleet)
+    if plan.refined:
+        refinement, line = _refinement(chosen, units, plan.sensor, date, plan.fleet)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
-    calibration = level_by_rows(calibration, poses, frame, _row(poses, flat), nose_down)
-    return Outcome(calibration, rate(calibration, refinement=refinement), refinement, line)
+    calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
+                                plan.nose_down)
+    return Outcome(calibration, refinement, line)
 
 
 def _row(poses: Poses, flat: Flat) -> int | None:
@@ -107,6 +143,8 @@ def _row(poses: Poses, flat: Flat) -> int | None:
 def _refinement(poses: Poses, units: Units, sensor: str, date: str,
                 fleet: FleetPrior | None) -> tuple[Refinement | None, str]:
     """Return the search for effects, and a line about it; None if the poses are too few."""
+    from .refine import refine, refine_with_fleet  # a fit alone does not load the search
+
     try:
         found = (refine(poses, units, sensor=sensor, date=date) if fleet is None
                  else refine_with_fleet(poses, units, fleet, sensor=sensor, date=date))

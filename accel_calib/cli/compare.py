@@ -33,7 +33,7 @@ FAILED = 1
 def run_verify(args: argparse.Namespace) -> Done:
     """Evaluate a calibration on the poses of a log."""
     found, calibration = intake_for(args, args.poses)
-    poses = rows_between(found.poses, args.rows)
+    poses = found.poses.take(rows_between(found.poses, args.rows))
     check_units(poses, calibration.units)
     verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)

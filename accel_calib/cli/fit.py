@@ -15,29 +15,25 @@ import numpy as np
 from rich.table import Table
 
 from .frame import console, Done, progress, rated, rating_lines, table, working
-from .inputs import given, intake, log_options, prior, rows_between, settings
+from .inputs import given, intake, log_options, plan_of, rows_between, settings
 from ..calibrate import (
     Calibration,
-    fit_poses,
-    fit_with_fleet,
     GyroBias,
-    level_by_rows,
     Outlook,
     outlook,
 )
 from ..effects import effect_named, LADDER, value_unit
-from ..errors import InputError
 from ..estimate import sensing_axes
-from ..findings import rate, Rating
+from ..findings import Rating
 from ..intake import Intake
+from ..pipeline import calibrated, Outcome
 from ..stored import write_calibration
-from ..table import Floats, Poses
-from ..text import counted, now, short, with_sd
+from ..table import Floats
+from ..text import counted, short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..fleet import Summary
-    from ..pipeline import Outcome
 
 BAD_RATING = 1
 """Exit status for a calibration that is BAD."""
@@ -47,10 +43,10 @@ def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
     found = intake(args, args.poses)
     with working('fitting'):
-        calibration = _fit(args, found, rows_between(found.poses, args.rows))
-        calibration = level_by_rows(calibration, found.poses, args.frame, args.flat,
-                                    args.nose_down)
-    rating, ahead = rate(calibration), outlook(calibration, args.model)
+        outcome = calibrated(found.poses, found.units, plan_of(
+            args, refined=False, rows=rows_between(found.poses, args.rows)))
+    calibration, rating = outcome.calibration, outcome.rating
+    ahead = outlook(calibration, args.model)
     stored = [] if args.output is None else [_store(args, calibration, rating)]
     if args.report is not None:
         from ..report import write_calibration_page
@@ -73,18 +69,6 @@ def _store(args: argparse.Namespace, calibration: Calibration, rating: Rating) -
         return 'not stored, because it is BAD; to store it, use --keep-bad'
     write_calibration(args.output, calibration)
     return f'stored in {args.output}'
-
-
-def _fit(args: argparse.Namespace, found: Intake, chosen: Poses) -> Calibration:
-    """Return the calibration of the chosen rows."""
-    fleet = prior(args)
-    if fleet is None:
-        return fit_poses(chosen, found.units, model=args.model, method=args.method,
-                         sensor=args.sensor, date=now())
-    if args.model not in ('auto', '10') or args.method != 'ml':
-        raise InputError(f'--prior with --model {args.model} --method {args.method}, expected '
-                         'model 10 by maximum likelihood', 'leave out these options')
-    return fit_with_fleet(chosen, found.units, fleet, sensor=args.sensor, date=now())
 
 
 def _shown(found: Intake, calibration: Calibration, ahead: Outlook) -> Iterator[Any]:
@@ -110,13 +94,10 @@ def error_line(result: dict[str, Any]) -> str:
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
     from .refine import refinement_result
-    from ..pipeline import calibrated
 
     found = intake(args, args.log)
     with working('fitting'):
-        outcome = calibrated(found.poses, found.units, flat=args.flat, nose_down=args.nose_down,
-                             frame=args.frame, sensor=args.sensor, refined=args.refined,
-                             fleet=prior(args))
+        outcome = calibrated(found.poses, found.units, plan_of(args))
     stored = _stored_outcome(args, found, outcome)
     ahead = outlook(outcome.calibration, 'auto')
     refinement, rating = outcome.refinement, outcome.rating

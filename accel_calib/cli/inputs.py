@@ -16,6 +16,7 @@ from ..capture import CaptureSettings
 from ..errors import InputError
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
+from ..pipeline import Plan
 from ..stored import OF_FILE, read_calibration, read_prior
 from ..table import Poses
 
@@ -70,7 +71,24 @@ def prior(args: argparse.Namespace) -> FleetPrior | None:
     return None if args.prior is None else read_prior(args.prior, args.sensor_model)
 
 
-def rows_between(poses: Poses, text: str | None) -> Poses:
+def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
+    """
+    Return how to calibrate.
+
+    Raises
+    ------
+    InputError
+        If ``--prior`` stands with another model.
+
+    """
+    plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': prior(args), **more})
+    if plan.fleet is not None and (plan.model not in ('auto', '10') or plan.method != 'ml'):
+        raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '
+                         'model 10 by maximum likelihood', 'leave out these options')
+    return plan
+
+
+def rows_between(poses: Poses, text: str | None) -> slice:
     """
     Return the rows ``A:B`` of a table, 1-based, inclusive; A and B are optional.
 
@@ -80,9 +98,7 @@ def rows_between(poses: Poses, text: str | None) -> Poses:
         If the text is not of this form, or the rows are not in the table.
 
     """
-    if text is None:
-        return poses
-    first, colon, last = text.partition(':')
+    first, colon, last = (text or ':').partition(':')
     try:
         start, stop = int(first or 1), int((last if colon else first) or len(poses))
     except ValueError:
@@ -90,4 +106,4 @@ def rows_between(poses: Poses, text: str | None) -> Poses:
     if not 1 <= start <= stop <= len(poses):
         raise InputError(f'--rows is {text}, expected A:B within 1:{len(poses)}',
                          'set A and B to the first and the last row, 1-based')
-    return poses.take(slice(start - 1, stop))
+    return slice(start - 1, stop)

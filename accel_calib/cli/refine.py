@@ -47,7 +47,7 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
         found, base = intake_for(args, args.poses)
     for line in found.lines:
         Output(stderr=True).print(line)
-    poses = rows_between(found.poses, args.rows)
+    poses = found.poses.take(rows_between(found.poses, args.rows))
     with working('refining'):
         fleet = prior(args)
         if fleet is not None:

@@ -33,7 +33,7 @@ from ..effects import MODELS
 from ..errors import AccelCalibError, crash_words, RefusedFitError, system_error
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
-from ..pipeline import calibrated, Outcome
+from ..pipeline import calibrated, Outcome, Plan
 from ..stored import write_calibration
 from ..stored.exports import export
 from ..table import Poses
@@ -176,8 +176,8 @@ def _result(found: Input, path: Path, options: Options) -> tuple[Row, Calibratio
     try:
         intake = poses_of(path, options.log, options.settings)
         row = _about(found, options, intake.poses, path)
-        outcome = calibrated(intake.poses, intake.units, sensor=row['sensor'],
-                             refined=options.refined)
+        outcome = calibrated(intake.poses, intake.units, Plan(
+            sensor=row['sensor'], refined=options.refined))
     except OSError:
         raise  # it may be possible to read it later
     except AccelCalibError as err:
