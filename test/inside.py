@@ -16,6 +16,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from accel_calib.calibrate import (
+    Calibration,
     determines,
     mounting_figures,
     posterior,
@@ -154,10 +155,7 @@ from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml, write_plan
 from accel_calib.stored.calibration_yaml import _values_in as values_in
-from accel_calib.stored.calibration_yaml import (
-    format_calibration,
-    parse_calibration,
-)
+from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import export, identifier
 from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
 from accel_calib.stored.exports import Options as ExportOptions
@@ -173,6 +171,17 @@ NODES = {
 
 CALIBRATOR = NODES['calibrator']
 
+
+def format_calibration(calibration: Calibration) -> str:
+    """Return the text of the file of a calibration."""
+    return calibration_bytes(calibration).decode()
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """Return the calibration in the text of a file."""
+    return calibration_from(text.encode(), name)
+
+
 PAGE_FOLDER = Path(server.__file__).parent / 'page'
 """Files of the live page."""
 
@@ -183,6 +192,7 @@ BLOCK_OF_A_BAG = bag, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_VALUES_WRITTEN = calibration_yaml, 'MOST_VALUES'
 MOST_BYTES_WRITTEN = calibration_yaml, 'MOST_BYTES'
+MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
 PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'
 CLOCK_OF_A_SOURCE = sources, 'time'

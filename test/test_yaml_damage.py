@@ -19,6 +19,7 @@ from inside import (
     format_calibration,
     MOST_BYTES,
     MOST_BYTES_WRITTEN,
+    MOST_LETTERS_OF_LABELS,
     MOST_VALUES,
     MOST_VALUES_READ,
     MOST_VALUES_WRITTEN,
@@ -133,7 +134,7 @@ def test_one_long_label_cannot_take_the_memory_of_all(monkeypatch: pytest.Monkey
     text = format_calibration(replace(calibration,
                                       poses=calibration.poses.with_columns(label=labels)))
     assert parse_calibration(text, 'x.yaml').poses['label'][0] == 50 * 'x'
-    monkeypatch.setattr(*MOST_BYTES_WRITTEN, 49 * len(labels))
+    monkeypatch.setattr(*MOST_LETTERS_OF_LABELS, 49 * len(labels))
     with pytest.raises(DamagedCalibrationError, match='label has 50 characters, expected 49'):
         parse_calibration(text, 'x.yaml')
 
@@ -199,8 +200,8 @@ def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:
     ('reading:\n', 'reading:\n  - [0.0, 0.0, x]\n', "reading has shape|reading contains 'x'"),
     ('count: [', 'count: [-1.0, ', 'count has shape|count holds'),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
-    ('rejected: []', 'rejected: [1]', 'rejected is 1, expected names'),
-    ('findings: [', 'findings: [1, ', 'finding is 1, expected names')])
+    ('rejected: []', 'rejected: [1]', 'rejected contains 1, expected names'),
+    ('findings: [', 'findings: [1, ', 'findings contains 1, expected names')])
 def test_a_value_of_another_kind_is_named(old: str, new: str, words: str) -> None:
     texts = [text for text in intact() if old in text]
     assert texts
