@@ -21,12 +21,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import re
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .made import about, frame_words, Made, Options, steady_at, steady_grid, temperature_range
+from .made import (
+    Format,
+    frame_words,
+    head,
+    Made,
+    Options,
+    polynomial,
+    single,
+    steady_at,
+    steady_grid,
+    temperature_range,
+)
 from ...calibrate import Calibration
 from ...effects import (
     CUBE,
@@ -53,32 +65,26 @@ _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,40}')
 _BEYOND = 2.0
 """The repetitions converge for forces up to this [g]."""
 
+_C_USE = ('use:', '  float raw[3], force[3];', '  {name}_apply(raw, {temperature}force);')
+_ARDUINO_USE = (
+    'use: save this file beside the sketch, and write',
+    '  #include "{name}.h"',
+    '  void loop() {{',
+    '    float raw[3] = {{imu.x(), imu.y(), imu.z()}};  // as in the log of the calibration',
+    '    float force[3];',
+    '    {name}_apply(raw, {temperature}force);',
+    '  }}')
+
 
 @dataclass(frozen=True)
 class Header:
     """
     The numbers of a header, in single precision.
 
-    Parameters
-    ----------
-    vec_v : (k, 3) array
-        Polynomial of the offset in s, the constant first, in the unit of the readings.
-    mat_w : (k, 3, 3) array
-        Polynomial of the gain in s.
-    bend : (k, b) array
-        Polynomials of the coefficients of the bending terms in s [g].
-    monomial, axis : (b,) array of int
-        Function and axis of each bending term.
-    inverse : (3, 3) array
-        W(0)⁻¹.
-    turn : (3, 3) array
-        ΔRᵀ times the force per g.
-    per_g : float
-        Reading per g.
-    middle, half : float
-        s = (temperature - middle) / half [°C].
-    steps : int
-        Number of repetitions.
+    The polynomials in s = (temperature - middle) / half have the constant first: `vec_v` (k, 3) in
+    the unit of the readings, `mat_w` (k, 3, 3), and `bend` (k, b) [g], the coefficients of the
+    bending terms. `monomial` and `axis` (b,) are the function and the axis of each bending term.
+    `inverse` is W(0)⁻¹, `turn` is ΔRᵀ times the force per g, and `steps` counts the repetitions.
 
     """
 
@@ -106,13 +112,13 @@ class Header:
 
     @property
     def matrix(self) -> Floats:
-        """M, (3, 3)."""
+        """M of an affine header, (3, 3)."""
         return self.turn @ self.inverse / self.per_g
 
     def force(self, reading: Floats, temperature: Floats) -> Floats:
         """Return the (n, 3) force in the unit of the header, by its equations."""
         if self.is_affine:
-            return (reading - self.vec_v[0]) @ _single(self.matrix).T
+            return (reading - self.vec_v[0]) @ single(self.matrix).T
         s = (np.clip(temperature, self.middle - self.half, self.middle + self.half)
              - self.middle) / self.half
         d = (reading - _value(self.vec_v, s)) / self.per_g
@@ -133,41 +139,30 @@ def _value(polynomial: Floats, s: Floats) -> Floats:
     return np.tensordot(powers, polynomial, 1)
 
 
-def _single(values: Floats) -> Floats:
-    return np.asarray(values, np.float32).astype(float)
-
-
-def header_of(calibration: Calibration) -> Header:
+def _header_of(calibration: Calibration) -> Header:
     """Return the numbers of the header of a calibration."""
     low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE,) * 2
     middle, half = (low + high) / 2.0, max((high - low) / 2.0, 1e-3)
-    nodes = np.cos(np.pi * (np.arange(4 * _LARGEST_DEGREE) + 0.5) / (4 * _LARGEST_DEGREE))
+    count, units = 4 * _LARGEST_DEGREE, calibration.units
+    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     here = steady_at(calibration, middle + half * nodes)
-    count, units = len(nodes), calibration.units
-    mat_w = _polynomial(nodes, np.broadcast_to(here.mat_w, (count, 3, 3)))
-    bend = _polynomial(nodes, np.broadcast_to(here.bend, (len(here.bend), count)).T)
-    vec_v = _polynomial(nodes, np.broadcast_to(here.vec_v, (count, 3)))
+    vec_v, mat_w, bend = (_without_rounding(polynomial(
+        nodes, values, 0.1 * _SMALL_G, _LARGEST_DEGREE)) for values in (
+            np.broadcast_to(here.vec_v, (count, 3)), np.broadcast_to(here.mat_w, (count, 3, 3)),
+            np.broadcast_to(here.bend, (len(here.bend), count)).T))
     terms, which = here.terms, here.terms.bending
     made = Header(
-        vec_v=_single(units.from_g(vec_v)), mat_w=_single(mat_w), bend=_single(bend),
+        vec_v=single(units.from_g(vec_v)), mat_w=single(mat_w), bend=single(bend),
         monomial=np.array(terms.monomials, np.intp)[terms.place[which]], axis=terms.axis[which],
-        inverse=_single(np.linalg.inv(mat_w[0])),
-        turn=_single(calibration.rotation.T * calibration.force_per_g),
+        inverse=single(np.linalg.inv(mat_w[0])),
+        turn=single(calibration.rotation.T * calibration.force_per_g),
         per_g=float(np.float32(units.per_g)), middle=float(np.float32(middle)),
         half=float(np.float32(half)), steps=0)
     return made if made.is_affine else _with_steps(made, calibration)
 
 
-def _polynomial(nodes: Floats, values: Floats) -> Floats:
-    """Return the (k, ...) polynomial of the smallest degree through (n, ...) values at nodes."""
-    flat = values.reshape(len(nodes), -1)
-    for degree in range(_LARGEST_DEGREE + 1):
-        powers = nodes[:, np.newaxis] ** np.arange(degree + 1)
-        found = np.linalg.lstsq(powers, flat, rcond=None)[0]
-        if not flat.size or np.max(np.abs(powers @ found - flat)) < 0.1 * _SMALL_G:
-            break
-    found[np.abs(found) < _NOTHING_G] = 0.0
-    return found.reshape(len(found), *values.shape[1:])
+def _without_rounding(coefficients: Floats) -> Floats:
+    return np.where(np.abs(coefficients) < _NOTHING_G, 0.0, coefficients)
 
 
 def _with_steps(header: Header, calibration: Calibration) -> Header:
@@ -183,51 +178,19 @@ def _with_steps(header: Header, calibration: Calibration) -> Header:
     return found
 
 
-def make_c(calibration: Calibration, options: Options) -> Made:
-    """Return a C99 header, which is C++, too."""
-    return _make(calibration, options, _C_USE)
-
-
-def make_arduino(calibration: Calibration, options: Options) -> Made:
-    """Return a header for an Arduino sketch."""
-    return _make(calibration, options, _ARDUINO_USE)
-
-
-_C_USE = ('use:', '  float raw[3], force[3];', '  {name}_apply(raw, {temperature}force);')
-_ARDUINO_USE = (
-    'use: save this file beside the sketch, and write',
-    '  #include "{name}.h"',
-    '  void loop() {{',
-    '    float raw[3] = {{imu.x(), imu.y(), imu.z()}};  // as in the log of the calibration',
-    '    float force[3];',
-    '    {name}_apply(raw, {temperature}force);',
-    '  }}')
-
-
 def _make(calibration: Calibration, options: Options, use: Sequence[str]) -> Made:
-    name = _name_of(calibration, options)
-    header = header_of(calibration)
-    per_g = calibration.force_per_g
-    return Made(_text(header, calibration, name, use),
+    """Return a header for C99 and C++, with these lines about its use."""
+    header, per_g = _header_of(calibration), calibration.force_per_g
+    return Made(_text(header, calibration, _name_of(calibration, options), use),
                 lambda reading, temperature: header.force(reading, temperature) / per_g, True)
 
 
 def _name_of(calibration: Calibration, options: Options) -> str:
-    """
-    Return the name of the functions, a C identifier.
-
-    Raises
-    ------
-    InputError
-        If the name that was asked for is none.
-
-    """
-    if options.name:
-        if not _NAME.fullmatch(options.name):
-            raise InputError(f'the name is {options.name!r}, expected a letter, and then at most '
-                             '40 letters, digits or _', 'choose a name such as imu_left')
-        return options.name
-    return identifier(calibration.sensor)
+    """Return the name of the functions; raise InputError if the one asked for is none in C."""
+    if options.name and not _NAME.fullmatch(options.name):
+        raise InputError(f'the name is {options.name!r}, expected a letter, and then at most '
+                         '40 letters, digits or _', 'choose a name such as imu_left')
+    return options.name or identifier(calibration.sensor)
 
 
 def identifier(text: str) -> str:
@@ -240,14 +203,15 @@ def identifier(text: str) -> str:
 def _text(header: Header, calibration: Calibration, name: str, use: Sequence[str]) -> str:
     unit = 'm/s^2' if calibration.units.is_si else 'g'
     temperature = 'temperature, ' if header.of_temperature else ''
-    comment = ['Calibration of an accelerometer, written by accel-calib export.', '',
-               *about(calibration), '',
-               f'force: {unit}, {frame_words(calibration, True)}; at rest +1 g on the axis that '
-               'points up', *_equation(header), '',
+    title, *about = head(calibration)
+    comment = [title, '', *about, '',
+               f'force: {unit}, {frame_words(calibration)}; at rest +1 g on the axis that points '
+               'up', *_equation(header), '',
                *(line.format(name=name, temperature=temperature) for line in use)]
     guard = f'ACCEL_CALIB_{name.upper()}_H'
     lines = ['/*', *(f' * {line}'.rstrip() for line in comment), ' */', f'#ifndef {guard}',
-             f'#define {guard}', '', *_includes(header),
+             f'#define {guard}', '',
+             *(['#include <math.h>', ''] if np.any(header.monomial >= WAVE) else []),
              f'/* 1 if {name}_apply takes the temperature [degC] */',
              f'#define {name.upper()}_NEEDS_TEMPERATURE {int(header.of_temperature)}', '',
              *(_affine(header, name) if header.is_affine else _general(header, name)), '',
@@ -266,11 +230,7 @@ def _equation(header: Header) -> list[str]:
     return lines
 
 
-def _includes(header: Header) -> list[str]:
-    return ['#include <math.h>', ''] if np.any(header.monomial >= WAVE) else []
-
-
-def literal(value: float) -> str:
+def _literal(value: float) -> str:
     """Return a C literal of a float."""
     text = str(np.float32(value))
     return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
@@ -279,16 +239,14 @@ def literal(value: float) -> str:
 def _array(kind: str, values: Floats) -> str:
     """Return the definition of a C array of one or two dimensions."""
     sizes = ''.join(f'[{size}]' for size in values.shape)
-    rows = [', '.join(map(literal, row)) for row in np.atleast_2d(values)]
-    inner = '{' + '}, {'.join(rows) + '}'
-    body = f'{{{inner}}}' if values.ndim == 2 else inner
-    text = f'    static const float {kind}{sizes} = {body};'
+    parts = ([f'{{{", ".join(map(_literal, row))}}}' for row in values] if values.ndim == 2
+             else list(map(_literal, values)))
+    start = f'    static const float {kind}{sizes} = '
+    text = f'{start}{{{", ".join(parts)}}};'
     if len(text) <= 99:
         return text
-    joined = '},\n        {'.join(rows) if values.ndim == 2 else ',\n        '.join(
-        map(literal, values))
-    return (f'    static const float {kind}{sizes} = {{\n        '
-            + (f'{{{joined}}}}};' if values.ndim == 2 else f'{joined}}};'))
+    lines = ',\n        '.join(parts)
+    return f'{start}{{\n        {lines}}};'
 
 
 def _affine(header: Header, name: str) -> list[str]:
@@ -305,7 +263,7 @@ def _general(header: Header, name: str) -> list[str]:
     return [f'static inline void {name}_apply(const float raw[3], {temperature}float force[3])',
             '{', _array('N', header.inverse), _array('R', header.turn),
             *_scaled_temperature(header),
-            f'    const float per_unit = {literal(1.0 / header.per_g)};',
+            f'    const float per_unit = {_literal(1.0 / header.per_g)};',
             '    float d[3], e[3], u[3];', '    int i, step;', '',
             *(f'    d[{axis}] = (raw[{axis}] - {_horner(header.vec_v[:, axis])}) * per_unit;'
               for axis in range(3)),
@@ -323,16 +281,16 @@ def _scaled_temperature(header: Header) -> list[str]:
     """Return the lines that compute s; a temperature that is NaN counts as the reference."""
     if not header.of_temperature:
         return []
-    low, high = (literal(header.middle + sign * header.half) for sign in (-1.0, 1.0))
-    unknown = literal(REFERENCE_TEMPERATURE)
+    low, high = (_literal(header.middle + sign * header.half) for sign in (-1.0, 1.0))
+    unknown, per_half = _literal(REFERENCE_TEMPERATURE), _literal(1 / header.half)
     return [f'    const float known = temperature == temperature ? temperature : {unknown};',
             f'    const float held = known < {low} ? {low} : (known > {high} ? {high} : known);',
-            f'    const float s = (held - {_signed(header.middle)}) * {literal(1 / header.half)};']
+            f'    const float s = (held - {_signed(header.middle)}) * {per_half};']
 
 
 def _signed(value: float) -> str:
     """Return a literal, in brackets if it is negative."""
-    return f'({literal(value)})' if value < 0 else literal(value)
+    return f'({_literal(value)})' if value < 0 else _literal(value)
 
 
 def _horner(polynomial: Floats) -> str:
@@ -364,7 +322,7 @@ def _monomial(index: int) -> str:
         mode, axis = divmod(index - WAVE, 3)
         x = f'u[{axis}]'
         held = f'({x} < -1.0f ? -1.0f : ({x} > 1.0f ? 1.0f : {x}))'
-        return f'cosf({literal((mode + 1) * np.pi / 2.0)} * ({held} + 1.0f))'
+        return f'cosf({_literal((mode + 1) * np.pi / 2.0)} * ({held} + 1.0f))'
     if index >= PRODUCT:
         one, two = ((0, 1), (0, 2), (1, 2))[index - PRODUCT]
         return f'u[{one}] * u[{two}]'
@@ -373,3 +331,10 @@ def _monomial(index: int) -> str:
     if index >= ODD_SQUARE:
         return f'{x} * {size.format(x)}'
     return f'{x} * {x} * {x}' if index >= CUBE else f'{x} * {x}'
+
+
+FORMATS = {
+    'c': Format('C header', '.h', 'header in C99 and C++, single precision',
+                partial(_make, use=_C_USE), 'options'),
+    'arduino': Format('Arduino header', '.h', 'header for an Arduino sketch',
+                      partial(_make, use=_ARDUINO_USE), 'options')}

@@ -17,8 +17,8 @@ context of the poses. The loss is the RMS difference to the full correction.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,10 +32,9 @@ from ...effects import (
     NOMINAL_SUPPLY,
     REFERENCE_TEMPERATURE,
 )
-from ...errors import InputError
 from ...geometry import OVER_THE_SPHERE, spread_directions
 from ...table import Floats
-from ...units import MG
+from ...units import MG, Units
 
 Correction = Callable[[Floats, Floats], Floats]
 """(n, 3) readings in the unit of the calibration, (n,) temperatures [°C] -> (n, 3) force [g]."""
@@ -47,6 +46,9 @@ LEAST_LOSS_MG = 0.005
 """Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
 
 _LARGEST_TEXT = 200
+_TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
+_AXES = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
+         'android': 'x right, y up the screen, z out of it', 'win8': 'as android, z reversed'}
 
 
 @dataclass(frozen=True)
@@ -80,21 +82,11 @@ class Options:
 @dataclass(frozen=True)
 class Made:
     """
-    The text of a format, and what it does.
+    The content of a file, and what it does.
 
-    Parameters
-    ----------
-    content : str or bytes
-        Content of the file.
-    correct : callable or None
-        The correction that the written values make, by the equation of the format; None for a
-        format that holds everything.
-    levelled : bool
-        Whether the correction includes the mounting.
-    notes : tuple of str
-        What the user has to do.
-    rounded : str
-        What the offset is rounded to; empty if it is not.
+    `correct` is the correction that the written values make by the equation of the format; None
+    for a format that holds everything. `levelled` states whether it includes the mounting, and
+    `rounded` what the values of an effect are rounded to. `notes` say what the user has to do.
 
     """
 
@@ -102,7 +94,37 @@ class Made:
     correct: Correction | None
     levelled: bool
     notes: tuple[str, ...] = ()
-    rounded: str = ''
+    rounded: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Format:
+    """
+    A format that a calibration can be exported to.
+
+    Parameters
+    ----------
+    label : str
+        Name of what reads the file.
+    suffix : str
+        End of the name of the file, after the name of the calibration.
+    what : str
+        Content in a few words.
+    make : callable
+        Calibration, and what `needs` names -> file.
+    needs : {'', 'options', 'noise'}
+        What the file needs beside the calibration: choices, or the noise of the sensor.
+    source : str
+        Definition of the format; empty for formats of this package.
+
+    """
+
+    label: str
+    suffix: str
+    what: str
+    make: Callable[..., Made]
+    needs: str = ''
+    source: str = ''
 
 
 @dataclass(frozen=True)
@@ -135,7 +157,7 @@ class Grid:
     force: Floats
 
 
-_TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
+# The steady model
 
 
 def temperature_range(calibration: Calibration) -> tuple[float, float] | None:
@@ -148,14 +170,18 @@ def temperature_range(calibration: Calibration) -> tuple[float, float] | None:
     return low, max(low, high)
 
 
-def steady_context(calibration: Calibration, temperature: Floats) -> Context:
-    """Return the context of the steady model at (n,) temperatures."""
+def steady_at(calibration: Calibration, temperature: Floats) -> AtContext:
+    """Return the steady model at (n,) temperatures."""
+    return calibration.model.at(_steady_context(calibration, temperature))
+
+
+def _steady_context(calibration: Calibration, temperature: Floats) -> Context:
     none, used = np.zeros((len(temperature), 3)), calibration.used_poses
     supply = (float(np.mean(used['supply_voltage'])) if 'supply_voltage' in used and len(used)
               else NOMINAL_SUPPLY)
     time = calibration.ranges.get('time', (0.0, 0.0))[1]
-    return {'temperature': temperature, 'temperature_of_offset': temperature,
-            'temperature_of_gain': temperature, 'temperature_rate': np.zeros(len(temperature)),
+    return {**dict.fromkeys(_TEMPERATURE_KEYS, temperature),
+            'temperature_rate': np.zeros(len(temperature)),
             'time': np.full(len(temperature), time),
             'supply_voltage': np.full(len(temperature), supply),
             'std': none, 'previous': none, 'rate': none}
@@ -168,47 +194,46 @@ def steady_grid(calibration: Calibration, temperatures: int = _TEMPERATURES, siz
     levels = np.linspace(low, high, temperatures if high > low else 1)
     force = np.tile(OVER_THE_SPHERE * size, (len(levels), 1))
     temperature = np.repeat(levels, len(OVER_THE_SPHERE))
-    here = calibration.model.at(steady_context(calibration, temperature))
-    return Grid(calibration.units.from_g(here.reading(force)), temperature, force)
+    reading = steady_at(calibration, temperature).reading(force)
+    return Grid(calibration.units.from_g(reading), temperature, force)
 
 
-def _full_grid(calibration: Calibration) -> Grid:
-    """Return forces over the sphere with the context of the poses."""
-    model = calibration.model
-    if not set(model.needs) - {'temperature'}:
-        return steady_grid(calibration)
-    poses = with_history(in_g(calibration.poses, calibration.units), model)
-    known = calibration.held_context(poses.columns)
-    rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _POSES).astype(int))]
-    directions = spread_directions(_DIRECTIONS)
-    each = np.repeat(rows, len(directions))
-    context: dict[str, Any] = {
-        **steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),
-        **{key: values[each] for key, values in known.items()}}
-    force = np.tile(directions, (len(rows), 1))
-    reading = model.at(_of_the_model(context, model)).reading(force)
-    return Grid(calibration.units.from_g(reading), context['temperature'], force)
+def polynomial(nodes: Floats, values: Floats, exact: float, most: int) -> Floats:
+    """Return the (k, ...) polynomial of the smallest degree through (n, ...) values at nodes."""
+    flat = values.reshape(len(nodes), -1)
+    for degree in range(most + 1):
+        powers = nodes[:, np.newaxis] ** np.arange(degree + 1)
+        found = np.linalg.lstsq(powers, flat, rcond=None)[0]
+        if not flat.size or np.max(np.abs(powers @ found - flat)) < exact:
+            break
+    return found.reshape(len(found), *values.shape[1:])
 
 
-def _of_the_model(context: Context, model: Model) -> Context:
-    return {key: values for key, values in context.items()
-            if key in (*model.needs, *model.over)}
+def single(values: Floats) -> Floats:
+    """Return the values in single precision."""
+    return np.asarray(np.asarray(values, np.float32), float)
 
 
-def steady_at(calibration: Calibration, temperature: Floats) -> AtContext:
-    """Return the steady model at (n,) temperatures."""
-    return calibration.model.at(steady_context(calibration, temperature))
+def affine_fit(calibration: Calibration) -> tuple[Floats, Floats]:
+    """
+    Return M (3, 3) and c (3,) with levelled force = M reading - c [g].
+
+    For a model of offset and gain they are exact; for others they are the least-squares fit over
+    the sphere and the range of the temperature.
+
+    """
+    if all(effect.linear for effect in calibration.model.terms.effects):
+        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
+        offset = matrix @ calibration.offset
+    else:
+        grid, scale = steady_grid(calibration), calibration.units.per_g
+        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
+        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
+        matrix, offset = found[:3].T / scale, -found[3]
+    return calibration.rotation.T @ matrix, calibration.rotation.T @ offset
 
 
-def difference_mg(calibration: Calibration, made: Made) -> float:
-    """Return the RMS difference between the full correction and that of an export [mg]."""
-    if made.correct is None:
-        return 0.0
-    grid = _full_grid(calibration)
-    wanted = grid.force @ calibration.rotation if made.levelled else grid.force
-    found = made.correct(grid.reading, grid.temperature)
-    return float(np.sqrt(np.mean(np.sum((found - wanted) ** 2, axis=1)))) * MG
+# The losses
 
 
 def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration], Made],
@@ -219,13 +244,16 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
     The part of an effect is the loss for a sensor that has this effect alone.
 
     """
-    total = difference_mg(calibration, made)
-    found = [] if total < LEAST_LOSS_MG else _by_effect(calibration, label, make, made)
-    found.sort(key=lambda loss: -loss.leaves_mg)
-    if total >= LEAST_LOSS_MG and (len(found) != 1 or found[0].leaves_mg < 0.99 * total):
-        found.append(Loss('', f'{label} leaves {total:.2g} mg in all{_where(calibration)}', total))
+    found, total = [], difference_mg(calibration, made)
+    if total >= LEAST_LOSS_MG:
+        found = sorted(_by_effect(calibration, label, make, made), key=lambda one: -one.leaves_mg)
+        if len(found) != 1 or found[0].leaves_mg < 0.99 * total:
+            limits = temperature_range(calibration)
+            where = f', from {limits[0]:.0f} to {limits[1]:.0f} degC' if limits else ''
+            found.append(Loss('', f'{label} leaves {total:.2g} mg in all{where}', total))
     if calibration.is_levelled and not made.levelled:
-        angle = _angle_deg(calibration.rotation)
+        cosine = (np.trace(calibration.rotation) - 1.0) / 2.0
+        angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
         found.append(Loss('mounting', f'{label} has its own setting for the mounting: this file '
                           f'leaves the rotation of {angle:.2f} deg',
                           2.0 * np.sin(np.radians(angle) / 2.0) * np.sqrt(2.0 / 3.0) * MG))
@@ -252,44 +280,46 @@ def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration
 def _lacking(name: str, values: Floats, made: Made, left: Callable[[dict[str, Floats]], float]
              ) -> str:
     """Return what a format does with an effect that it does not hold."""
-    if name == 'offset' and made.rounded:
-        return f'rounds the zero-g offset to {made.rounded}'
     effect = effect_named(name)
     parameters, shape = effect.split(values)
     words = effect.words.partition(',')[0]
+    if name in made.rounded:
+        return f'rounds the {words} to {made.rounded[name]}'
     if effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
         return f'has no lag ({shape[0]:.0f} s) in the {words}'
     return f'has no {words}'
 
 
-def _where(calibration: Calibration) -> str:
-    limits = temperature_range(calibration)
-    return f', from {limits[0]:.0f} to {limits[1]:.0f} degC' if limits else ''
+def difference_mg(calibration: Calibration, made: Made) -> float:
+    """Return the RMS difference between the full correction and that of an export [mg]."""
+    if made.correct is None:
+        return 0.0
+    grid = _full_grid(calibration)
+    wanted = grid.force @ calibration.rotation if made.levelled else grid.force
+    found = made.correct(grid.reading, grid.temperature)
+    return float(np.sqrt(np.mean(np.sum((found - wanted) ** 2, axis=1)))) * MG
 
 
-def _angle_deg(rotation: Floats) -> float:
-    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
+def _full_grid(calibration: Calibration) -> Grid:
+    """Return forces over the sphere with the context of the poses."""
+    model = calibration.model
+    if not set(model.needs) - {'temperature'}:
+        return steady_grid(calibration)
+    poses = with_history(in_g(calibration.poses, calibration.units), model)
+    known = calibration.held_context(poses.columns)
+    rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _POSES).astype(int))]
+    directions = spread_directions(_DIRECTIONS)
+    each = np.repeat(rows, len(directions))
+    context: dict[str, Any] = {
+        **_steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),
+        **{key: values[each] for key, values in known.items()}}
+    force = np.tile(directions, (len(rows), 1))
+    reading = model.at(context).reading(force)
+    return Grid(calibration.units.from_g(reading), context['temperature'], force)
 
 
-def affine_fit(calibration: Calibration, *, levelled: bool) -> tuple[Floats, Floats]:
-    """
-    Return the matrix M (3, 3) and the constant c (3,) with force = M reading - c [g].
-
-    For a model of offset and gain they are exact; for others they are the least-squares fit over
-    the sphere and the range of the temperature.
-
-    """
-    if all(effect.linear for effect in calibration.model.terms.effects):
-        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
-        offset = matrix @ calibration.offset
-    else:
-        grid = steady_grid(calibration)
-        scale = calibration.units.per_g
-        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
-        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
-        matrix, offset = found[:3].T / scale, -found[3]
-    turned = calibration.rotation.T if levelled else np.eye(3)
-    return turned @ matrix, turned @ offset
+# Text
 
 
 def plain_text(text: str) -> str:
@@ -307,14 +337,18 @@ def plain_text(text: str) -> str:
     return safe
 
 
+def unit_in_ascii(units: Units, native: str) -> str:
+    """Return the unit of readings, with this name for native ones."""
+    return native if units.is_native else units.name.replace('s2', 's^2')
+
+
 def about(calibration: Calibration) -> list[str]:
     """Return lines about a calibration for a comment: sensor, date, unit, model, quality."""
-    quality, poses = calibration.quality, calibration.used_poses
-    unit = {'m/s2': 'm/s^2', 'g': 'g', 'native': 'native (counts or volts)'}[
-        calibration.units.name]
+    quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
     lines = [f'sensor: {plain_text(calibration.sensor) or "not named"}',
              f'date: {plain_text(calibration.date) or "not known"}',
-             f'readings: {unit}, 1 g = {calibration.units.per_g:.9g}',
+             f'readings: {unit_in_ascii(units, "native (counts or volts)")}, '
+             f'1 g = {units.per_g:.9g}',
              f'model {plain_text(calibration.name)}: '
              f'{plain_text(", ".join(calibration.model.effects)) or "no effects"}',
              f'residual over {len(poses)} poses: before {quality.rms_before_mg:.3g} mg, after '
@@ -328,26 +362,14 @@ def about(calibration: Calibration) -> list[str]:
     return lines
 
 
-def frame_words(calibration: Calibration, levelled: bool) -> str:
-    """Return the frame of the corrected force in words."""
-    if not levelled or not calibration.is_levelled:
+def head(calibration: Calibration, *others: str) -> list[str]:
+    """Return the lines of the comment on top of a file, without the sign of a comment."""
+    return ['Calibration of an accelerometer, written by accel-calib export.',
+            *about(calibration), *others]
+
+
+def frame_words(calibration: Calibration) -> str:
+    """Return the frame of the levelled force in words."""
+    if not calibration.is_levelled:
         return 'in the axes of the sensor'
-    axes = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
-            'android': 'x right, y up the screen, z out of it', 'win8': 'as android, z reversed'}
-    return f'in the levelled frame {calibration.frame}: {axes[calibration.frame]}'
-
-
-def in_metric(calibration: Calibration, label: str) -> Calibration:
-    """
-    Return the calibration for readings in m/s².
-
-    Raises
-    ------
-    InputError
-        If the readings are native.
-
-    """
-    if calibration.units.is_native:
-        raise InputError(f'the calibration is for native readings, but {label} corrects readings '
-                         'in m/s2', f'fit a calibration to the readings that {label} logs in m/s2')
-    return calibration.in_units('m/s2')
+    return f'in the levelled frame {calibration.frame}: {_AXES[calibration.frame]}'

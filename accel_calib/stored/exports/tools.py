@@ -17,7 +17,7 @@ VINS      no correction; noise of one sample               integration_base.h of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import io
 import json
 from pathlib import Path
@@ -28,13 +28,17 @@ import numpy as np
 from .made import (
     about,
     affine_fit,
+    Correction,
     difference_mg,
+    Format,
     frame_words,
+    head,
     LEAST_LOSS_MG,
     Made,
-    Options,
     plain_text,
+    unit_in_ascii,
 )
+from ..calibration_yaml import CORRECTION
 from ... import __version__
 from ...calibrate import Calibration
 from ...disk import check_regular
@@ -42,78 +46,72 @@ from ...errors import InputError
 from ...table import Floats
 from ...units import STANDARD_GRAVITY
 
-IMU_CALIB_URL = ('https://github.com/dpkoch/imu_calib/blob/master/src/accel_calib/'
-                 'accel_calib.cpp')
-IMUCAL_URL = 'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'
-KALIBR_URL = 'https://github.com/ethz-asl/kalibr/wiki/IMU-Noise-Model'
-VINS_URL = ('https://github.com/HKUST-Aerial-Robotics/VINS-Fusion/blob/master/vins_estimator/src/'
-            'factor/integration_base.h')
+_IMU_CALIB_URL = ('https://github.com/dpkoch/imu_calib/blob/master/src/accel_calib/'
+                  'accel_calib.cpp')
+_IMUCAL_URL = 'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'
+_KALIBR_URL = 'https://github.com/ethz-asl/kalibr/wiki/IMU-Noise-Model'
+_VINS_URL = ('https://github.com/HKUST-Aerial-Robotics/VINS-Fusion/blob/master/vins_estimator/'
+             'src/factor/integration_base.h')
 
 _IMUCAL_VERSION = '2.0.0'
-EQUATION = ('force = transpose(rotation) matrix (reading - offset), plus the effects other than '
-            'offset and gain')
 
-NOISE_KEYS = ('accelerometer_noise_density', 'accelerometer_random_walk',
-              'gyroscope_noise_density', 'gyroscope_random_walk', 'update_rate')
-"""Figures of ``accel-calib noise --json``: m/s²/√Hz, m/s³/√Hz, rad/s/√Hz, rad/s²/√Hz, Hz."""
+_NOISE = {'accelerometer_noise_density': 'm/s^2/sqrt(Hz)',
+          'accelerometer_random_walk': 'm/s^3/sqrt(Hz)',
+          'gyroscope_noise_density': 'rad/s/sqrt(Hz)',
+          'gyroscope_random_walk': 'rad/s^2/sqrt(Hz)', 'update_rate': 'Hz'}
+"""Figures of ``accel-calib noise --json``, and their units."""
+
+_VINS = {'acc_n': ('accelerometer_noise_density', 'm/s^2'),
+         'gyr_n': ('gyroscope_noise_density', 'rad/s'),
+         'acc_w': ('accelerometer_random_walk', 'm/s^3'),
+         'gyr_w': ('gyroscope_random_walk', 'rad/s^2')}
+"""Keys of VINS, with the figure of the noise and its unit for one sample."""
 
 Noise = Mapping[str, Any]
 
 
-def _affine(calibration: Calibration, factor: float = 1.0) -> tuple[Floats, Floats, Any]:
+def _affine(calibration: Calibration, factor: float = 1.0) -> tuple[Floats, Floats, Correction]:
     """Return M and c with force = M raw - c in the unit of `apply`, and the correction in g."""
     unit = calibration.force_per_g * factor
-    matrix, constant = (each * unit for each in affine_fit(calibration, levelled=True))
+    matrix, constant = (each * unit for each in affine_fit(calibration))
     return matrix, constant, lambda reading, temperature: (reading @ matrix.T - constant) / unit
 
 
-def make_imu_calib(calibration: Calibration, options: Options) -> Made:
+def _make_imu_calib(calibration: Calibration) -> Made:
     """Return the YAML file of the ROS package imu_calib."""
     matrix, constant, correct = _affine(calibration)
-    lines = [*_comment(calibration), f'# source: {IMU_CALIB_URL}',
-             f'# equation: force = SM raw - bias; SM row by row; {frame_words(calibration, True)}',
-             'SM:', *(f'  - {yaml_number(value)}' for value in matrix.ravel().tolist()),
-             'bias:', *(f'  - {yaml_number(value)}' for value in constant.tolist())]
-    return Made('\n'.join(lines) + '\n', correct, True)
+    lines = ['SM:', *(f'  - {_yaml_number(value)}' for value in matrix.ravel().tolist()),
+             'bias:', *(f'  - {_yaml_number(value)}' for value in constant.tolist())]
+    equation = f'equation: force = SM raw - bias; SM row by row; {frame_words(calibration)}'
+    return Made(_commented(calibration, _IMU_CALIB_URL, [equation], lines), correct, True)
 
 
-def yaml_number(value: float) -> str:
-    """Return a number for YAML 1.1, which reads 1e-05 without a point as text."""
-    mantissa, exponent, power = repr(float(value)).partition('e')
-    return mantissa + ('' if '.' in mantissa else '.0') + exponent + power
-
-
-def _rounded(value: float) -> float:
-    """Return a figure of the noise with more digits than it has meaning."""
-    return float(f'{value:.9g}')
-
-
-def make_imucal(calibration: Calibration, options: Options) -> Made:
+def _make_imucal(calibration: Calibration) -> Made:
     """Return the JSON file of imucal: FerrarisCalibrationInfo."""
-    native = calibration.units.is_native
-    matrix, constant, correct = _affine(calibration, STANDARD_GRAVITY if native else 1.0)
+    units, gyro = calibration.units, calibration.gyro
+    matrix, constant, correct = _affine(calibration, STANDARD_GRAVITY if units.is_native else 1.0)
     gain = np.linalg.inv(matrix)
     sizes = np.linalg.norm(gain, axis=1)
-    rate = calibration.gyro.bias if calibration.gyro is not None else np.zeros(3)
-    unit = {'m/s2': 'm/s^2', 'g': 'g', 'native': 'a.u.'}[calibration.units.name]
-    gyro = '' if calibration.gyro is not None else ' The bias of the gyro is not known: it is 0.'
+    no_gyro = ' The bias of the gyro is not known: it is 0.' if gyro is None else ''
     content = {
-        'cal_type': 'Ferraris', 'acc_unit': 'g' if unit == 'g' else 'm/s^2', 'gyr_unit': 'rad/s',
-        'from_acc_unit': unit, 'from_gyr_unit': 'rad/s',
+        'cal_type': 'Ferraris',
+        'acc_unit': 'm/s^2' if units.is_native else unit_in_ascii(units, ''),
+        'gyr_unit': 'rad/s', 'from_acc_unit': unit_in_ascii(units, 'a.u.'),
+        'from_gyr_unit': 'rad/s',
         'comment': '; '.join(['written by accel-calib export', *about(calibration)])
-        + f'; {frame_words(calibration, True)}.{gyro}',
+        + f'; {frame_words(calibration)}.{no_gyro}',
         'K_a': np.diag(sizes), 'R_a': gain / sizes[:, np.newaxis], 'b_a': gain @ constant,
-        'K_g': np.eye(3), 'R_g': calibration.rotation, 'K_ga': np.zeros((3, 3)), 'b_g': rate,
-        '_format_version': _IMUCAL_VERSION}
+        'K_g': np.eye(3), 'R_g': calibration.rotation, 'K_ga': np.zeros((3, 3)),
+        'b_g': np.zeros(3) if gyro is None else gyro.bias, '_format_version': _IMUCAL_VERSION}
     return Made(_json(content), correct, True)
 
 
-def make_json(calibration: Calibration, options: Options) -> Made:
+def _make_json(calibration: Calibration) -> Made:
     """Return all values as JSON."""
     return Made(_json(_content(calibration)), None, True, _affine_alone(calibration))
 
 
-def make_npz(calibration: Calibration, options: Options) -> Made:
+def _make_npz(calibration: Calibration) -> Made:
     """Return all values as a NumPy archive; texts and effects are arrays of text."""
     content = _content(calibration)
     effects = content.pop('effects')
@@ -143,7 +141,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
     """Return the values of a calibration by name."""
     quality, model = calibration.quality, calibration.model
     return {
-        'format': 'accel_calib export', 'package_version': __version__, 'equation': EQUATION,
+        'format': 'accel_calib export', 'package_version': __version__, 'equation': CORRECTION,
         'sensor': calibration.sensor, 'stream': calibration.stream, 'date': calibration.date,
         'units': calibration.units.name, 'per_g': calibration.units.per_g,
         'force_per_g': calibration.force_per_g, 'model': calibration.name,
@@ -161,98 +159,68 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 
 
 def _json(content: Mapping[str, Any]) -> str:
-    """Return JSON text; numbers that are not finite are null."""
-    return json.dumps(_plain(content), indent=2, allow_nan=False) + '\n'
+    return json.dumps(content, indent=2, allow_nan=False, default=lambda array: array.tolist()
+                      ) + '\n'
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _commented(calibration: Calibration, url: str, comment: Sequence[str], lines: Sequence[str]
+               ) -> str:
+    """Return the text of a file with a comment on top."""
+    above = head(calibration, f'source: {url}', *comment)
+    return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
 
 
-def _comment(calibration: Calibration) -> list[str]:
-    return ['# Calibration of an accelerometer, written by accel-calib export.',
-            *(f'# {line}' for line in about(calibration))]
+def _make_kalibr(calibration: Calibration, noise: Noise | None) -> Made:
+    """Return imu.yaml of Kalibr; raise InputError if a figure of the noise is missing."""
+    figures, notes = _noise_figures(noise, 'Kalibr')
+    comment = ['Kalibr corrects no offset and gain: correct recordings with accel-calib apply.',
+               *notes]
+    # The topic of most examples, if that of the readings is not known.
+    topic = json.dumps(plain_text(calibration.stream) or '/imu0')
+    lines = [f'rostopic: {topic}', *(
+        f'{key}: {_noise_number(figures[key])}  # {unit}' for key, unit in _NOISE.items())]
+    return _of_noise(calibration, _commented(calibration, _KALIBR_URL, comment, lines), notes)
 
 
-def _uncorrected(calibration: Calibration) -> Any:
-    """Return what a tool does that takes the readings as they are."""
-    return lambda reading, temperature: calibration.units.to_g(reading)
-
-
-def make_kalibr(calibration: Calibration, options: Options, noise: Noise | None) -> Made:
-    """
-    Return imu.yaml of Kalibr.
-
-    Raises
-    ------
-    InputError
-        If a figure of the noise is missing.
-
-    """
-    figures, notes = noise_figures(noise, 'Kalibr')
-    units = ('m/s^2/sqrt(Hz)', 'm/s^3/sqrt(Hz)', 'rad/s/sqrt(Hz)', 'rad/s^2/sqrt(Hz)', 'Hz')
-    lines = [*_comment(calibration), f'# source: {KALIBR_URL}',
-             '# Kalibr corrects no offset and gain: correct recordings with accel-calib apply.',
-             *(f'# {note}' for note in notes),
-             f'rostopic: {json.dumps(_topic(calibration))}',
-             *(f'{key}: {yaml_number(_rounded(figures[key]))}  # {unit}'
-               for key, unit in zip(NOISE_KEYS, units, strict=True))]
-    return Made('\n'.join(lines) + '\n', _uncorrected(calibration), False,
-                (*_APPLY, *notes))
-
-
-_APPLY = ('the correction is not in this file: use accel-calib apply for recordings, or the '
-          'calibrator node',)
-
-
-def make_vins(calibration: Calibration, options: Options, noise: Noise | None) -> Made:
-    """
-    Return the lines of the noise for a configuration of VINS.
-
-    Raises
-    ------
-    InputError
-        If a figure of the noise is missing.
-
-    """
-    figures, notes = noise_figures(noise, 'VINS')
+def _make_vins(calibration: Calibration, noise: Noise | None) -> Made:
+    """Return lines for VINS; raise InputError if a figure of the noise is missing."""
+    figures, notes = _noise_figures(noise, 'VINS')
     root = float(np.sqrt(figures['update_rate']))
-    rows = [('acc_n', NOISE_KEYS[0], 'm/s^2'), ('gyr_n', NOISE_KEYS[2], 'rad/s'),
-            ('acc_w', NOISE_KEYS[1], 'm/s^3'), ('gyr_w', NOISE_KEYS[3], 'rad/s^2')]
-    gravity = (calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY)
-    lines = [*_comment(calibration), f'# source: {VINS_URL}',
-             '# VINS does not correct offset and gain: correct readings with accel-calib first.',
-             f'# noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)',
-             *(f'# {note}' for note in notes),
-             '# Put these lines into the configuration file, below "imu parameters".',
-             *(f'{name}: {yaml_number(_rounded(figures[key] * root))}  # {unit}, density '
-               f'{figures[key]:.6g}' for name, key, unit in rows),
-             f'g_norm: {yaml_number(gravity)}  # m/s^2']
-    return Made('\n'.join(lines) + '\n', _uncorrected(calibration), False,
-                (*_APPLY, *notes))
+    comment = ['VINS does not correct offset and gain: correct readings with accel-calib first.',
+               f'noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)', *notes,
+               'Put these lines into the configuration file, below "imu parameters".']
+    gravity = calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY
+    lines = [*(f'{name}: {_noise_number(figures[key] * root)}  # {unit}, density '
+               f'{figures[key]:.6g}' for name, (key, unit) in _VINS.items()),
+             f'g_norm: {_yaml_number(gravity)}  # m/s^2']
+    return _of_noise(calibration, _commented(calibration, _VINS_URL, comment, lines), notes)
 
 
-def _topic(calibration: Calibration) -> str:
-    """Return the topic of the readings; that of most examples if it is not known."""
-    return plain_text(calibration.stream) or '/imu0'
+def _of_noise(calibration: Calibration, text: str, notes: tuple[str, ...]) -> Made:
+    """Return the file of a tool that takes the readings as they are."""
+    advice = ('the correction is not in this file: use accel-calib apply for recordings, or the '
+              'calibrator node')
+    return Made(text, lambda reading, temperature: calibration.units.to_g(reading), False,
+                (advice, *notes))
 
 
-def noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
+def _noise_number(value: float) -> str:
+    """Return a figure of the noise with more digits than it has meaning."""
+    return _yaml_number(float(f'{value:.9g}'))
+
+
+def _yaml_number(value: float) -> str:
+    """Return a number for YAML 1.1, which reads 1e-05 without a point as text."""
+    mantissa, exponent, power = repr(float(value)).partition('e')
+    return mantissa + ('' if '.' in mantissa else '.0') + exponent + power
+
+
+def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
     """
     Return the figures of the noise that a file needs, and notes about them.
 
-    A random walk that is not seen in the recording is replaced by its upper limit.
-
-    Raises
-    ------
-    InputError
-        If there is no file of the noise, or a figure is missing or not positive.
+    A random walk that is not seen in the recording is replaced by its upper limit. Other figures
+    that are missing or not positive raise InputError.
 
     """
     if noise is None:
@@ -260,7 +228,7 @@ def noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tu
                          'run accel-calib noise RECORDING --json noise.json, and add --noise '
                          'noise.json')
     figures, notes = {}, []
-    for key in NOISE_KEYS:
+    for key in _NOISE:
         limit = _upper_limit(noise, key)
         figures[key] = _figure(noise, key, label) if limit is None else limit
         if limit is not None:
@@ -316,3 +284,16 @@ def read_noise(path: Path) -> Noise:
         raise InputError(f'{path} contains no JSON object, expected the result of accel-calib '
                          'noise --json', 'run accel-calib noise RECORDING --json noise.json')
     return content
+
+
+FORMATS = {
+    'imu_calib': Format('imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package',
+                        _make_imu_calib, source=_IMU_CALIB_URL),
+    'imucal': Format('imucal', '_imucal.json', 'FerrarisCalibrationInfo as JSON', _make_imucal,
+                     source=_IMUCAL_URL),
+    'kalibr': Format('Kalibr', '_imu.yaml', 'imu.yaml with the noise', _make_kalibr, 'noise',
+                     _KALIBR_URL),
+    'vins': Format('VINS', '_vins.yaml', 'lines of the noise for its configuration', _make_vins,
+                   'noise', _VINS_URL),
+    'json': Format('JSON', '.json', 'all values', _make_json),
+    'npz': Format('NumPy', '.npz', 'all values as arrays', _make_npz)}
