@@ -166,6 +166,21 @@ def test_the_node_computes_if_the_worker_process_was_killed(
     assert process.call(os.getpid) != os.getpid()
 
 
+def test_a_file_does_not_wait_for_the_worker_process(process: WorkerProcess) -> None:
+    assert process.call_if_free(os.getpid) == os.getpid()  # it is not started for this
+    worker = process.call(os.getpid)
+    assert process.call_if_free(os.getpid) == worker
+    computing = threading.Thread(target=process.call, args=(time.sleep, 2.0))
+    computing.start()
+    found = {process.call_if_free(os.getpid)}
+    while computing.is_alive() and os.getpid() not in found:
+        found.add(process.call_if_free(os.getpid))
+    assert computing.is_alive()
+    computing.join()
+    process.close()
+    assert process.call_if_free(math.sqrt, 4.0) == 2.0
+
+
 def test_a_node_that_ends_does_not_wait_for_a_computation(process: WorkerProcess) -> None:
     worker = process.call(os.getpid)
     closing = threading.Timer(0.2, process.close)

@@ -23,7 +23,7 @@ from .guidance import next_action, Plan
 from .sensor import Sensor
 from .store import Store, writing_advice
 from .work import at_rest, change_words, fit, is_partial, plan_for, refined
-from .worker import Compute, Files, Found, Part, Task
+from .worker import Calibrations, Compute, Files, Found, Part, Task
 from ..calibrate import (
     Calibration,
     carried_words,
@@ -251,7 +251,7 @@ class Commands:
     def _with_files(self, function: Callable[..., Found], *given: Any) -> Part[Found]:
         """Use files; fail if another sensor replaces this one meanwhile."""
         session, sensor, name = self._session, self._session.sensor, self._session.name
-        found: Found = yield Files(function, *given)
+        found: Found = yield Calibrations(function, *given)
         if session.sensor is not sensor:
             raise InputError(f'the sensor {session.name!r} has replaced {name!r} meanwhile, '
                              'expected one sensor: the result is not used',
@@ -266,7 +266,7 @@ class Commands:
         calibration = session.sensor.present
         if calibration is None:
             raise _NO_CALIBRATION
-        yield Files(store.save, calibration, session.sensor.live.book.poses())
+        yield Calibrations(store.save, calibration, session.sensor.live.book.poses())
         if session.sensor.offered is calibration:
             session.adopt(calibration)
         return f'stored in {store.calibration} and {store.poses}'
@@ -355,11 +355,12 @@ class Commands:
                           'hold it still for longer')
 
 
-def _stored(store: Store, calibration: Calibration | None) -> OSError | None:
+def _stored(store: Store, calibration: Calibration | None, call: Callable[..., Any]
+            ) -> OSError | None:
     """Store a calibration if there is one; return the error if it cannot be stored."""
     try:
         if calibration is not None:
-            store.save_calibration(calibration)
+            store.save_calibration(calibration, call)
     except OSError as error:
         return error
     return None

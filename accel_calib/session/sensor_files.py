@@ -10,6 +10,7 @@ A lock on the files is held until it is released or the process ends.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 import fcntl
@@ -18,7 +19,7 @@ from pathlib import Path
 import stat
 
 from .settings import CalibratorSettings
-from .store import aside, Identity, Store, store_of, writing_advice
+from .store import aside, here, Identity, Store, store_of, writing_advice
 from ..calibrate import Calibration
 from ..disk import remove_leftovers
 from ..errors import (
@@ -185,12 +186,12 @@ class Loaded:
     notes: tuple[str, ...] = ()
 
 
-def load(store: Store) -> Loaded:
+def load(store: Store, call: Callable[..., Calibration] = here) -> Loaded:
     """Read a store; damaged files are renamed, and no file keeps the node from starting."""
     notes = _tidied(store)
     calibration, poses, problem = None, None, ''
     try:
-        calibration = store.load_calibration()
+        calibration = store.load_calibration(call)
     except Exception as error:  # the node starts in any case
         problem = f'{_words(error)}; {_after(store.calibration, error)}'
     if calibration is not None and calibration.stream not in ('', store.identity.topic):

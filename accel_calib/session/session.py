@@ -29,7 +29,7 @@ from .settings import CalibratorSettings
 from .store import Store, writing_advice
 from .stream import SILENT, StreamStatistics
 from .work import plan_for
-from .worker import Compute, Files, Task
+from .worker import Calibrations, Compute, Files, Task
 from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
 from ..compare import status
 from ..errors import InputError
@@ -283,7 +283,7 @@ class Session:
 
     def _load(self, store: Store, sensor: Sensor) -> Task:
         """Read the files of a sensor, and use them unless another one has replaced it."""
-        loaded: Loaded = yield Files(load, store)
+        loaded: Loaded = yield Calibrations(load, store)
         if self.sensor is sensor:
             self._adopt_loaded(loaded)
             self._show_poses(store=False)

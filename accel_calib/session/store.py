@@ -14,6 +14,7 @@ are left where they are: the node then works without storing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import errno
 import glob
@@ -23,11 +24,12 @@ import os
 from pathlib import Path
 import re
 import stat
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..calibrate import Calibration, check_sensor
-from ..disk import check_regular, copy_atomically
+from ..disk import check_regular, copy_atomically, write_atomically
 from ..errors import (
     AccelCalibError,
     DamagedCalibrationError,
@@ -37,9 +39,11 @@ from ..errors import (
     StoredCalibrationError,
 )
 from ..logs import read_poses, write_table
-from ..stored import read_calibration, write_calibration
+from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
 from ..units import UnitName
+
+Found = TypeVar('Found')
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
 _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
@@ -58,6 +62,11 @@ _UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENOENT, errno.ELOOP)
 
 _LARGEST_TABLE = 32 * 2**20
 """Largest pose table of a store: 100,000 poses have half of it [bytes]."""
+
+
+def here(function: Callable[..., Found], *given: object) -> Found:
+    """Call a function in this process."""
+    return function(*given)
 
 
 @dataclass(frozen=True)
@@ -107,6 +116,9 @@ class Store:
     """
     The files of a sensor.
 
+    Calibrations are formatted and parsed by the function that methods have as `call`, which can
+    use another process. Files are written in this one, which holds their lock.
+
     Parameters
     ----------
     calibration : Path
@@ -127,7 +139,7 @@ class Store:
         """Path of the pose table."""
         return self.calibration.with_name(f'{self.calibration.stem}_poses.csv')
 
-    def load_calibration(self) -> Calibration | None:
+    def load_calibration(self, call: Callable[..., Calibration] = here) -> Calibration | None:
         """
         Return the stored calibration, or None if there is none.
 
@@ -142,7 +154,7 @@ class Store:
             If the file cannot be read.
 
         """
-        return self._read(self.calibration) if _exists(self.calibration) else None
+        return call(self._read, self.calibration) if _exists(self.calibration) else None
 
     def _read(self, path: Path) -> Calibration:
         """Read a calibration for this sensor, and convert it to the unit of the readings."""
@@ -186,17 +198,17 @@ class Store:
                                              f'{expected!r}', 'new poses start a new table')
         return poses
 
-    def save_calibration(self, calibration: Calibration) -> None:
+    def save_calibration(self, calibration: Calibration, call: Callable[..., Any] = here) -> None:
         """Write the calibration, and keep the file before as a step; raise OSError if it fails."""
+        data: bytes = call(calibration_bytes, replace(
+            calibration, sensor=self.identity.sensor, stream=self.identity.topic))
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
-        step = self._keep_step()
-        write_calibration(self.calibration, replace(
-            calibration, sensor=self.identity.sensor, stream=self.identity.topic),
-            keep_before=False)
-        if step.read_bytes() == self.calibration.read_bytes():
+        step = self._keep_step(call)
+        write_atomically(self.calibration, lambda file: file.buffer.write(data))
+        if step.read_bytes() == data:
             step.unlink()
 
-    def _keep_step(self) -> Path:
+    def _keep_step(self, call: Callable[..., Calibration]) -> Path:
         """
         Copy the file for `step_back`, or store an empty step if there is no file.
 
@@ -207,7 +219,7 @@ class Store:
 
         """
         try:
-            self.load_calibration()
+            self.load_calibration(call)
         except AccelCalibError:
             aside(self.calibration, 'other')
         except OSError as error:
@@ -237,7 +249,7 @@ class Store:
     def _step(self, number: int) -> Path:
         return self.calibration.with_name(f'{self.calibration.name}.before{number}')
 
-    def step_back(self) -> Calibration | None:
+    def step_back(self, call: Callable[..., Calibration] = here) -> Calibration | None:
         """
         Return to the calibration before the last stored one; None if there was none.
 
@@ -255,7 +267,7 @@ class Store:
         """
         step = self._last_step()
         try:
-            before = self._read(step) if step.stat().st_size else None
+            before = call(self._read, step) if step.stat().st_size else None
         except DamagedCalibrationError as error:
             raise StoredCalibrationError(f'{error.message}; it is kept as '
                                          f'{aside(step, "damaged")}', 'try again for the '
@@ -289,15 +301,16 @@ class Store:
         self.poses.parent.mkdir(parents=True, exist_ok=True)
         write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
 
-    def save(self, calibration: Calibration, poses: Poses) -> None:
+    def save(self, calibration: Calibration, poses: Poses, call: Callable[..., Any] = here
+             ) -> None:
         """Write the calibration and the poses; raise OSError if it fails."""
-        self.save_calibration(calibration)
+        self.save_calibration(calibration, call)
         self.save_poses(poses)
 
-    def set_aside(self) -> list[Path]:
+    def set_aside(self, call: Callable[..., Calibration] = here) -> list[Path]:
         """Rename both files, and return the new paths; raise OSError if it fails."""
         if _exists(self.calibration):
-            self._keep_step()
+            self._keep_step(call)
         return [aside(path, 'reset') for path in (self.calibration, self.poses) if _exists(path)]
 
     def is_writable(self) -> bool:

@@ -14,6 +14,9 @@ Functions, arguments and results are pickled between the processes and never sto
 ends with the node in all cases, because its standard input is then closed. If the process cannot
 be started or dies, the node does the computation itself.
 
+Calibrations are also formatted and parsed in the process, if it is free. Files are written in the
+node, which holds their lock: the process may live a little longer than the node.
+
 **Order.** A task is a generator of steps. Steps that use files run in one thread, one after the
 other. Steps that compute run in another one, which waits for the worker process. Between its steps
 a task runs in the thread of the session, so that only this thread changes the session.
@@ -42,7 +45,7 @@ from threading import Lock, Thread
 from traceback import format_exc
 from typing import Any, BinaryIO, cast, TypeVar
 
-from .store import writing_advice
+from .store import here, writing_advice
 from ..errors import AccelCalibError, InputError
 
 Found = TypeVar('Found')
@@ -63,6 +66,10 @@ _IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.spec
 _START = ('import sys; sys.path[:] = filter(None, sys.path); '
           f'from {__name__} import main; main()')
 """Code of the process. The current folder is not searched for modules: it may hold any file."""
+
+
+class ClosedError(InputError):
+    """The node is ending."""
 
 
 class WorkerProcess:
@@ -122,13 +129,25 @@ class WorkerProcess:
         with self._turn:
             return self._call(function, given)
 
+    def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
+        """Call a function as `call` does, or at once in this process if the other one is busy."""
+        if not self._turn.acquire(blocking=False):
+            return function(*given)
+        try:
+            is_running = self._process is not None and self._process.poll() is None
+            return self._call(function, given) if is_running else function(*given)
+        except ClosedError:  # what the user has asked to store is stored
+            return function(*given)
+        finally:
+            self._turn.release()
+
     def _call(self, function: Callable[..., Found], given: tuple[Any, ...]) -> Found:
         self.start()
         try:
             good, found = self._ask(function, given)
         except (OSError, EOFError, pickle.UnpicklingError):
             if self._closed:
-                raise InputError('the node is shutting down', 'start it again') from None
+                raise ClosedError('the node is shutting down', 'start it again') from None
             self._end()
             return function(*given)
         if not good:
@@ -225,7 +244,15 @@ class Files(Step):
 
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; it does not need the worker process."""
-        return super().run(lambda function, *given: function(*given))
+        return super().run(here)
+
+
+class Calibrations(Files):
+    """A function that uses files, and can call others in the worker process if that is free."""
+
+    def run(self, call: Callable[..., Any]) -> Any:
+        """Return the result; the last argument of the function is `call`."""
+        return Step.run(self, lambda function, *given: function(*given, call))
 
 
 class Compute(Step):
@@ -314,16 +341,16 @@ class Worker:
             self._advance()
 
         self._is_busy = True
-        self._submit(self._files, step, then)
+        self._submit(self._files, step, self._process.call_if_free, then)
 
     def _later(self, task: Task, answer: Answer, done: Future[Any]) -> None:
         """Continue a task that computed when no files are used."""
         self._computed.append((task, answer, done))
         self._advance()
 
-    def _submit(self, pool: ThreadPoolExecutor, step: Step,
+    def _submit(self, pool: ThreadPoolExecutor, step: Step, call: Callable[..., Any],
                 then: Callable[[Future[Any]], None]) -> None:
-        future = pool.submit(step.run, self._process.call)
+        future = pool.submit(step.run, call)
         future.add_done_callback(lambda done: self._call_soon(lambda: then(done)))
 
     def _resume(self, task: Task, answer: Answer, done: Future[Any] | None = None) -> None:
@@ -345,7 +372,8 @@ class Worker:
             self._steps.append((found, task, answer))
             self._advance()
         elif isinstance(found, Step):
-            self._submit(self._computation, found, partial(self._later, task, answer))
+            self._submit(self._computation, found, self._process.call,
+                         partial(self._later, task, answer))
         else:
             answer(success, found)
 
@@ -373,5 +401,5 @@ class Worker:
         self._process.close()
         self._computation.shutdown(wait=True)
         for step, _, _ in self._steps:
-            self._files.submit(step.run, self._process.call)
+            self._files.submit(step.run, self._process.call_if_free)
         self._files.shutdown(wait=True)
