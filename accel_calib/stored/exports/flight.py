@@ -32,15 +32,15 @@ calibration, [5]_ Betaflight, [6]_ the parameter file of QGroundControl.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from .made import (
+    commented,
     Format,
-    head,
     Made,
     Options,
     polynomial,
@@ -174,11 +174,12 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
     notes = () if device is not None else (
         f'PX4 uses these values for the accelerometer whose device id is in {ids}; check it in '
         'QGroundControl, or use --device-id (device_id of sensor_accel)',)
-    comment = ['equation: (raw - thermal(T - TREF) - OFF) * SCALE, by axis, in m/s^2, before the '
+    comment = [_AXES[options.axes], f'source: {_PX4_URL}',
+               'equation: (raw - thermal(T - TREF) - OFF) * SCALE, by axis, in m/s^2, before the '
                'rotation of the board', 'Vehicle-Id Component-Id Name Value Type']
     lines = [f'1\t1\t{name}\t{_number(value)}\t'
              f'{_INT32 if isinstance(value, int) else _REAL32}' for name, value in rows.items()]
-    text = _text(calibration, options, _PX4_URL, comment, lines)
+    text = commented(calibration, comment, lines)
     return _made(text, found, metric, calibration, options, notes)
 
 
@@ -201,11 +202,11 @@ def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
                  f'{thermal}TMAX': found.limits[1]}
         for order, part in enumerate(found.thermal, 1):
             rows |= _three(f'{thermal}ACC{order}_', '', part * _PER_MILLION)
-    comment = ['equation: (raw - p(T - 35) + p(CALTEMP - 35) - OFFS) * SCAL, by axis, in m/s^2, '
+    comment = [_AXES[options.axes], f'source: {_ARDUPILOT_URL}',
+               'equation: (raw - p(T - 35) + p(CALTEMP - 35) - OFFS) * SCAL, by axis, in m/s^2, '
                'before the rotation of the board; p has the coefficients INS_TCAL / 1e6']
     lines = [f'{name},{_number(value)}' for name, value in rows.items()]
-    text = _text(calibration, options, _ARDUPILOT_URL, comment, lines)
-    return _made(text, found, metric, calibration, options, ())
+    return _made(commented(calibration, comment, lines), found, metric, calibration, options, ())
 
 
 def _made(text: str, found: ByAxis, metric: Calibration, calibration: Calibration,
@@ -227,11 +228,11 @@ def _make_betaflight(calibration: Calibration, options: Options) -> Made:
     if np.max(np.abs(counts)) > _LARGEST_COUNT:
         raise InputError(f'the largest offset is {np.max(np.abs(counts)):.0f} counts, expected at '
                          f'most {_LARGEST_COUNT}', 'correct --counts-per-g')
-    comment = [f'equation: (raw - acc_calibration) / acc_1G, by axis, acc_1G = {per_g:g} counts; '
+    comment = [_AXES[options.axes], f'source: {_BETAFLIGHT_URL}',
+               f'equation: (raw - acc_calibration) / acc_1G, by axis, acc_1G = {per_g:g} counts; '
                'the fourth number says that the calibration is done']
     values = ','.join(f'{int(value)}' for value in counts)
-    text = _text(calibration, options, _BETAFLIGHT_URL, comment,
-                 [f'set acc_calibration = {values},1', 'save'])
+    text = commented(calibration, comment, [f'set acc_calibration = {values},1', 'save'])
     return Made(text, lambda reading, temperature: (reading * factor - counts * signs) / per_g,
                 False, rounded={'offset': 'counts'})
 
@@ -276,12 +277,6 @@ def _signs(options: Options) -> Floats:
 def _three(start: str, end: str, values: Floats) -> Parameters:
     """Return three parameters by axis."""
     return {f'{start}{axis}{end}': float(value) for axis, value in zip('XYZ', values)}
-
-
-def _text(calibration: Calibration, options: Options, url: str, comment: Sequence[str],
-          lines: Sequence[str]) -> str:
-    above = head(calibration, _AXES[options.axes], f'source: {url}', *comment)
-    return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
 
 
 def _number(value: float) -> str:

@@ -17,7 +17,7 @@ context of the poses. The loss is the RMS difference to the full correction.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -102,20 +102,10 @@ class Format:
     """
     A format that a calibration can be exported to.
 
-    Parameters
-    ----------
-    label : str
-        Name of what reads the file.
-    suffix : str
-        End of the name of the file, after the name of the calibration.
-    what : str
-        Content in a few words.
-    make : callable
-        Calibration, and what `needs` names -> file.
-    needs : {'', 'options', 'noise'}
-        What the file needs beside the calibration: choices, or the noise of the sensor.
-    source : str
-        Definition of the format; empty for formats of this package.
+    `label` is the name of what reads the file, `suffix` the end of its name, `what` its content in
+    a few words, and `source` the definition of the format; empty for formats of this package.
+    `make` returns the file of a calibration. What it `needs` beside is ``options``, or the
+    ``noise`` of the sensor.
 
     """
 
@@ -130,16 +120,9 @@ class Format:
 @dataclass(frozen=True)
 class Loss:
     """
-    What a format does not hold.
+    What a format does not hold: the RMS difference to the full correction that is left [mg].
 
-    Parameters
-    ----------
-    effect : str
-        Name of the effect; ``mounting`` for ΔR; empty for all effects together.
-    words : str
-        One line for the user.
-    leaves_mg : float
-        RMS difference to the full correction [mg].
+    The effect is ``mounting`` for ΔR, and empty for all effects together. `words` is one line.
 
     """
 
@@ -362,10 +345,16 @@ def about(calibration: Calibration) -> list[str]:
     return lines
 
 
-def head(calibration: Calibration, *others: str) -> list[str]:
-    """Return the lines of the comment on top of a file, without the sign of a comment."""
+def head(calibration: Calibration) -> list[str]:
+    """Return the first lines of the comment on top of a file."""
     return ['Calibration of an accelerometer, written by accel-calib export.',
-            *about(calibration), *others]
+            *about(calibration)]
+
+
+def commented(calibration: Calibration, comment: Sequence[str], lines: Sequence[str]) -> str:
+    """Return the text of a file with these lines, and a comment on top."""
+    above = [*head(calibration), *comment]
+    return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
 
 
 def frame_words(calibration: Calibration) -> str:

@@ -17,7 +17,8 @@ VINS      no correction; noise of one sample               integration_base.h of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 import io
 import json
 from pathlib import Path
@@ -28,11 +29,11 @@ import numpy as np
 from .made import (
     about,
     affine_fit,
+    commented,
     Correction,
     difference_mg,
     Format,
     frame_words,
-    head,
     LEAST_LOSS_MG,
     Made,
     plain_text,
@@ -82,8 +83,9 @@ def _make_imu_calib(calibration: Calibration) -> Made:
     matrix, constant, correct = _affine(calibration)
     lines = ['SM:', *(f'  - {_yaml_number(value)}' for value in matrix.ravel().tolist()),
              'bias:', *(f'  - {_yaml_number(value)}' for value in constant.tolist())]
-    equation = f'equation: force = SM raw - bias; SM row by row; {frame_words(calibration)}'
-    return Made(_commented(calibration, _IMU_CALIB_URL, [equation], lines), correct, True)
+    comment = [f'source: {_IMU_CALIB_URL}',
+               f'equation: force = SM raw - bias; SM row by row; {frame_words(calibration)}']
+    return Made(commented(calibration, comment, lines), correct, True)
 
 
 def _make_imucal(calibration: Calibration) -> Made:
@@ -163,37 +165,31 @@ def _json(content: Mapping[str, Any]) -> str:
                       ) + '\n'
 
 
-def _commented(calibration: Calibration, url: str, comment: Sequence[str], lines: Sequence[str]
-               ) -> str:
-    """Return the text of a file with a comment on top."""
-    above = head(calibration, f'source: {url}', *comment)
-    return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
-
-
 def _make_kalibr(calibration: Calibration, noise: Noise | None) -> Made:
     """Return imu.yaml of Kalibr; raise InputError if a figure of the noise is missing."""
     figures, notes = _noise_figures(noise, 'Kalibr')
-    comment = ['Kalibr corrects no offset and gain: correct recordings with accel-calib apply.',
-               *notes]
+    comment = [f'source: {_KALIBR_URL}', 'Kalibr corrects no offset and gain: correct recordings '
+               'with accel-calib apply.', *notes]
     # The topic of most examples, if that of the readings is not known.
     topic = json.dumps(plain_text(calibration.stream) or '/imu0')
     lines = [f'rostopic: {topic}', *(
         f'{key}: {_noise_number(figures[key])}  # {unit}' for key, unit in _NOISE.items())]
-    return _of_noise(calibration, _commented(calibration, _KALIBR_URL, comment, lines), notes)
+    return _of_noise(calibration, commented(calibration, comment, lines), notes)
 
 
 def _make_vins(calibration: Calibration, noise: Noise | None) -> Made:
     """Return lines for VINS; raise InputError if a figure of the noise is missing."""
     figures, notes = _noise_figures(noise, 'VINS')
     root = float(np.sqrt(figures['update_rate']))
-    comment = ['VINS does not correct offset and gain: correct readings with accel-calib first.',
+    comment = [f'source: {_VINS_URL}',
+               'VINS does not correct offset and gain: correct readings with accel-calib first.',
                f'noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)', *notes,
                'Put these lines into the configuration file, below "imu parameters".']
     gravity = calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY
     lines = [*(f'{name}: {_noise_number(figures[key] * root)}  # {unit}, density '
                f'{figures[key]:.6g}' for name, (key, unit) in _VINS.items()),
              f'g_norm: {_yaml_number(gravity)}  # m/s^2']
-    return _of_noise(calibration, _commented(calibration, _VINS_URL, comment, lines), notes)
+    return _of_noise(calibration, commented(calibration, comment, lines), notes)
 
 
 def _of_noise(calibration: Calibration, text: str, notes: tuple[str, ...]) -> Made:
@@ -275,14 +271,13 @@ def read_noise(path: Path) -> Noise:
 
     """
     check_regular(path)
-    try:
+    content, fault = None, 'is not a JSON file'
+    with suppress(ValueError):
         content = json.loads(path.read_text(encoding='utf-8'))
-    except ValueError as err:
-        raise InputError(f'{path} is not a JSON file, expected the result of accel-calib noise '
-                         '--json', 'run accel-calib noise RECORDING --json noise.json') from err
+        fault = 'contains no JSON object'
     if not isinstance(content, Mapping):
-        raise InputError(f'{path} contains no JSON object, expected the result of accel-calib '
-                         'noise --json', 'run accel-calib noise RECORDING --json noise.json')
+        raise InputError(f'{path} {fault}, expected the result of accel-calib noise --json',
+                         'run accel-calib noise RECORDING --json noise.json')
     return content
 
 
