@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import csv
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -25,8 +25,10 @@ from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..errors import InputError
 from ..estimate import Prior
-from ..refine import PosePlan
 from ..units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from ..refine import PosePlan
 
 _FORMAT = 1
 _NAMES = parameter_names(MODELS['10'])

@@ -73,22 +73,10 @@ def format_plain(content: Mapping[str, Any]) -> str:
 
 def read_plain(text: str) -> Any:
     """
-    Return the content of a text in plain YAML.
+    Return the content of a text in plain YAML, which has at most `MOST_BYTES` bytes in UTF-8.
 
-    Parameters
-    ----------
-    text : str
-        The text, of at most `MOST_BYTES` bytes in UTF-8.
-
-    Returns
-    -------
-    dict, list, str, int, float, bool or None
-        The content. A number is a float unless it is whole; all keys are text.
-
-    Raises
-    ------
-    ValueError
-        If the text is not YAML, is not plain, or exceeds a limit. The message has one line.
+    A number is a float unless it is whole; all keys are text. ValueError, with one line, if the
+    text is not YAML, is not plain, or exceeds a limit.
 
     """
     try:

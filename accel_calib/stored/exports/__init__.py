@@ -36,20 +36,10 @@ CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs !
 @dataclass(frozen=True)
 class Exported:
     """
-    The file of an export.
+    The file of an export, and the end of its name.
 
-    Parameters
-    ----------
-    text_or_bytes : str or bytes
-        Its content.
-    suffix : str
-        End of its name.
-    leaves_mg : float
-        RMS difference to the full correction over the sphere, without the mounting [mg].
-    details : tuple of Loss
-        What the format does not hold, by effect.
-    notes : tuple of str
-        What the user has to do.
+    `leaves_mg` is the RMS difference to the full correction over the sphere, without the mounting
+    [mg], `details` what the format does not hold, by effect, and `notes` what the user has to do.
 
     """
 

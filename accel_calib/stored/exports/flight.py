@@ -32,7 +32,6 @@ calibration, [5]_ Betaflight, [6]_ the parameter file of QGroundControl.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,7 +84,7 @@ _DEGREE = 3
 _EXACT_G = 1e-7
 """A polynomial of a smaller degree is used if it is exact to this [g]."""
 
-Parameters = Mapping[str, float]
+Parameters = dict[str, float]
 """Parameters of a firmware by name; whole numbers are of type int."""
 
 
@@ -161,17 +160,16 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
     metric = _in_metric(calibration, 'PX4')
     found = _turned(_fit_by_axis(metric), options)
-    prefix, thermal, device = f'CAL_ACC{instance}_', f'TC_A{instance}_', options.device_id
-    rows: dict[str, float] = {} if device is None else {f'{prefix}ID': device}
-    rows |= {**_three(prefix, 'OFF', found.offset), **_three(prefix, 'SCALE', found.scale)}
+    prefix, thermal = f'CAL_ACC{instance}_', f'TC_A{instance}_'
+    rows = {**_device(options, prefix), **_three(prefix, 'OFF', found.offset),
+            **_three(prefix, 'SCALE', found.scale)}
     if found.of_temperature:
-        rows |= {'TC_A_ENABLE': 1, **({} if device is None else {f'{thermal}ID': device}),
-                 f'{thermal}TREF': found.reference, f'{thermal}TMIN': found.limits[0],
-                 f'{thermal}TMAX': found.limits[1]}
-        rows |= {f'{thermal}X{order}_{axis}': value for order, part in enumerate(
-            [np.zeros(3), *found.thermal]) for axis, value in enumerate(part)}
+        rows |= {'TC_A_ENABLE': 1, **_device(options, thermal), f'{thermal}TREF': found.reference,
+                 f'{thermal}TMIN': found.limits[0], f'{thermal}TMAX': found.limits[1]}
+        for order, part in enumerate([np.zeros(3), *found.thermal]):
+            rows |= {f'{thermal}X{order}_{axis}': value for axis, value in enumerate(part)}
     ids = f'{prefix}ID' + (f' and {thermal}ID' if found.of_temperature else '')
-    notes = () if device is not None else (
+    notes = () if options.device_id is not None else (
         f'PX4 uses these values for the accelerometer whose device id is in {ids}; check it in '
         'QGroundControl, or use --device-id (device_id of sensor_accel)',)
     comment = [_AXES[options.axes], f'source: {_PX4_URL}',
@@ -189,17 +187,15 @@ def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
     metric = _in_metric(calibration, 'ArduPilot')
     found = _turned(_fit_by_axis(metric, _ARDUPILOT_REFERENCE), options)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
-    rows: dict[str, float] = ({} if options.device_id is None
-                              else {f'{prefix}_ID': options.device_id})
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
-    rows |= {**_three(f'{prefix}OFFS_', '', found.offset + found.moved(_ARDUPILOT_REFERENCE)),
-             **_three(f'{prefix}SCAL_', '', found.scale)}
+    offset = found.offset + found.moved(_ARDUPILOT_REFERENCE)
+    rows = {**_device(options, f'{prefix}_'), **_three(f'{prefix}OFFS_', '', offset),
+            **_three(f'{prefix}SCAL_', '', found.scale)}
     if found.of_temperature:
         thermal = f'INS_TCAL{instance}_'
-        rows |= {f'INS_ACC{instance}_CALTEMP': float(np.clip(_ARDUPILOT_REFERENCE,
-                                                             *found.limits)),
-                 f'{thermal}ENABLE': 1, f'{thermal}TMIN': found.limits[0],
-                 f'{thermal}TMAX': found.limits[1]}
+        reference = float(np.clip(_ARDUPILOT_REFERENCE, *found.limits))
+        rows |= {f'INS_ACC{instance}_CALTEMP': reference, f'{thermal}ENABLE': 1,
+                 f'{thermal}TMIN': found.limits[0], f'{thermal}TMAX': found.limits[1]}
         for order, part in enumerate(found.thermal, 1):
             rows |= _three(f'{thermal}ACC{order}_', '', part * _PER_MILLION)
     comment = [_AXES[options.axes], f'source: {_ARDUPILOT_URL}',
@@ -272,6 +268,11 @@ def _turned(found: ByAxis, options: Options) -> ByAxis:
 
 def _signs(options: Options) -> Floats:
     return _TO_FRD if options.axes == 'flu' else np.ones(3)
+
+
+def _device(options: Options, prefix: str) -> Parameters:
+    """Return the parameter with the device id, if it is known."""
+    return {} if options.device_id is None else {f'{prefix}ID': options.device_id}
 
 
 def _three(start: str, end: str, values: Floats) -> Parameters:
