@@ -142,15 +142,15 @@ from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store
 from accel_calib.session import worker
 from accel_calib.session.guidance import Guide, next_action, Plan
-from accel_calib.session.health import figures
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
-from accel_calib.session.sensor import rest_after, Sensor
+from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
 from accel_calib.session.sensor_files import load as load_store
 from accel_calib.session.sensor_files import Lock
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
+from accel_calib.session.state import figures
 from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
 from accel_calib.session.store import Store as SensorStore
-from accel_calib.session.stream import StreamStatistics, TemperatureHistory
+from accel_calib.session.stream import StreamStatistics
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml, write_plan

@@ -4,8 +4,8 @@
 
 """What tests use of the nodes, as `inside` does for the parts that need no ROS."""
 
+from accel_calib.ros.calibrator_node import in_executor, serve
 from accel_calib.ros.display import pose_markers
-from accel_calib.ros.services import in_executor, Services
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
 from accel_calib.ros.transforms import (
     MountingBroadcaster,

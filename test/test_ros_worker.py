@@ -20,7 +20,7 @@ from accel_calib.session import CalibratorSettings, Files, Log, Task
 from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import fitted, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
-from inside_ros import in_executor, Services
+from inside_ros import in_executor, serve
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -51,7 +51,6 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
 
     logged: list[Log] = []
     worker = Worker(in_executor(node), on_events, pytest.fail)
-    services = Services(node, worker, logged.append)
 
     def fit() -> Task:
         found = yield Files(work)
@@ -73,7 +72,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         return f'{min(ticks[0] - before, TICKS)} ticks'
 
     for command in (fit, load, save):
-        services.serve(command.__name__, command)
+        serve(node, command.__name__, command, worker, logged.append)
     node.create_timer(0.005, lambda: ticks.__setitem__(0, ticks[0] + 1))
     executor = make_executor(context)
     executor.add_node(node)

@@ -13,6 +13,7 @@ import shutil
 from typing import Any
 
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
+from accel_calib.finding import Finding, LEVELS
 from accel_calib.logs import read_poses, write_table
 from accel_calib.session import CalibratorSettings, checks, Level, Log, Session, state, Task
 from accel_calib.stored import read_calibration, write_calibration
@@ -84,7 +85,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in checks(state.health(self.session)) if each.name == name)
+        return next(each for each in checks(self.session) if each.name == name)
 
 
 @pytest.mark.parametrize(('one', 'other'), [
@@ -352,6 +353,15 @@ def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
             continue
         assert driver.done(driver.session.commands.fit())
     assert driver.session.sensor.advice == 'the calibration uses these poses'
+
+
+def test_findings_are_logged_by_their_level(stored: Stored) -> None:
+    driver = Driver(calibration_file=str(stored()))
+    driver.session.adopt(replace(driver.session.sensor.calibration, noted=tuple(
+        Finding('note', f'about {level}', level=level) for level in LEVELS)))
+    driver.handle()
+    assert [line.severity for line in driver.log if 'about ' in line.words] == [
+        'info', 'warning', 'error']
 
 
 def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.session import state
+from accel_calib.session import Level
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.units import units_of
 from faults.sample import sample
@@ -251,7 +251,7 @@ def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
     driver = Driver(calibration_file=str(inner / 'imu.yaml'))
     assert 'Permission denied' in driver.logged()
     driver.feed(readings(spread_directions(10)))
-    assert state.health(driver.session).writable is False
+    assert driver.finding('storage').level == Level.ERROR
     with pytest.raises(InputError, match='in use but could not be stored'):
         driver.done(driver.session.commands.fit())
     assert driver.session.sensor.calibration is not None
@@ -290,7 +290,7 @@ def test_a_path_that_no_file_can_have_is_reported(name: str, tmp_path: Path, rea
     (tmp_path / 'loop').symlink_to('loop')
     driver = Driver(calibration_file=str(tmp_path / name))
     driver.feed(readings(spread_directions(10)))
-    assert state.health(driver.session).writable is (name[0] == 'x')
+    assert (driver.finding('storage').level == Level.OK) is (name[0] == 'x')
     with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
         driver.done(driver.session.commands.fit())
     driver.session.close()

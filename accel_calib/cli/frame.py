@@ -198,7 +198,7 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
     from concurrent.futures import ThreadPoolExecutor
     from queue import SimpleQueue
 
-    from ..session.worker import WorkerProcess
+    from ..session import WorkerProcess
 
     workers = [WorkerProcess(idle=False) for _ in range(min(jobs, len(items)))]
     free: SimpleQueue[WorkerProcess] = SimpleQueue()

@@ -38,7 +38,7 @@ from ..units import MG
 
 if TYPE_CHECKING:
     from ..ros.watch import Show
-    from ..session.guidance import Progress
+    from ..session import Progress
 
 GOOD, BAD, NEXT = 'green', 'red', 'bold yellow'
 

@@ -34,19 +34,20 @@ from ..findings import rate, Rating
 from ..messages.one_reading import Triple
 from ..report.page import calibration_page, STORED
 from ..session import (
+    Answer,
     BATCH,
     CalibratorSettings,
+    CallSoon,
     Compute,
-    Health,
     Log,
     LogFilter,
     Session,
+    Severity,
     ShowPoses,
     state,
     Task,
+    Worker,
 )
-from ..session.events import Severity
-from ..session.worker import Answer, CallSoon, Worker
 from ..stored.exports import export, Exported
 from ..table import Floats
 
@@ -111,15 +112,14 @@ class Exchange:
         self._line += 1
         self.show(messages.log(self._line, line.severity, line.words, time()))
 
-    def show_state(self, health: Health | None = None) -> None:
+    def show_state(self) -> None:
         """Show the state; the server sends it only if it has changed."""
         session = self._session
         if session.sensor.present is not self._shown:
             self._take(session.sensor.present)
         self.show(messages.state(
-            state.health(session) if health is None else health, self.problem, shown=self._shown,
-            preview=session.sensor.offered is not None, busy=next(iter(self._worker.running), ''),
-            rating=self._rating, page=self._number))
+            session, self.problem, shown=self._shown, preview=session.sensor.offered is not None,
+            busy=next(iter(self._worker.running), ''), rating=self._rating, page=self._number))
 
     def _take(self, calibration: Calibration | None) -> None:
         """Show another calibration, and rate it in the worker process."""

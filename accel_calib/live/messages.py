@@ -24,9 +24,7 @@ from .. import __version__
 from ..calibrate import Calibration, words_of
 from ..errors import InputError
 from ..findings import Rating
-from ..session.events import Severity
-from ..session.guidance import Progress
-from ..session.health import checks, Health, Level
+from ..session import checks, Level, Progress, Session, Severity, title, words_of_state
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
 from ..units import MG
@@ -148,15 +146,15 @@ def answer(number: int, success: bool, words: str) -> Message:
     return {'kind': 'answer', 'id': number, 'success': success, 'words': words}
 
 
-def state(health: Health, problem: str, *, shown: Calibration | None, preview: bool, busy: str,
+def state(session: Session, problem: str, *, shown: Calibration | None, preview: bool, busy: str,
           rating: Rating | None, page: int) -> Message:
     """
     Return the state of a session.
 
     Parameters
     ----------
-    health : Health
-        Its health.
+    session : Session
+        The session.
     problem : str
         What the user must know before all else; empty: the most severe finding.
     shown : Calibration or None
@@ -171,20 +169,22 @@ def state(health: Health, problem: str, *, shown: Calibration | None, preview: b
         Number of the calibration page.
 
     """
+    in_use = session.sensor.calibration
     return {
-        'kind': 'state', 'sensor': health.sensor, 'source': health.topic, 'state': health.state,
-        'problem': problem or _problem(health), 'calibration': health.calibration,
+        'kind': 'state', 'sensor': session.name, 'source': session.topic,
+        'state': words_of_state(session), 'problem': problem or _problem(session),
+        'calibration': '' if in_use is None else title(in_use),
         'preview': preview, 'levelled': shown is not None and shown.is_levelled,
-        'file': health.file, 'busy': busy,
+        'file': session.files.path, 'busy': busy,
         'rating': None if rating is None else _rating(rating),
         'result': None if shown is None else _result(shown),
         'page': '' if shown is None else f'/calibration.html?{page}'}
 
 
-def _problem(health: Health) -> str:
+def _problem(session: Session) -> str:
     """Return the most severe finding, other than that there is no calibration yet."""
-    found = [each for each in checks(health) if each.level > Level.OK and (
-        each.name != 'calibration' or health.calibration or health.problem)]
+    found = [each for each in checks(session) if each.level > Level.OK and (
+        each.name != 'calibration' or session.sensor.calibration or session.problem)]
     return max(found, key=lambda each: each.level).words if found else ''
 
 

@@ -32,7 +32,7 @@ from . import messages
 from .link import check_installed, not_bound, reachable
 from .viewer import STUCK_S, TooManyError, Viewer
 from ..report.sheet import SCRIPT
-from ..session.worker import Answer
+from ..session import Answer
 from ..stored.exports import Exported, FORMATS
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@
 """
 The ROS nodes. They only convert messages, call other parts, and publish the results.
 
-`calibrator_node`, `managed_node` and `simulator_node` are the nodes; `run` has the executables,
-which start, spin and end them. In the calibrator, `stream` processes Imu messages,
-`services` answers service calls and runs jobs, `display` makes diagnostics and markers,
-`declare` declares parameters, and `qos` defines the quality of service. `demo` runs both nodes.
+`calibrator_node` and `simulator_node` are the nodes; `run` has the executables, which start, spin
+and end them. In the calibrator, `stream` processes Imu messages, `display` makes diagnostics,
+markers and the live page, and `transforms` reads and publishes the mounting. `declare` declares
+parameters and the quality of service. `watch` receives the progress, and `demo` runs both nodes.
 
 All callbacks run in one thread, and only callbacks use the session.
 

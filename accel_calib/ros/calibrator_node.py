@@ -4,38 +4,46 @@
 """
 The calibrator node: it converts messages, calls the session, and publishes its events.
 
-`accel_calib.session` contains the state, and `stream` processes Imu messages. Diagnostics use a
-steady clock, so they are also published without ``/clock``. `Calibrator` is the same for the plain
-node and for the managed node (`managed_node`).
+`Calibrator` is the same for the plain node and for the managed node, whose transitions are in
+`run`. `accel_calib.session` contains the state, and `stream` processes Imu messages. Diagnostics
+use a steady clock, so they are also published without ``/clock``.
+
+**Services.** The response is sent when the task of a command is done, so that no callback waits.
+For an error, it is ``success: false`` with the message of the error. This works with every
+executor. Coroutines as service callbacks, which rclpy offers for this purpose, do not work with
+EventsExecutor.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from queue import SimpleQueue
 from time import monotonic
-from typing import Any
+from traceback import format_exc
+from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from . import qos
-from .declare import declared, follow
-from .display import pose_markers, progress_of, self_test_of, statuses_of
-from .page import Page
-from .services import in_executor, Services
+from .declare import declared, follow, LATCHED, mismatches, name_of, SENSOR, STREAM
+from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
 from .stream import Stream
 from .transforms import MountingBroadcaster, watch_static
+from ..errors import AccelCalibError
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings,
+    CallSoon,
     Event,
     Log,
     LogFilter,
@@ -45,8 +53,11 @@ from ..session import (
     state,
     Still,
     Task,
+    Worker,
 )
-from ..session.worker import Worker
+
+if TYPE_CHECKING:
+    from rclpy.lifecycle import LifecycleState
 
 _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
              'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
@@ -56,30 +67,9 @@ _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
 
 
-class CalibratorNode(Node):
-    """Calibrate an accelerometer in place and correct its messages."""
-
-    def __init__(self) -> None:
-        super().__init__('calibrator')
-        self._calibrator = Calibrator(self)
-
-    def start(self) -> None:
-        """Start; to be called when the node has an executor."""
-        self._calibrator.start()
-
-    def close(self) -> None:
-        """Finish writing, and release the files."""
-        self._calibrator.close()
-
-
 class Calibrator:
     """
     The topics, services and parameters of a calibrator in a node.
-
-    Parameters
-    ----------
-    node : Node
-        The node.
 
     Raises
     ------
@@ -101,16 +91,15 @@ class Calibrator:
         call_soon = in_executor(node)
         self._worker = Worker(call_soon, self._handle_events,
                               lambda words: self._log(Log('error', words)))
-        self._filter = LogFilter()
-        self._progress_at = 0.0
-        self._still = node.create_publisher(Bool, '~/still', qos.LATCHED)
-        self._poses = node.create_publisher(MarkerArray, '~/poses', qos.LATCHED)
-        self._progress = node.create_publisher(DiagnosticStatus, '~/progress', qos.LATCHED)
+        self._filter, self._progress_at = LogFilter(), 0.0
+        self._still = node.create_publisher(Bool, '~/still', LATCHED)
+        self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
+        self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
         self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._overrides = QoSOverridingOptions.with_default_policies()
-        outputs = (self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
-                   self._published(Vector3Stamped, '~/linear_acceleration'))
-        self.stream = Stream(self.session, *outputs, self._handle_events)
+        outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
+                   self._published(Vector3Stamped, '~/linear_acceleration')]
+        self.stream = Stream(self.session, outputs, self._handle_events)
         self._heard: list[Any] = []
         self._said = [*outputs, self._still, self._poses, self._progress, self._diagnostics]
         self._page = Page(node, self.session, self.stream, self._worker, call_soon, self._log)
@@ -118,13 +107,12 @@ class Calibrator:
         self._serve()
 
     def _published(self, kind: Any, topic: str) -> Any:
-        return self._node.create_publisher(kind, topic, qos.STREAM,
+        return self._node.create_publisher(kind, topic, STREAM,
                                            qos_overriding_options=self._overrides)
 
     def _serve(self) -> None:
-        services = Services(self._node, self._worker, self._log)
         for name in _TRIGGERS:
-            services.serve(name, self._command(name))
+            serve(self._node, name, self._command(name), self._worker, self._log)
         self._node.create_service(SetBool, '~/enable', self._on_enable)
         self._node.create_service(SelfTest, '~/self_test', self._on_self_test)
 
@@ -133,14 +121,16 @@ class Calibrator:
         self._handle_events()
         node, overrides = self._node, self._overrides
         self._heard = [
-            node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, qos.SENSOR,
+            node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR,
                                      raw=True, qos_overriding_options=overrides),
-            node.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR,
-                                     qos_overriding_options=overrides)]
+            node.create_subscription(
+                Temperature, 'temperature',
+                lambda message: self.stream.set_temperature(message.temperature), SENSOR,
+                qos_overriding_options=overrides)]
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._page.start()
 
-    def _command(self, name: str) -> Any:
+    def _command(self, name: str) -> Callable[[], Task]:
         """Return a command of the session that first processes all messages so far."""
         command = getattr(self.session.commands, name)
 
@@ -149,9 +139,6 @@ class Calibrator:
             return (yield from command())
 
         return call
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self.stream.set_temperature(message.temperature)
 
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""
@@ -165,17 +152,16 @@ class Calibrator:
     def _on_tick(self) -> None:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
-            map(qos.name_of, self._node.get_publishers_info_by_topic(self._topic)))
-        self.session.mismatches = qos.mismatches(self._node, self._heard, self._said)
+            map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
+        self.session.mismatches = mismatches(self._node, self._heard, self._said)
         self.stream.flush()
         self.session.tick()
         self._on_transforms()
         self._handle_events()
-        health = state.health(self.session)
-        array = DiagnosticArray(status=statuses_of(health, self._name))
+        array = DiagnosticArray(status=diagnostics_of(self.session, self._name))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-        self._page.show_state(health)
+        self._page.show_state()
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, self.session.commands.enable(request.data)
@@ -183,10 +169,9 @@ class Calibrator:
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
-        health = state.health(self.session)
-        response.id = health.sensor
-        response.status = self_test_of(health, self._name)
-        passed = all(status.level == b'\x00' for status in response.status)
+        response.id = self.session.name
+        response.status = self_test_of(self.session, self._name)
+        passed = all(status.level == DiagnosticStatus.OK for status in response.status)
         response.passed = b'\x01' if passed else b'\x00'
         return response
 
@@ -243,3 +228,127 @@ class Calibrator:
         self._page.close()
         self._worker.close()
         self.session.close()
+
+
+def in_executor(node: Node) -> CallSoon:
+    """Return a function that lets the executor of a node call functions, in their order."""
+    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def call_next() -> None:
+        try:
+            waiting.get()()
+        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
+            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+
+    def call_soon(function: Callable[[], None]) -> None:
+        waiting.put(function)
+        executor = node.executor
+        if executor is not None:
+            # The executor may run tasks in any order; the queue keeps their order.
+            executor.create_task(call_next)
+
+    return call_soon
+
+
+def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker,
+          log: Callable[[Log], object]) -> None:
+    """Create the service ``~/name``, which logs and responds the result of a command."""
+    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response)
+    send = service.send_response
+
+    def send_response(response: Any, header: Any) -> None:
+        def answer(success: bool, words: str) -> None:
+            log(Log('info' if success else 'warning', words))
+            send(Trigger.Response(success=success, message=words), header)
+
+        worker.do(name, command(), answer)
+
+    service.send_response = send_response
+
+
+class CalibratorNode(Node):
+    """Calibrate an accelerometer in place and correct its messages."""
+
+    def __init__(self) -> None:
+        super().__init__('calibrator')
+        self._calibrator = Calibrator(self)
+
+    def start(self) -> None:
+        """Start; to be called when the node has an executor."""
+        self._calibrator.start()
+
+    def close(self) -> None:
+        """Finish writing, and release the files."""
+        self._calibrator.close()
+
+
+class ManagedCalibrator(LifecycleNode):
+    """A calibrator whose states are those of a managed node."""
+
+    def __init__(self) -> None:
+        super().__init__('calibrator')
+        self._calibrator: Calibrator | None = None
+        self._own = [*self.publishers, *self.subscriptions, *self.services, *self.timers]
+
+    def start(self) -> None:
+        """Do nothing: transitions start the calibrator."""
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters, load the calibration and listen, without publishing."""
+        try:
+            self._calibrator = Calibrator(self)
+        except AccelCalibError as error:
+            self.get_logger().error(str(error))
+            self._destroy_entities()
+            return TransitionCallbackReturn.FAILURE
+        self._set_active(active=False)
+        self._calibrator.start()
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Publish corrected messages."""
+        self._set_active(active=True)
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop publishing corrected messages."""
+        self._set_active(active=False)
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the files and remove all topics and services."""
+        self.close()
+        self._destroy_entities()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the files and remove all topics and services."""
+        self.close()
+        self._destroy_entities()
+        return super().on_shutdown(state)
+
+    def _set_active(self, *, active: bool) -> None:
+        if self._calibrator is not None:
+            self._calibrator.stream.set_active(active=active)
+
+    def close(self) -> None:
+        """Finish writing, and release the files."""
+        if self._calibrator is not None:
+            self._calibrator.close()
+            self._calibrator = None
+
+    def _destroy_entities(self) -> None:
+        """Remove what the calibrator has created in this node."""
+        for kinds, destroy in ((self.publishers, self.destroy_publisher),
+                               (self.subscriptions, self.destroy_subscription),
+                               (self.services, self.destroy_service),
+                               (self.timers, self.destroy_timer)):
+            for each in list(kinds):
+                if each not in self._own:
+                    # The executor calls these for the events that it has already received.
+                    each.callback = each.send_response = _ignore
+                    destroy(each)
+
+
+def _ignore(*given: Any) -> None:
+    """Do nothing with a message, a request, a response, or at the time of a timer."""

@@ -39,7 +39,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from . import qos
+from .declare import LATCHED, SENSOR
 from .run import own_domain
 from ..effects import parse_effect
 from ..errors import AccelCalibError
@@ -97,16 +97,8 @@ class Errors:
     """
     Errors of a topic over rests in several poses.
 
-    Parameters
-    ----------
-    vector_mg : float
-        RMS of the difference from the truth, as a vector [mg].
-    rms_mg : float
-        RMS of |a| - 1 g [mg].
-    max_mg : float
-        Largest | |a| - 1 g | [mg].
-    tilt_deg : float
-        RMS angle between measured and true direction of up [°].
+    RMS of the difference from the truth, as a vector; RMS and largest | |a| - 1 g |; RMS angle
+    between measured and true direction of up.
 
     """
 
@@ -122,22 +114,8 @@ class Outcome:
     Errors before and after a correction.
 
     Before is ``imu/data_raw`` and after is ``imu/data_calibrated``; with a hidden effect, before
-    and after are ``imu/data_calibrated`` before and after ``~/refine``.
-
-    Parameters
-    ----------
-    rests : int
-        Number of rests, before and after.
-    before, after : Errors
-        The errors.
-    seconds : float
-        Duration of the demonstration.
-    hidden : str
-        Effect that the sensor hides; empty: none.
-    found : tuple of str
-        Effects of the refined calibration that the fit did not contain.
-    lag_s : float
-        Lag of the found effect [s]; 0: none.
+    and after are ``imu/data_calibrated`` before and after ``~/refine``, and `found` has the
+    effects that the fit did not contain, with their lag (0: none).
 
     """
 
@@ -169,12 +147,12 @@ class User(Node):
         self.poses = np.zeros((0, 3))
         self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
             'raw': {}, 'corrected': {}, 'truth': {}}
-        self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, qos.LATCHED)
-        self.create_subscription(Temperature, 'temperature', self._on_temperature, qos.SENSOR)
+        self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
+        self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
-            self.create_subscription(kind, topic, self._keeper(name), qos.SENSOR)
+            self.create_subscription(kind, topic, self._keeper(name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
         self.triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
@@ -224,19 +202,7 @@ class User(Node):
 
 
 class Demonstration:
-    """
-    The user's steps.
-
-    Parameters
-    ----------
-    user : User
-        The node of the user.
-    spin : callable
-        Function that spins until a condition is true.
-    report : callable
-        Function that is called with a line for each step.
-
-    """
+    """The steps of a user, each reported in a line."""
 
     def __init__(self, user: User, spin: Spin, report: Callable[[str], None]) -> None:
         self._user, self._spin, self._report = user, spin, report
@@ -312,7 +278,7 @@ def _refused(service: str, answer: Trigger.Response) -> DemoError:
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     """
-    Run the demonstration.
+    Run the demonstration, and compare the errors.
 
     Parameters
     ----------
@@ -320,11 +286,6 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         Function that is called with a line for each step.
     hidden : str
         Effect that the sensor hides, such as ``quadratic=0.004``; empty: none.
-
-    Returns
-    -------
-    Outcome
-        The comparison.
 
     Raises
     ------
@@ -379,22 +340,7 @@ def _rms(values: Floats) -> float:
 
 def demonstrate_page(port: int, report: Callable[[str], None],
                      is_over: Callable[[], bool]) -> None:
-    """
-    Run simulator and calibrator with its live page, until it is over.
-
-    Parameters
-    ----------
-    port : int
-        Port of the page.
-    report, is_over : callable
-        Function that is called with a line for the user; function that returns whether to end.
-
-    Raises
-    ------
-    DemoError
-        If a node ends on its own.
-
-    """
+    """Run simulator and calibrator with its live page, until it is over; raises DemoError."""
     with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
         set_environment(Path(folder), stack.enter_context(own_domain()))
         report('a simulated Imu is turned by hand; open the link of the live page in a browser, '

@@ -2,43 +2,62 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Markers for rviz: captured poses and the next pose on the unit sphere.
+What a node shows: diagnostics, markers for rviz, and the live page.
 
-**Diagnostics.** The state of the calibrator as diagnostic messages.
+The server of the page has its own thread. The executor of the node only makes the messages, and
+runs the commands of the page as those of the services.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+import sys
 from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ..session import Check, checks, Health, worst
-from ..session.health import figures, Level
+from ..calibrate import NextPose
+from ..errors import AccelCalibError
+from ..session import (
+    CallSoon,
+    Check,
+    checks,
+    figures,
+    Level,
+    Log,
+    Progress,
+    Session,
+    ShowPoses,
+    Worker,
+    worst,
+)
+from ..table import Floats
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from rclpy.node import Node
 
-    from ..calibrate import NextPose
-    from ..session.guidance import Progress
-    from ..table import Floats
-
-
-def statuses_of(health: Health, node: str) -> list[DiagnosticStatus]:
-    """Return the diagnostics: the state with all values, and one status for each concern."""
-    state = _status(worst(health), node, health.sensor)
-    state.values = _values(figures(health))
-    return [state, *self_test_of(health, node)]
+    from .stream import Stream
+    from ..live.host import Exchange
+    from ..live.server import PageServer
 
 
-def self_test_of(health: Health, node: str) -> list[DiagnosticStatus]:
+def diagnostics_of(session: Session, node: str) -> list[DiagnosticStatus]:
+    """Return the state with all values, and one status for each concern."""
+    found = checks(session)
+    state = _status(worst(session, found), node, session.name)
+    state.values = _values(figures(session))
+    return [state, *(_status(check, node, session.name) for check in found)]
+
+
+def self_test_of(session: Session, node: str) -> list[DiagnosticStatus]:
     """Return one status for each check; the test passes if all are OK."""
-    return [_status(check, node, health.sensor) for check in checks(health)]
+    return [_status(check, node, session.name) for check in checks(session)]
 
 
 def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
@@ -67,7 +86,7 @@ _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerArray:
     """
-    Return the markers of poses.
+    Return markers of the captured poses and of the next pose; they replace all earlier markers.
 
     Parameters
     ----------
@@ -77,12 +96,6 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
         The next pose, or that more poses no longer help.
     frame_id : str
         Frame of the sensor.
-
-    Returns
-    -------
-    MarkerArray
-        Markers in the namespaces ``sphere``, ``poses``, ``numbers`` and ``next``; they replace all
-        earlier markers.
 
     """
     markers = [Marker(action=Marker.DELETEALL),
@@ -127,3 +140,64 @@ def _at(marker: Marker, position: Floats) -> Marker:
 def _point(position: Floats) -> Point:
     x, y, z = position.tolist()
     return Point(x=x, y=y, z=z)
+
+
+class Page:
+    """The live page of a node; it does nothing if the parameter ``web_port`` is 0."""
+
+    def __init__(self, node: Node, session: Session, stream: Stream, worker: Worker,
+                 call_soon: CallSoon, log: Callable[[Log], None]) -> None:
+        self._node, self._session, self._stream = node, session, stream
+        self._worker, self._call_soon, self._log = worker, call_soon, log
+        self._exchange: Exchange | None = None
+        self._server: PageServer | None = None
+
+    def start(self) -> None:
+        """Serve the page; if this is not possible, log why."""
+        settings = self._session.settings
+        if not settings.web_port:
+            return
+        from ..live.host import Exchange
+        from ..live.link import qr_code
+        from ..live.messages import PERIOD
+        from ..live.server import PageServer
+        exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
+                            self._stream.flush)
+        try:
+            self._server = PageServer(exchange, settings.web_host, settings.web_port)
+            self._server.start()
+        except AccelCalibError as error:
+            self._log(Log('error', str(error)))
+            return
+        exchange.show, self._exchange = self._server.show, exchange
+        self._node.get_logger().info(f'live page: {self._server.link}')  # not for all viewers
+        if sys.stdout.isatty():
+            print(qr_code(self._server.link), flush=True)
+        self._node.create_timer(PERIOD, self._show_progress,
+                                clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _show_progress(self) -> None:
+        if self._exchange is not None:
+            self._exchange.show_progress(self._stream.newest)
+
+    def show_state(self) -> None:
+        """Show the state of the session."""
+        if self._exchange is not None:
+            self._exchange.show_state()
+
+    def show_poses(self, event: ShowPoses) -> None:
+        """Show the poses, and the state that may have changed with them."""
+        if self._exchange is not None:
+            self._exchange.show_poses(event)
+            self._exchange.show_state()
+
+    def show_line(self, line: Log) -> None:
+        """Show a log line."""
+        if self._exchange is not None:
+            self._exchange.show_line(line)
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self._server is not None:
+            self._exchange = None
+            self._server.close()

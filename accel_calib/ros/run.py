@@ -61,7 +61,7 @@ def calibrator(args: Sequence[str] | None = None) -> int:
 
 def calibrator_lifecycle(args: Sequence[str] | None = None) -> int:
     """Run the managed calibrator until it is ended; parameters and exit status as `run`."""
-    return run('.managed_node:ManagedCalibrator', args)
+    return run('.calibrator_node:ManagedCalibrator', args)
 
 
 def simulator(args: Sequence[str] | None = None) -> int:
@@ -75,7 +75,7 @@ EXECUTABLES = {each.__name__: each for each in (calibrator, calibrator_lifecycle
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
     """
-    Run a node until it is ended.
+    Run a node until it is ended, and return the exit status.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0, or 2 if the input is invalid or ROS is not available.
+        0, or 2 if the input is invalid or ROS is not available.
 
     """
     came, written = os.pipe()
@@ -183,12 +183,7 @@ def own_domain() -> Iterator[int]:
 
     Of the UDP ports of a domain, DDS does not use the third one. This process holds it, so that
     other processes with a domain of this function have another one. A domain in which somebody
-    else has a first participant is left out, too.
-
-    Raises
-    ------
-    AccelCalibError
-        If all domains are in use.
+    else has a first participant is left out, too. AccelCalibError if all domains are in use.
 
     """
     for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):

@@ -27,12 +27,11 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from . import qos
-from .declare import declared
+from .declare import declared, STREAM
 from ..calibrate import mounting_of, of_samples, thermal_stream
 from ..effects import model_with, parse_effect, predict, turn_between
 from ..geometry import spread_directions
-from ..session.settings import parameter
+from ..session import parameter
 from ..table import Floats, numbered, Recording
 from ..units import STANDARD_GRAVITY
 
@@ -89,22 +88,9 @@ class SimulatorSettings:
 
 class SimulatedImu:
     """
-    The samples of a sensor that is turned through poses.
+    The samples of a sensor that is turned through poses, `next_pose` of them so far.
 
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        The parameters.
-
-    Attributes
-    ----------
-    next_pose : int
-        Number of poses that the sensor was turned to so far.
-
-    Raises
-    ------
-    InputError
-        If an effect is not in the catalogue.
+    InputError if an effect is not in the catalogue.
 
     """
 
@@ -203,9 +189,9 @@ class SimulatorNode(Node):
         super().__init__('simulator')
         self.settings = declared(self, SimulatorSettings)
         self._simulated = SimulatedImu(self.settings)
-        self._imu = self.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
-        self._temperature = self.create_publisher(Temperature, 'temperature', qos.STREAM)
-        self._truth = self.create_publisher(Vector3Stamped, '~/truth', qos.STREAM)
+        self._imu = self.create_publisher(Imu, 'imu/data_raw', STREAM)
+        self._temperature = self.create_publisher(Temperature, 'temperature', STREAM)
+        self._truth = self.create_publisher(Vector3Stamped, '~/truth', STREAM)
         self.create_service(Trigger, '~/next', self._on_next)
         self.create_service(Trigger, '~/flat', self._on_flat)
         self._message = _empty_message(self.settings)

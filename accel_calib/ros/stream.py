@@ -13,7 +13,7 @@ same way.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 import operator
 from time import monotonic
@@ -45,15 +45,7 @@ _NO_BIAS = np.zeros(3)
 
 
 class Output:
-    """
-    A publisher of corrected messages, with the prepared correction.
-
-    Attributes
-    ----------
-    listeners : int
-        Number of subscribers; messages without subscribers are not computed.
-
-    """
+    """A publisher of corrected messages, with the prepared correction, if it has listeners."""
 
     def __init__(self, publisher: Any) -> None:
         self._publisher = publisher
@@ -90,20 +82,19 @@ class Stream:
     ----------
     session : Session
         The session; it receives the samples and contains the calibration.
-    calibrated, preview, motion : Publisher
-        Publishers of corrected messages, of those by an offered calibration, and of the
-        acceleration without gravity.
+    publishers : sequence of 3 Publishers
+        For corrected messages, those by an offered calibration, and the acceleration without
+        gravity.
     on_events : callable
         Function that is called after the session received samples.
 
     """
 
-    def __init__(self, session: Session, calibrated: Any, preview: Any, motion: Any,
+    def __init__(self, session: Session, publishers: Sequence[Any],
                  on_events: Callable[[], None]) -> None:
-        self._session = session
-        self._calibrated, self._preview = Output(calibrated), Output(preview)
-        self._motion = Output(motion)
-        self._on_events = on_events
+        self._session, self._on_events = session, on_events
+        self._outputs = [Output(publisher) for publisher in publishers]
+        self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
         self._waiting: list[bytes] = []
         self._temperatures: list[float] = []
@@ -165,10 +156,9 @@ class Stream:
         session = self._session
         self._applied, self._offered = session.sensor.applied, session.sensor.offered
         self._settings = session.settings
-        outputs = self._calibrated, self._preview, self._motion
-        for output in outputs:
+        for output in self._outputs:
             output.count()
-        self._listened = self._active and any(output.listeners for output in outputs)
+        self._listened = self._active and any(output.listeners for output in self._outputs)
         gyro = session.sensor.gyro if session.settings.gyro_bias else None
         bias = _NO_BIAS if gyro is None else gyro.at(self._temperature)
         for output, calibration in ((self._calibrated, self._applied),
@@ -178,12 +168,7 @@ class Stream:
                 output.rewriter.bias = tuple(bias.tolist())
 
     def _adopted(self, data: bytes) -> bytes | None:
-        """
-        Return a message with a new layout, in the usual encoding.
-
-        The result is None if the message cannot be read, or is from another sensor.
-
-        """
+        """Return a message with a new layout as usual; None: not readable, or another sensor."""
         layout = layout_of(data)
         if layout is None:
             data = _usual(data)

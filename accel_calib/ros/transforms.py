@@ -5,9 +5,8 @@
 Static transforms between frames, on /tf_static.
 
 Transforms of a URDF that do not move arrive in several latched messages, often from several
-nodes. `StaticTransforms` keeps them as a tree, and multiplies the rotations along the path between
-two frames. Only rotations are needed. The message type is in tf2_msgs, which is imported only if a
-parameter needs it: the node also runs without this package.
+nodes. Only their rotations are needed. The message type is in tf2_msgs, which is imported only if
+a parameter needs it: the node also runs without this package.
 
 """
 
@@ -21,7 +20,7 @@ from geometry_msgs.msg import Quaternion, TransformStamped
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from . import qos
+from .declare import LATCHED
 from ..errors import InputError
 from ..geometry import quaternion_of, rotation_from_quaternion
 from ..table import Floats
@@ -42,20 +41,7 @@ _INSTEAD = {'base_frame': 'set mounting_rpy instead', 'publish_tf': 'set publish
 
 
 def needs_tf2(parameter: str) -> Any:
-    """
-    Return the message type of transforms, `tf2_msgs.msg.TFMessage`.
-
-    Parameters
-    ----------
-    parameter : {'base_frame', 'publish_tf'}
-        The parameter that needs it.
-
-    Raises
-    ------
-    InputError
-        If tf2_msgs is not installed.
-
-    """
+    """Return `tf2_msgs.msg.TFMessage`, which a parameter needs; InputError if not installed."""
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError as error:
@@ -85,7 +71,7 @@ class StaticTransforms:
         Returns
         -------
         bool
-            Whether this changed the tree.
+            Whether the tree has changed.
 
         Raises
         ------
@@ -109,12 +95,7 @@ class StaticTransforms:
         return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
 
     def rotation(self, base: str, frame: str) -> Floats | None:
-        """
-        Return the (3, 3) rotation that transforms a vector from `frame` to `base`.
-
-        Returns None if no transforms connect the two frames.
-
-        """
+        """Return the (3, 3) rotation of vectors from `frame` to `base`; None: not connected."""
         above_base = self._rotations_above(_plain(base))
         for common, mat_common_frame in self._rotations_above(_plain(frame)).items():
             if common in above_base:
@@ -133,24 +114,10 @@ class StaticTransforms:
 
 def watch_static(node: Node, on_change: Callable[[], None]) -> StaticTransforms:
     """
-    Subscribe to the static transforms.
+    Subscribe to the static transforms, and return those that have arrived at any time.
 
-    Parameters
-    ----------
-    node : Node
-        The node; its log receives a warning for each transform that is not valid.
-    on_change : callable
-        Function that is called after a message with at least one new or different transform.
-
-    Returns
-    -------
-    StaticTransforms
-        The transforms; messages that arrive later are added to it.
-
-    Raises
-    ------
-    InputError
-        If tf2_msgs is not installed.
+    `on_change` is called after a message with at least one new or different transform. A transform
+    that is not valid is logged. InputError if tf2_msgs is not installed.
 
     """
     transforms = StaticTransforms()
@@ -174,39 +141,14 @@ def watch_static(node: Node, on_change: Callable[[], None]) -> StaticTransforms:
 
 
 class MountingBroadcaster:
-    """
-    Publisher of one static transform, without translation.
-
-    Parameters
-    ----------
-    node : Node
-        The node that publishes.
-
-    Raises
-    ------
-    InputError
-        If tf2_msgs is not installed.
-
-    """
+    """Publisher of one static transform, without translation; it needs tf2_msgs."""
 
     def __init__(self, node: Node) -> None:
         self._message = needs_tf2('publish_tf')
-        self._publisher = node.create_publisher(self._message, TOPIC, qos.LATCHED)
+        self._publisher = node.create_publisher(self._message, TOPIC, LATCHED)
 
     def publish(self, stamp: Any, parent: str, child: str, rotation: Floats) -> None:
-        """
-        Publish the transform; late subscribers receive the last one.
-
-        Parameters
-        ----------
-        stamp : Time
-            Stamp of the message (builtin_interfaces).
-        parent, child : str
-            Names of the frames; a leading slash is ignored.
-        rotation : (3, 3) array
-            Rotation that transforms a vector from `child` to `parent`.
-
-        """
+        """Publish the (3, 3) rotation of vectors from `child` to `parent`."""
         stamped = TransformStamped(child_frame_id=_plain(child))
         stamped.header.stamp, stamped.header.frame_id = stamp, _plain(parent)
         x, y, z, w = quaternion_of(rotation)

@@ -22,17 +22,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from . import qos
+from .declare import LATCHED
 from ..errors import InputError
-from ..session.guidance import Progress
+from ..session import Progress
 
 Show = Callable[[str, Progress | None, str], None]
-"""
-Function that shows the full name of the node, its progress, and a problem.
-
-The progress is None before the first message. The problem is empty if there is none.
-
-"""
+"""Function of the name of the node, its progress (None: no message yet), and a problem or ''."""
 
 _LOOK_EVERY = 0.1
 """Longest wait for a message before the end is checked [s]."""
@@ -50,17 +45,7 @@ _SUFFIX = '/progress'
 
 
 class _Receiver:
-    """
-    The subscription of the progress of a calibrator.
-
-    Attributes
-    ----------
-    name : str
-        Full name of the node, such as ``/left/calibrator``.
-    messages : int
-        Number of messages so far.
-
-    """
+    """The progress of a calibrator: full name, such as ``/left/calibrator``, and messages."""
 
     def __init__(self, node: Node, executor: SingleThreadedExecutor, name: str) -> None:
         self._node, self._executor = node, executor
@@ -70,7 +55,7 @@ class _Receiver:
         topic = f'{name.rstrip("/")}{_SUFFIX}'
         try:
             found = node.create_subscription(DiagnosticStatus, topic, self._on_message,
-                                             qos.LATCHED)
+                                             LATCHED)
         except InvalidTopicNameException as err:
             raise InputError(f'--node is {name!r}, expected the name of a node',
                              'set it to a name such as calibrator or left/calibrator') from err
@@ -158,15 +143,7 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
     """
     Return the full name of a calibrator and its progress now; None: it was over before.
 
-    Parameters
-    ----------
-    name, is_over, args
-        As in `watch`.
-
-    Raises
-    ------
-    InputError
-        As in `watch`, and if no node answers.
+    Parameters and errors are as in `watch`; InputError also if no node answers.
 
     """
     with _receiver(name, args) as receiver:

@@ -7,19 +7,45 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 `session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
 belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
 `store` manages files, and `sensor_files` locks them. `work` contains the computations, and
-`worker` runs the tasks. `stream` describes the messages, `state` and `health` the state, `reports`
-has log lines. `settings` defines the parameters.
+`worker` runs the tasks and defines the events. `stream` describes the messages, `state` the state.
+`settings` defines the parameters.
 
 """
 
 from . import state
-from .events import Event, Log, LogFilter, Mounting, ShowPoses, Still
 from .guidance import Progress
-from .health import Check, checks, Health, Level, worst
+from .sensor import title
 from .session import BATCH, Session
-from .settings import CalibratorSettings, WEB_PORT
-from .worker import Compute, Files, Step, Task
+from .settings import (
+    CalibratorSettings,
+    changed,
+    default_of,
+    expected,
+    parameter,
+    Settings,
+    WEB_PORT,
+)
+from .state import Check, checks, figures, Level, words_of_state, worst
+from .worker import (
+    Answer,
+    CallSoon,
+    Compute,
+    Event,
+    Files,
+    Log,
+    LogFilter,
+    Mounting,
+    Severity,
+    ShowPoses,
+    Step,
+    Still,
+    Task,
+    Worker,
+    WorkerProcess,
+)
 
-__all__ = ['BATCH', 'WEB_PORT', 'CalibratorSettings', 'Check', 'Compute', 'Event', 'Files',
-           'Health', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session', 'ShowPoses',
-           'Step', 'Still', 'Task', 'checks', 'state', 'worst']
+__all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
+           'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session',
+           'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
+           'WorkerProcess', 'changed', 'checks', 'default_of', 'expected', 'figures', 'parameter',
+           'state', 'title', 'words_of_state', 'worst']

@@ -47,21 +47,10 @@ _CONTEXT = ('temperature', 'supply_voltage', 'rate')
 
 
 class PoseBook:
-    """
-    Poses in the order of their capture.
-
-    Parameters
-    ----------
-    settings : CaptureSettings
-        Whether repeated poses are kept, merged or refused.
-    units : Units
-        Unit of the readings.
-
-    """
+    """Poses in the order of their capture; repeated ones are kept, merged or refused as set."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
-        self._settings = settings
-        self._units = units
+        self._settings, self._units = settings, units
         self._earlier: list[Dwell] = []
         self._dwells: list[Dwell] = []
         self._held: list[Dwell] = []
@@ -88,11 +77,6 @@ class PoseBook:
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others."""
         self._earlier = [*dwells_of(poses), *self._earlier]
-
-    @property
-    def holding(self) -> bool:
-        """Whether there is a provisional pose."""
-        return bool(self._held)
 
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
@@ -217,16 +201,8 @@ class Change:
     """
     The changes that samples caused.
 
-    Parameters
-    ----------
-    rest : Dwell or None
-        The latest rest, if it is new or has a new average.
-    ended : tuple of Dwell
-        Rests that ended.
-    poses : bool
-        Whether the poses changed.
-    doubted : int
-        Number of poses newly marked as doubtful.
+    The latest rest, if it is new or has a new average; rests that ended; whether the poses
+    changed; and the number of poses newly marked as doubtful.
 
     """
 
@@ -237,17 +213,7 @@ class Change:
 
 
 class LiveCapture:
-    """
-    The stillness detector and the poses of one sensor.
-
-    Parameters
-    ----------
-    settings : CaptureSettings
-        Settings of the detector and of the poses.
-    units : Units
-        Unit of the readings.
-
-    """
+    """The stillness detector and the poses of one sensor."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self.detector = StillDetector(settings, units)
@@ -279,11 +245,6 @@ class LiveCapture:
             As in `StillDetector.push`.
         capture : bool
             Whether every rest becomes a pose.
-
-        Yields
-        ------
-        Change
-            A change; most blocks have none.
 
         """
         for piece in _pieces(samples):
@@ -319,7 +280,7 @@ class LiveCapture:
 
     def refresh(self) -> None:
         """Update the pose of the ongoing rest."""
-        dwell = self.detector.current() if self.book.holding else None
+        dwell = self.detector.current()
         if dwell is not None and self.book.holds(dwell):
             self.book.hold(dwell)
 

@@ -11,11 +11,17 @@ Every rest is compared with 1 g (`accel_calib.compare.drift`) as soon as it is l
 final average replaces this first comparison. A robot can stand for weeks, so each interval
 `LONG_REST` of a long rest counts as one rest.
 
+The history of temperatures lets a calibration that changes while the node runs start with the lag
+that the sensor has, and not in equilibrium.
+
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
+from itertools import islice
 import math
 from typing import Any
 
@@ -24,12 +30,14 @@ import numpy as np
 from .guidance import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
 from .settings import CalibratorSettings, capture_settings
-from .stream import NewestReading, StreamStatistics, TemperatureHistory
-from ..calibrate import Calibration, GyroBias, SampleNoise
+from .stream import StreamStatistics
+from ..calibrate import Calibration, GyroBias, Outside, outside, SampleNoise, thermal_stream
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rests_of
-from ..effects import Context, Model
+from ..effects import Context, Model, ThermalStream
+from ..errors import InputError
 from ..messages import output_scale
+from ..messages.one_reading import Known, OneReading, Triple
 from ..table import Floats
 from ..units import Units
 
@@ -37,6 +45,7 @@ _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
 
 _NONE = np.zeros((1, 3))
+_AT_REST: Triple = (0.0, 0.0, 0.0)
 
 _LARGEST_BIAS = 0.1
 """Largest bias of a gyro [rad/s]; MEMS gyros have up to 5 °/s."""
@@ -49,23 +58,8 @@ class Sensor:
     """
     The poses, the plan, the calibration, its drift, and the last rest of one sensor.
 
-    Parameters
-    ----------
-    settings : CalibratorSettings
-        The parameters.
-    units : Units
-        Unit of the readings.
-
     Attributes
     ----------
-    live : LiveCapture
-        Stillness detector and poses.
-    guide : Guide
-        The next pose.
-    temperatures : TemperatureHistory
-        Temperatures of the stream, for lags.
-    newest : NewestReading
-        Correction of single readings.
     calibration : Calibration or None
         The calibration in use.
     applied : Calibration or None
@@ -94,7 +88,6 @@ class Sensor:
     def __init__(self, settings: CalibratorSettings, units: Units) -> None:
         self.live = LiveCapture(capture_settings(settings), units)
         self.guide, self.temperatures = Guide(), TemperatureHistory()
-        self.newest = NewestReading(units)
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None
         self.offered: Calibration | None = None
@@ -109,6 +102,7 @@ class Sensor:
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
+        self._prepared: tuple[Calibration, OneReading] | None = None
 
     @property
     def present(self) -> Calibration | None:
@@ -187,17 +181,7 @@ class Sensor:
         return self.drift is not None and self.drift.change is not None
 
     def update(self, rest: Dwell, least: float) -> None:
-        """
-        Compare an ongoing rest with 1 g.
-
-        Parameters
-        ----------
-        rest : Dwell
-            The ongoing rest.
-        least : float
-            Smallest change to report [g].
-
-        """
+        """Compare an ongoing rest with 1 g; `least` is the smallest change to report [g]."""
         self.rest = rest
         self._hold()
         part = self._uncounted(rest)
@@ -206,7 +190,7 @@ class Sensor:
         self._compare(least)
 
     def end(self, rest: Dwell, least: float) -> None:
-        """Compare a rest that ended with 1 g; parameters as in `update`."""
+        """Compare a rest that ended with 1 g; `least` is as in `update`."""
         part = self._uncounted(rest)
         self._past = self._past if part is None else self._with(part, least)
         self._counted = rest
@@ -254,6 +238,34 @@ class Sensor:
         """Return the context of a rest as one row, for this calibration."""
         return {**context_of_rest(rest, calibration.units),
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
+
+    def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
+        """Return the quantities that are outside of the range of the calibration now."""
+        if self.calibration is None:
+            return {}
+        now = {key: np.array([value]) for key, value in {
+            **known, 'std': np.zeros(3), **self.temperatures.columns}.items()}
+        return {key: each for key, each in outside(self.calibration, now).items() if each.count}
+
+    def force_of(self, reading: Triple, known: Known) -> Triple | None:
+        """Return the force of a reading by the `present` calibration [g]; None: not known."""
+        calibration = self.present
+        if calibration is None:
+            return None
+        if self._prepared is None or self._prepared[0] is not calibration:
+            self._prepared = calibration, OneReading(calibration, 1.0 / calibration.force_per_g)
+        context = {'std': _AT_REST, 'previous': _AT_REST, 'rate': _AT_REST,
+                   **self.temperatures.columns_of(calibration.model), **known}
+        try:
+            return self._prepared[1].at(context).correct(*reading)
+        except InputError:
+            return None  # a quantity is not known yet, or the reading is out of range
+
+    def rest_ago(self, stamp: float) -> float:
+        """Return the time since the last rest, by header stamps [s]; NaN: no rest yet."""
+        if self.rest is None:
+            return math.nan
+        return 0.0 if self.live.still else max(0.0, stamp - self.rest.end)
 
     @property
     def residual(self) -> float:
@@ -316,3 +328,110 @@ def title(calibration: Calibration) -> str:
     return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
             f'{calibration.quality.rms_after_mg:.3f} mg, '
             f'{"levelled" if calibration.is_levelled else "not levelled"}')
+
+
+_APART = 2.0
+"""Shortest time between two temperatures of the history [s]."""
+
+_POINTS = 3600
+"""Largest number of temperatures of the history: two hours, many times a common lag."""
+
+_RECENT = int(2.0 * LONG_REST / _APART)
+"""Number of recent points whose columns are kept; they cover the longest rest."""
+
+
+class TemperatureHistory:
+    """Temperatures of the last hours, and the columns that a model needs from them."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
+        self._columns: deque[tuple[float, dict[str, float]]] = deque(maxlen=_RECENT)
+        self._stream: ThermalStream | None = None
+        self._followed = Model({})
+
+    def follow(self, model: Model) -> None:
+        """Compute the columns of this model from now on, and for the history."""
+        same, self._followed = _key(model) == _key(self._followed), model
+        if same:
+            return
+        self._columns.clear()
+        self._stream = thermal_stream(model)
+        if self._stream is not None:
+            self._columns.extend(_replayed(self._stream, self._points))
+
+    def add(self, time: Floats, temperature: Floats) -> None:
+        """
+        Add samples; a temperature that is NaN is ignored.
+
+        The points do not depend on how the samples are divided into calls: of a recording that is
+        played fast, a call may have the samples of many seconds.
+
+        """
+        known = np.isfinite(time + temperature)
+        if not np.any(known):
+            return
+        time, temperature = time[known], temperature[known]
+        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
+            self._points.clear()
+            self._columns.clear()
+        back = np.flatnonzero(np.diff(time) < -_APART)
+        begin = int(back[-1]) + 1 if len(back) else 0
+        while begin < len(time):
+            due = self._points[-1][0] + _APART if self._points else -np.inf
+            later = np.flatnonzero(time[begin:] >= due)
+            end = begin + int(later[0]) + 1 if len(later) else len(time)
+            if self._stream is not None:
+                self._stream.add_all(time[begin:end], temperature[begin:end])
+            if len(later):
+                now = float(time[end - 1])
+                self._points.append((now, float(temperature[end - 1])))
+                if self._stream is not None:
+                    self._columns.append((now, self._stream.value))
+            begin = end
+
+    @property
+    def columns(self) -> Mapping[str, float]:
+        """Return the present columns of the followed model; empty if it needs none."""
+        return {} if self._stream is None else self._stream.value
+
+    def columns_of(self, model: Model) -> Mapping[str, float]:
+        """Return the present columns of any model; those of another one are computed anew."""
+        if _key(model) == _key(self._followed):
+            return self.columns
+        stream = self.stream(model)
+        return {} if stream is None else stream.value
+
+    def stream(self, model: Model) -> ThermalStream | None:
+        """Return the lag and rate for a model after this history; None if it needs none."""
+        stream = thermal_stream(model)
+        if stream is not None:
+            _replayed(stream, self._points)
+        return stream
+
+    def during(self, model: Model, start: float, end: float) -> Context:
+        """Return the mean columns that a model needs between two times; empty if not known."""
+        columns = self._columns
+        if model is not self._followed and _key(model) != _key(self._followed):
+            stream = thermal_stream(model)
+            columns = deque() if stream is None else _replayed(stream, self._points)
+        inside = [each for time, each in columns if start - _APART <= time <= end]
+        if not inside:
+            return {}
+        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
+
+
+def _key(model: Model) -> tuple[object, ...]:
+    return dict(model.lags), 'temperature_rate' in model.over
+
+
+def _replayed(stream: ThermalStream, points: deque[tuple[float, float]]
+              ) -> deque[tuple[float, dict[str, float]]]:
+    """Add a history to a stream, and return the columns at its last points."""
+    old = max(len(points) - _RECENT, 0)
+    if old:
+        stream.add_all(*np.array(list(islice(points, old))).T)
+    columns: deque[tuple[float, dict[str, float]]] = deque()
+    for time, temperature in islice(points, old, None):
+        stream.add(time, temperature)
+        columns.append((time, stream.value))
+    return columns

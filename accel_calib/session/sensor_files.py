@@ -40,20 +40,7 @@ class StoreInUseError(AccelCalibError):
 
 
 class Lock:
-    """
-    A lock on the files of a store, until it is released or the process ends.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-
-    Raises
-    ------
-    StoreInUseError
-        If another process has locked the files.
-
-    """
+    """A lock on the files of a store; StoreInUseError if another process has locked them."""
 
     def __init__(self, store: Store) -> None:
         self._handle = -1
@@ -90,30 +77,18 @@ class Lock:
 
 
 class SensorFiles:
-    """
-    The store of a sensor, with its lock.
-
-    Parameters
-    ----------
-    settings : CalibratorSettings
-        Parameters for sensor and files.
-    topic : str
-        Topic of the messages, with namespace.
-
-    Attributes
-    ----------
-    store : Store or None
-        The store; None until the sensor is known.
-    problem : str
-        Reason why the files cannot be used, or empty.
-
-    """
+    """The store of a sensor, None until the sensor is known; and why it cannot be used, or ''."""
 
     def __init__(self, settings: CalibratorSettings, topic: str) -> None:
         self._settings, self._topic = settings, topic
         self._lock: Lock | None = None
         self.store: Store | None = None
         self.problem = ''
+
+    @property
+    def path(self) -> str:
+        """Path of the calibration; empty until the sensor is known."""
+        return '' if self.store is None else str(self.store.calibration)
 
     @property
     def locked(self) -> bool:
@@ -141,15 +116,7 @@ class SensorFiles:
         return self.store
 
     def usable(self) -> Store:
-        """
-        Return the locked store.
-
-        Raises
-        ------
-        InputError
-            If the sensor is not known yet, or another node uses the files.
-
-        """
+        """Return the locked store; InputError if the sensor is not known, or it is not locked."""
         if self.store is None:
             raise InputError('the name of the sensor is not known, because there is no Imu '
                              'message yet', 'start the driver, or set the parameter sensor')
@@ -167,16 +134,9 @@ class SensorFiles:
 @dataclass(frozen=True)
 class Loaded:
     """
-    The content of a store.
+    The content of a store: what is usable of it, and notes for the user.
 
-    Parameters
-    ----------
-    calibration, poses
-        Usable calibration and poses; None without them.
-    problem : str
-        Reason why the calibration cannot be used; empty if it is usable or does not exist.
-    notes : tuple of str
-        Notes for the user.
+    `problem` is why the calibration cannot be used, or empty.
 
     """
 

@@ -20,16 +20,25 @@ from time import monotonic
 import numpy as np
 
 from .commands import Commands
-from .events import Event, Log, Mounting, Severity, ShowPoses, Still
 from .live_capture import Change
-from .reports import AGAIN, Reports
 from .sensor import Sensor, title
 from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
 from .store import Store, writing_advice
-from .stream import SILENT, StreamStatistics
+from .stream import AGAIN, Reports, SILENT, StreamStatistics
 from .work import plan_for
-from .worker import Calibrations, Compute, Files, Task
+from .worker import (
+    Calibrations,
+    Compute,
+    Event,
+    Files,
+    Log,
+    Mounting,
+    Severity,
+    ShowPoses,
+    Still,
+    Task,
+)
 from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
 from ..compare import status
 from ..errors import InputError
@@ -49,6 +58,9 @@ and 3 batches per second, these are less than 1 % of the messages.
 _LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
 """Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
 
+_SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
+"""Severity of the log line about a finding, by its level."""
+
 
 class Session:
     """
@@ -65,14 +77,6 @@ class Session:
 
     Attributes
     ----------
-    sensor : Sensor
-        What belongs to the sensor; another record when the sensor changes.
-    commands : Commands
-        What the user can ask for.
-    reports : Reports
-        Log lines about the messages.
-    files : SensorFiles
-        The files of the sensor.
     enabled : bool
         Whether messages are corrected.
     publishers : tuple of str or None
@@ -316,8 +320,8 @@ class Session:
                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.sensor.adopt(calibration)
         self.log('info', f'correcting with {title(calibration)}')
-        for line in calibration.warnings:
-            self.log('warning', line)
+        for finding in calibration.noted:
+            self.log(_SEVERITY[finding.level], finding.words)
         if calibration.is_levelled:
             self._events.append(Mounting(calibration.rotation, self.frame_id or ''))
 

@@ -104,15 +104,7 @@ def expected(given: Field[Any]) -> str:
 
 
 def checked(given: Field[Any], value: Any) -> Any:
-    """
-    Return a value converted to the type of a parameter.
-
-    Raises
-    ------
-    InputError
-        If the parameter does not accept the value.
-
-    """
+    """Return a value converted to the type of a parameter; InputError if it is not accepted."""
     converted, limits = _converted(given, value), given.metadata['limits']
     choices = given.metadata['choices']
     if (converted is None or (choices and converted not in choices)
@@ -123,15 +115,7 @@ def checked(given: Field[Any], value: Any) -> Any:
 
 
 def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """
-    Return the settings with these parameters changed; other names are ignored.
-
-    Raises
-    ------
-    InputError
-        As in `checked`.
-
-    """
+    """Return the settings with these parameters `checked` and changed; ignore other names."""
     known = {each.name: each for each in fields(settings)}
     given = {name: checked(known[name], value) for name, value in values.items() if name in known}
     return replace(settings, **given)
@@ -232,15 +216,7 @@ class CalibratorSettings:
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
-    """
-    Return the settings of the capture, in g if the unit is known.
-
-    Raises
-    ------
-    InputError
-        If the settings contradict each other.
-
-    """
+    """Return the settings of the capture, in g if the unit is known; InputError if impossible."""
     std_max = settings.still_std_max
     try:
         return CaptureSettings(

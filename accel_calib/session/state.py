@@ -1,25 +1,41 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The state of a session, as its topics and pages show it."""
+"""
+The state of a session, as its topics and pages show it.
+
+``~/progress`` has the progress of the calibration, ``~/self_test`` one check for each concern, and
+``/diagnostics`` the checks and all figures.
+
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .guidance import Progress
-from .health import Health
 from .sensor import title
-from .stream import Newest, SILENT
+from .stream import SILENT, stream_faults
 from .work import is_partial
-from ..calibrate import mounting_words, Outside, outside
+from ..calibrate import mounting_words, USES_LIMIT
+from ..compare import Drift, status
 from ..messages.one_reading import Triple
+from ..text import counted
+from ..units import MG
 
 if TYPE_CHECKING:
     from .session import Session
+
+Newest = tuple[tuple[float, ...], float, float]
+"""A reading: direction (empty if not known), |a| and corrected |a| [g] (NaN: not known)."""
+
+_NOT_KNOWN: Newest = (), math.nan, math.nan
 
 
 def progress(session: Session, reading: Triple | None = None) -> Progress:
@@ -36,7 +52,7 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
     """
     sensor, statistics = session.sensor, session.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
-    newest = Newest() if silent else _newest(session, reading)
+    up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
     direction = None if plan is None or sensor.all_fitted else plan.asked.direction
     return Progress(
         still=session.still and not silent,
@@ -47,73 +63,187 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
         coverage=0.0 if plan is None else plan.coverage,
         accuracy=math.nan if plan is None else plan.asked.error * plan.noise_g,
         advice=sensor.advice, direction=() if direction is None else tuple(direction.tolist()),
-        up=newest.up, length=newest.length, corrected=newest.corrected,
-        temperature=statistics.temperature)
+        up=up, length=length, corrected=corrected, temperature=statistics.temperature)
 
 
 def _newest(session: Session, reading: Triple | None) -> Newest:
-    """Return direction and length of the newest reading; the parameter is as in `progress`."""
-    sensor, statistics = session.sensor, session.statistics
+    """
+    Describe the newest reading; the parameter is as in `progress`.
+
+    Native readings have a direction only if their zero is known: from a calibration, or about from
+    the poses so far.
+
+    """
+    sensor, newest = session.sensor, session.statistics.newest
     if reading is None:
-        if statistics.newest is None:
-            return Newest()
-        reading = tuple(statistics.newest.tolist())
-    calibration, plan, known = sensor.present, sensor.guide.plan, statistics.context
-    if calibration is not None:
-        known = {**sensor.temperatures.columns_of(calibration.model), **known}
-    return sensor.newest.described(reading, calibration, known,
-                                   () if plan is None else plan.zero)
+        if newest is None:
+            return _NOT_KNOWN
+        reading = tuple(newest.tolist())
+    force = sensor.force_of(reading, session.statistics.context)
+    corrected = math.nan if force is None else math.hypot(*force)
+    if not session.units.is_native:
+        length = math.hypot(*reading)
+        return _unit(reading, length), length / session.units.per_g, corrected
+    if sensor.present is None or force is None:
+        zero = () if sensor.guide.plan is None else sensor.guide.plan.zero
+        parts = [part - at for part, at in zip(reading, zero, strict=False)]
+        return _unit(parts, math.hypot(*parts)), math.nan, math.nan
+    return _unit((sensor.present.rotation @ force).tolist(), corrected), math.nan, corrected
 
 
-def health(session: Session) -> Health:
-    """Return the state for the diagnostics."""
-    sensor, statistics, store = session.sensor, session.statistics, session.files.store
-    detector, poses = sensor.live.detector, sensor.live.book.poses()
-    calibration, breaks = sensor.calibration, detector.interruptions
-    rest_ago = math.nan
-    if sensor.rest is not None:
-        rest_ago = 0.0 if sensor.live.still else max(0.0, statistics.stamp - sensor.rest.end)
-    return Health(
-        sensor=session.name, state=_state(session), problem=session.problem, topic=session.topic,
-        publishers=session.publishers, mismatches=session.mismatches,
-        calibration='' if calibration is None else title(calibration),
-        outside='; '.join(each.words for key, each in limits_left(session).items()
-                          if key != 'std'),
-        file='' if store is None else str(store.calibration),
-        writable=store is None or store.is_writable(), statistics=statistics,
-        length=statistics.length_g(session.units), rest_ago=rest_ago, residual=sensor.residual,
-        drift=sensor.drift, poses=len(poses),
-        doubtful=int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0,
-        interruptions=len(breaks),
-        last_interruption=f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else '',
-        threshold=detector.threshold, next_pose=sensor.advice,
-        mounting='' if calibration is None or not calibration.is_levelled else mounting_words(
-            calibration.rotation, session.frame_id or '', session.settings.base_frame),
-        gyro=sensor.gyro, noise=sensor.noise)
+def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
+    return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
 
 
-def limits_left(session: Session) -> dict[str, Outside]:
-    """Return the quantities that are outside of the range of the calibration now."""
-    sensor = session.sensor
-    if sensor.calibration is None:
-        return {}
-    known = {**session.statistics.context, 'std': np.zeros(3), **sensor.temperatures.columns}
-    now = {key: np.array([value]) for key, value in known.items()}
-    return {key: each for key, each in outside(sensor.calibration, now).items() if each.count}
+class Level(IntEnum):
+    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
 
 
-def _state(session: Session) -> str:
-    sensor = session.sensor
+@dataclass(frozen=True)
+class Check:
+    """The result of one check: name, severity and text."""
+
+    name: str
+    level: Level
+    words: str
+
+
+def checks(session: Session) -> list[Check]:
+    """Return the results of all checks, one for each concern."""
+    return [_stream(session), _calibration(session), _drift(session.sensor.drift),
+            _storage(session)]
+
+
+def worst(session: Session, found: Sequence[Check]) -> Check:
+    """Return the most severe of the checks, or the state of the session if all are OK."""
+    severest = max(found, key=lambda check: check.level)
+    words = words_of_state(session) if severest.level == Level.OK else severest.words
+    return Check('state', severest.level, words)
+
+
+def words_of_state(session: Session) -> str:
+    """Return whether messages are corrected, and why not."""
+    calibration = session.sensor.calibration
     if session.files.problem:
         return 'another node uses the files, nothing is published'
     if not session.enabled:
         return 'correction switched off, raw messages are published'
-    if sensor.offered is not None:
+    if session.sensor.offered is not None:
         return 'a new calibration waits for ~/save or ~/undo'
-    if sensor.calibration is not None:
+    if calibration is not None:
         return ('correcting, with a calibration of a part of the orientations'
-                if is_partial(sensor.calibration) else 'correcting')
+                if is_partial(calibration) else 'correcting')
     if not session.statistics.messages:
         return 'waiting for the first message'
     return ('no calibration, raw messages are published' if session.settings.passthrough
             else 'no calibration, nothing is published')
+
+
+def _stream(session: Session) -> Check:
+    faults = stream_faults(session)
+    if faults:
+        return Check('stream', Level.WARN, '; '.join(faults.values()))
+    return Check('stream', Level.OK, f'{session.statistics.rate:.1f} Hz on {session.topic}')
+
+
+def _calibration(session: Session) -> Check:
+    sensor = session.sensor
+    if session.problem:
+        return Check('calibration', Level.ERROR, session.problem)
+    if sensor.calibration is None:
+        count = counted(len(sensor.live.book.poses()), 'pose')
+        return Check('calibration', Level.WARN, f'no calibration yet, captured {count}: '
+                     f'{sensor.advice or "turn the sensor"}')
+    left = sensor.limits_left(session.statistics.context)
+    words = [each.words for key, each in left.items() if key != 'std']
+    if words:
+        return Check('calibration', Level.WARN, f'{"; ".join(words)}: {USES_LIMIT}; '
+                     'capture poses there and call ~/refine')
+    return Check('calibration', Level.OK, title(sensor.calibration))
+
+
+def _drift(drift: Drift | None) -> Check:
+    if drift is None:
+        return Check('drift', Level.OK, 'no calibration yet')
+    return Check('drift', Level.OK if drift.change is None else Level.WARN, status(drift))
+
+
+def _storage(session: Session) -> Check:
+    store = session.files.store
+    if store is None or store.is_writable():
+        return Check('storage', Level.OK, session.files.path)
+    return Check('storage', Level.ERROR, f'{session.files.path} cannot be written: correct the '
+                 'permissions, or restart the node with another calibration_file')
+
+
+def figures(session: Session) -> Iterator[tuple[str, str]]:
+    """Yield names and values for the diagnostics."""
+    sensor, counts = session.sensor, session.statistics
+    yield 'state', words_of_state(session)
+    yield 'sensor', session.name
+    yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
+    yield 'calibration file', session.files.path
+    yield 'rate [Hz]', f'{counts.rate:.1f}'
+    yield 'messages', str(counts.messages)
+    yield 'readings not finite', str(counts.not_finite)
+    yield 'messages of another sensor', str(counts.foreign)
+    yield 'corrected messages not plausible', str(counts.implausible)
+    yield 'residual |a| - 1 g at last rest [mg]', _number(sensor.residual * MG)
+    yield from _drift_figures(sensor.drift)
+    yield 'since last rest [s]', _number(sensor.rest_ago(counts.stamp))
+    yield from _pose_figures(session)
+    yield 'temperature [°C]', _number(counts.temperature)
+    yield 'still below [m/s² or native]', f'{sensor.live.detector.threshold:.4g}'
+    yield from _sensor_figures(session)
+
+
+def _drift_figures(drift: Drift | None) -> Iterator[tuple[str, str]]:
+    if drift is None:
+        return
+    yield 'drift since calibration [mg]', _number(drift.error * MG)
+    yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
+    yield 'rests since calibration', str(drift.count)
+    yield 'rests since it changed', str(drift.lasted)
+    if drift.change is not None:
+        yield 'changed by [mg]', _number(drift.change.error * MG)
+    if drift.temperatures:
+        low, high = drift.temperatures
+        yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
+
+
+def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
+    live = session.sensor.live
+    poses, breaks = live.book.poses(), live.detector.interruptions
+    doubtful = int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0
+    yield 'poses captured', str(len(poses))
+    yield 'poses doubtful', str(doubtful)
+    yield 'next pose', session.sensor.advice
+    yield 'interruptions of the clock', str(len(breaks))
+    yield 'last interruption', (
+        f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
+
+
+def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
+    """Yield the mounting, the bias of the gyro, and the noise."""
+    calibration, gyro, noise = (
+        session.sensor.calibration, session.sensor.gyro, session.sensor.noise)
+    yield 'mounting', 'not known' if calibration is None or not calibration.is_levelled else (
+        mounting_words(calibration.rotation, session.frame_id or '', session.settings.base_frame))
+    if gyro is not None:
+        yield 'gyro bias [rad/s]', _vector(gyro.at(session.statistics.temperature))
+        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
+    if noise is not None:
+        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
+        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
+
+
+def _vector(values: Iterable[float]) -> str:
+    return ', '.join(f'{value:.4g}' for value in values)
+
+
+def _number(value: float) -> str:
+    return f'{value:.3f}' if math.isfinite(value) else 'not known'

@@ -74,14 +74,8 @@ class Identity:
     """
     The identity of a sensor, which determines its files.
 
-    Parameters
-    ----------
-    sensor : str
-        frame_id of the messages, or the name set by the user.
-    topic : str
-        Topic of the messages, with namespace.
-    named : bool
-        Whether the user set the name; the topic is then ignored.
+    `sensor` is the frame_id of the messages, or the name set by the user (`named`). The topic,
+    with namespace, is then ignored.
 
     """
 
@@ -114,19 +108,12 @@ def ros_home() -> Path:
 @dataclass(frozen=True)
 class Store:
     """
-    The files of a sensor.
+    The files of a sensor, for readings in one unit.
 
-    Calibrations are formatted and parsed by the function that methods have as `call`, which can
-    use another process. Files are written in this one, which holds their lock.
-
-    Parameters
-    ----------
-    calibration : Path
-        File of the calibration; the poses are in ``<stem>_poses.csv`` in the same folder.
-    identity : Identity
-        The sensor.
-    units : {'m/s2', 'g', 'native'}
-        Unit of the readings.
+    The poses are in ``<stem of the calibration>_poses.csv`` in the same folder. All methods raise
+    OSError if a file cannot be read or written. Calibrations are formatted and parsed by the
+    function that methods have as `call`, which can use another process. Files are written in this
+    one, which holds their lock.
 
     """
 
@@ -143,15 +130,8 @@ class Store:
         """
         Return the stored calibration, or None if there is none.
 
-        Raises
-        ------
-        StoredCalibrationError
-            If it is damaged, newer than this package, or for another sensor, or if its unit
-            cannot be converted.
-        InputError
-            If it is not a regular file.
-        OSError
-            If the file cannot be read.
+        StoredCalibrationError if it is damaged, newer than this package, for another sensor, or in
+        a unit that cannot be converted. InputError if it is not a regular file.
 
         """
         return call(self._read, self.calibration) if _exists(self.calibration) else None
@@ -172,14 +152,8 @@ class Store:
         """
         Return the stored poses, or None if there are none.
 
-        Raises
-        ------
-        InputError
-            If the table is damaged, too large, or not a regular file.
-        StoredCalibrationError
-            If the table is for another sensor or unit.
-        OSError
-            If the file cannot be read.
+        InputError if the table is damaged, too large, or not a regular file.
+        StoredCalibrationError if it is for another sensor or unit.
 
         """
         if not _exists(self.poses):
@@ -199,7 +173,7 @@ class Store:
         return poses
 
     def save_calibration(self, calibration: Calibration, call: Callable[..., Any] = here) -> None:
-        """Write the calibration, and keep the file before as a step; raise OSError if it fails."""
+        """Write the calibration, and keep the file before as a step."""
         data: bytes = call(calibration_bytes, replace(
             calibration, sensor=self.identity.sensor, stream=self.identity.topic))
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
@@ -209,15 +183,7 @@ class Store:
             step.unlink()
 
     def _keep_step(self, call: Callable[..., Calibration]) -> Path:
-        """
-        Copy the file for `step_back`, or store an empty step if there is no file.
-
-        Returns
-        -------
-        Path
-            The step.
-
-        """
+        """Return a copy of the file for `step_back`, or an empty step if there is no file."""
         try:
             self.load_calibration(call)
         except AccelCalibError:
@@ -253,16 +219,8 @@ class Store:
         """
         Return to the calibration before the last stored one; None if there was none.
 
-        The last stored file is kept as ``<name>.undone<k>``.
-
-        Raises
-        ------
-        InputError
-            If there is no earlier step.
-        StoredCalibrationError
-            If the earlier calibration cannot be used.
-        OSError
-            If a file cannot be read or written.
+        The last stored file is kept as ``<name>.undone<k>``. InputError if there is no earlier
+        step, StoredCalibrationError if the earlier calibration cannot be used.
 
         """
         step = self._last_step()
@@ -294,7 +252,7 @@ class Store:
         raise InputError('there is no earlier calibration', 'nothing can be undone')
 
     def save_poses(self, poses: Poses) -> None:
-        """Write the poses, or remove the file if there are none; raise OSError if it fails."""
+        """Write the poses, or remove the file if there are none."""
         if len(poses) == 0:
             self.poses.unlink(missing_ok=True)
             return
@@ -303,12 +261,12 @@ class Store:
 
     def save(self, calibration: Calibration, poses: Poses, call: Callable[..., Any] = here
              ) -> None:
-        """Write the calibration and the poses; raise OSError if it fails."""
+        """Write the calibration and the poses."""
         self.save_calibration(calibration, call)
         self.save_poses(poses)
 
     def set_aside(self, call: Callable[..., Calibration] = here) -> list[Path]:
-        """Rename both files, and return the new paths; raise OSError if it fails."""
+        """Rename both files, and return the new paths."""
         if _exists(self.calibration):
             self._keep_step(call)
         return [aside(path, 'reset') for path in (self.calibration, self.poses) if _exists(path)]
@@ -345,21 +303,10 @@ def _check_sizes(poses: Poses, path: Path) -> None:
 
 def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:
     """
-    Return the store of a sensor.
+    Return the store of a sensor; InputError if the home folder is not known.
 
-    Parameters
-    ----------
-    calibration_file : str
-        File set by the user, with ``~`` for home; empty: in ``accel_calib`` in `ros_home`.
-    identity : Identity
-        The sensor.
-    units : {'m/s2', 'g', 'native'}
-        Unit of the readings.
-
-    Raises
-    ------
-    InputError
-        If the home folder is not known.
+    `calibration_file` is set by the user, with ``~`` for home; empty: in ``accel_calib`` in
+    `ros_home`.
 
     """
     if calibration_file:
@@ -376,10 +323,7 @@ def aside(path: Path, word: str) -> Path:
     """
     Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path.
 
-    Raises
-    ------
-    OSError
-        If it cannot be renamed, or is a device, or a folder that does not have the name of a file.
+    OSError also for a device, and for a folder that does not have the name of a file.
 
     """
     mode = path.lstat().st_mode

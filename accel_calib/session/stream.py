@@ -2,33 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a session keeps of the stream: statistics, the newest reading, and recent temperatures.
+The messages of a session: statistics, faults, and log lines.
 
-**Statistics.** Rates and ages use the arrival times by a steady clock, so that they are also right
-for a bag that is played at another speed. They cover the last `_SPAN` seconds.
-
-**Temperatures.** A calibration can change while the node runs. The history then lets the new
-calibration start with the lag that the sensor has, and not in equilibrium.
+Rates and ages use the arrival times by a steady clock, so that they are also right for a bag that
+is played at another speed. They cover the last `_SPAN` seconds.
 
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
-from itertools import islice
+from collections.abc import Callable, Sequence
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from .live_capture import LONG_REST
-from ..calibrate import Calibration, thermal_stream
-from ..effects import Context, Model, ThermalStream
-from ..errors import InputError
-from ..messages.one_reading import Known, OneReading, Triple
+from ..calibrate import USES_LIMIT
+from ..errors import AccelCalibError
 from ..table import Floats
+from ..text import counted
 from ..units import Units
+
+if TYPE_CHECKING:
+    from .session import Session
 
 _SPAN = 5.0
 """Time over which rate and faults are counted [s]."""
@@ -57,28 +54,17 @@ class StreamStatistics:
     """
     Statistics of a stream of messages.
 
-    Parameters
-    ----------
-    clock : callable
-        Steady clock [s].
-
     Attributes
     ----------
-    messages : int
-        Number of messages.
-    not_finite, foreign, implausible : int
-        Numbers of dropped messages: readings that are not finite, messages of another sensor, and
-        corrected messages that are not plausible.
-    stamp : float
-        Stamp of the last message [s].
-    arrived : float
-        Time of its arrival, by the steady clock [s].
+    messages, not_finite, foreign, implausible : int
+        Number of messages, and of dropped ones: readings that are not finite, messages of another
+        sensor, and corrected messages that are not plausible.
+    stamp, arrived : float
+        Stamp of the last message, and its arrival by the steady clock [s].
     temperature : float
         Last temperature [°C]; NaN: none.
-    reading : (3,) array or None
-        Mean reading of the last batch.
-    newest : (3,) array or None
-        The last reading.
+    reading, newest : (3,) array or None
+        Mean reading of the last batch, and the last reading.
     spread : float
         Largest standard deviation over the axes of the last batch [unit of the reading].
 
@@ -173,180 +159,146 @@ class StreamStatistics:
         return ''
 
 
-_NONE: Triple = (0.0, 0.0, 0.0)
+_DROPPED_SHOWN_FOR = 60.0
+"""Duration of the warning after a dropped message [s]."""
+
+_LIKELY_G = (0.2, 5.0)
+"""Range of |a| [g]; outside of it the unit is probably wrong."""
+
+_UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
+"""Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
 
-class Newest(NamedTuple):
-    """A reading: direction (empty if not known), |a| and corrected |a| [g] (NaN: not known)."""
-
-    up: tuple[float, ...] = ()
-    length: float = math.nan
-    corrected: float = math.nan
-
-
-class NewestReading:
-    """
-    Describe single readings, with the prepared correction.
-
-    Parameters
-    ----------
-    units : Units
-        Unit of the readings.
-
-    """
-
-    def __init__(self, units: Units) -> None:
-        self._units = units
-        self._prepared: tuple[Calibration, OneReading] | None = None
-
-    def described(self, reading: Triple, calibration: Calibration | None, known: Known,
-                  zero: tuple[float, ...] = ()) -> Newest:
-        """
-        Return direction and length of a reading.
-
-        Native readings have a direction only if their zero is known: from a calibration, or about
-        from the poses so far.
-
-        Parameters
-        ----------
-        reading : (float, float, float)
-            The reading, in the unit of the sensor.
-        calibration : Calibration or None
-            The calibration that corrects it.
-        known : mapping
-            Present context: time, and temperature with its lags if it is known.
-        zero : tuple of float, optional
-            Approximate zero of native readings before a calibration; empty if it is not known.
-
-        """
-        force = None if calibration is None else self._force(calibration, reading, known)
-        corrected = math.nan if force is None else math.hypot(*force)
-        if not self._units.is_native:
-            length = math.hypot(*reading)
-            return Newest(_unit(reading, length), length / self._units.per_g, corrected)
-        if calibration is None or force is None:
-            parts = tuple(part - at for part, at in zip(reading, zero, strict=False))
-            return Newest(_unit(parts, math.hypot(*parts)))
-        turned = (calibration.rotation @ force).tolist()
-        return Newest(_unit(turned, corrected), corrected=corrected)
-
-    def _force(self, calibration: Calibration, reading: Triple, known: Known) -> Triple | None:
-        """Return the corrected force [g]; None if the effects cannot be corrected now."""
-        if self._prepared is None or self._prepared[0] is not calibration:
-            self._prepared = (calibration, OneReading(calibration, 1.0 / calibration.force_per_g))
-        context = {'std': _NONE, 'previous': _NONE, 'rate': _NONE, **known}
-        try:
-            return self._prepared[1].at(context).correct(*reading)
-        except InputError:
-            return None  # a quantity is not known yet, or the reading is out of range
+def stream_faults(session: Session) -> dict[str, str]:
+    """Return by kind what is wrong with the messages, and what to do."""
+    statistics, topic, publishers = session.statistics, session.topic, session.publishers
+    silence = '' if session.mismatches else _silence(statistics, topic, publishers)
+    faults = {
+        'publishers': _publishers(topic, publishers), 'mismatches': '; '.join(session.mismatches),
+        'silence' if publishers else 'no_publisher': silence, 'stamps': statistics.stamp_fault,
+        **_dropped(statistics), 'unit': _wrong_unit(statistics, session.units)}
+    return {kind: words for kind, words in faults.items() if words}
 
 
-def _unit(vector: tuple[float, ...] | list[float], length: float) -> tuple[float, ...]:
-    return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
+def _publishers(topic: str, names: Sequence[str] | None) -> str:
+    if names is None or len(names) < 2:
+        return ''
+    count = 'two' if len(names) == 2 else str(len(names))
+    return (f'{count} publishers on the topic {topic}: {", ".join(names)}; expected one sensor: '
+            'stop the others, or give each sensor its own topic')
 
 
-_APART = 2.0
-"""Shortest time between two temperatures of the history [s]."""
-
-_POINTS = 3600
-"""Largest number of temperatures of the history: two hours, many times a common lag."""
-
-_RECENT = int(2.0 * LONG_REST / _APART)
-"""Number of recent points whose columns are kept; they cover the longest rest."""
-
-
-class TemperatureHistory:
-    """Temperatures of the last hours, and the columns that a model needs from them."""
-
-    def __init__(self) -> None:
-        self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        self._columns: deque[tuple[float, dict[str, float]]] = deque(maxlen=_RECENT)
-        self._stream: ThermalStream | None = None
-        self._followed = Model({})
-
-    def follow(self, model: Model) -> None:
-        """Compute the columns of this model from now on, and for the history."""
-        same, self._followed = _key(model) == _key(self._followed), model
-        if same:
-            return
-        self._columns.clear()
-        self._stream = thermal_stream(model)
-        if self._stream is not None:
-            self._columns.extend(_replayed(self._stream, self._points))
-
-    def add(self, time: Floats, temperature: Floats) -> None:
-        """
-        Add samples; a temperature that is NaN is ignored.
-
-        The points do not depend on how the samples are divided into calls: of a recording that is
-        played fast, a call may have the samples of many seconds.
-
-        """
-        known = np.isfinite(time + temperature)
-        if not np.any(known):
-            return
-        time, temperature = time[known], temperature[known]
-        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
-            self._points.clear()
-            self._columns.clear()
-        back = np.flatnonzero(np.diff(time) < -_APART)
-        begin = int(back[-1]) + 1 if len(back) else 0
-        while begin < len(time):
-            due = self._points[-1][0] + _APART if self._points else -np.inf
-            later = np.flatnonzero(time[begin:] >= due)
-            end = begin + int(later[0]) + 1 if len(later) else len(time)
-            if self._stream is not None:
-                self._stream.add_all(time[begin:end], temperature[begin:end])
-            if len(later):
-                now = float(time[end - 1])
-                self._points.append((now, float(temperature[end - 1])))
-                if self._stream is not None:
-                    self._columns.append((now, self._stream.value))
-            begin = end
-
-    @property
-    def columns(self) -> Mapping[str, float]:
-        """Return the present columns of the followed model; empty if it needs none."""
-        return {} if self._stream is None else self._stream.value
-
-    def columns_of(self, model: Model) -> Mapping[str, float]:
-        """Return the present columns of any model; those of another one are computed anew."""
-        if _key(model) == _key(self._followed):
-            return self.columns
-        stream = self.stream(model)
-        return {} if stream is None else stream.value
-
-    def stream(self, model: Model) -> ThermalStream | None:
-        """Return the lag and rate for a model after this history; None if it needs none."""
-        stream = thermal_stream(model)
-        if stream is not None:
-            _replayed(stream, self._points)
-        return stream
-
-    def during(self, model: Model, start: float, end: float) -> Context:
-        """Return the mean columns that a model needs between two times; empty if not known."""
-        columns = self._columns
-        if model is not self._followed and _key(model) != _key(self._followed):
-            stream = thermal_stream(model)
-            columns = deque() if stream is None else _replayed(stream, self._points)
-        inside = [each for time, each in columns if start - _APART <= time <= end]
-        if not inside:
-            return {}
-        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
+def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str] | None) -> str:
+    if min(statistics.age, statistics.dropped_ago) <= SILENT:
+        return ''
+    if publishers is None:
+        return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
+                'are kept')
+    if publishers:
+        return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
+                'the driver')
+    return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
+            'imu/data_raw to its topic')
 
 
-def _key(model: Model) -> tuple[object, ...]:
-    return dict(model.lags), 'temperature_rate' in model.over
+def _dropped(statistics: StreamStatistics) -> dict[str, str]:
+    """Return which messages were dropped lately, and what to do."""
+    if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
+        return {}
+    words = {'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
+             'foreign': ('message', 'of another sensor: use a separate topic for each sensor'),
+             'implausible': ('corrected message',
+                             'with implausible values: check the calibration')}
+    return {kind: f'dropped {counted(getattr(statistics, kind), what)} {why}'
+            for kind, (what, why) in words.items() if getattr(statistics, kind)}
 
 
-def _replayed(stream: ThermalStream, points: deque[tuple[float, float]]
-              ) -> deque[tuple[float, dict[str, float]]]:
-    """Add a history to a stream, and return the columns at its last points."""
-    old = max(len(points) - _RECENT, 0)
-    if old:
-        stream.add_all(*np.array(list(islice(points, old))).T)
-    columns: deque[tuple[float, dict[str, float]]] = deque()
-    for time, temperature in islice(points, old, None):
-        stream.add(time, temperature)
-        columns.append((time, stream.value))
-    return columns
+def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
+    length = statistics.length_g(units)
+    if statistics.reading is None or not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
+        return ''
+    size = float(np.linalg.norm(statistics.reading))
+    likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
+    return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
+            f'units:={likely}')
+
+
+AGAIN = 10.0
+"""Shortest time between two equal log lines about single messages or a silent stream [s]."""
+
+_FAULT_AGAIN = 60.0
+"""Shortest time between two equal log lines about another fault of the stream [s]."""
+
+
+class Reports:
+    """The log lines about the messages of a session, which is the only argument."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._faults: tuple[object, ...] | None = None
+        self._faults_at = -math.inf
+        self._left: frozenset[str] = frozenset()
+
+    def foreign(self, frame_id: str) -> None:
+        """Count a message of another sensor."""
+        self._session.statistics.drop('foreign')
+        self._session.log('error', f'an Imu message has frame_id {frame_id!r}, expected '
+                          f'{self._session.frame_id!r}; it is dropped: use a separate topic for '
+                          'each sensor', 'foreign', AGAIN)
+
+    def absurd(self, readings: Floats, largest: float) -> None:
+        """Count readings that are not of a sensor."""
+        reading = tuple(readings[0].tolist())
+        self._session.statistics.drop('not_finite', len(readings))
+        self._session.log('warning', f'an Imu message has the linear_acceleration {reading}, '
+                          f'expected three finite numbers up to {largest:.3g}; it is dropped: '
+                          'check the driver', 'absurd', AGAIN)
+
+    def unreadable(self, size: int) -> None:
+        """Count an unreadable message of this size [bytes]."""
+        self._session.statistics.drop('not_finite')
+        self._session.log('warning', f'an Imu message of {size} bytes cannot be read; it is '
+                          'dropped: check the driver', 'unreadable', AGAIN)
+
+    def uncorrected(self, error: AccelCalibError) -> None:
+        """Count a corrected message that is not published because of an error."""
+        self._session.statistics.drop('implausible')
+        self._session.log('error', f'messages are not corrected: {error}', 'uncorrected', AGAIN)
+
+    def jump(self, seconds: float, since: float) -> None:
+        """Log a jump of the stamps, unless no messages arrived for as long [s]."""
+        if abs(seconds - since) > SILENT:
+            where = 'back' if seconds < 0.0 else 'ahead'
+            self._session.log('warning', f'the stamps jumped {where} by {abs(seconds):.1f} s; the '
+                              'rest before it has ended, and the poses are kept: unless a '
+                              'recording is played, check the clock of the driver',
+                              f'jump {where}', _FAULT_AGAIN)
+
+    def limits(self) -> None:
+        """Log once when a quantity leaves the range of the calibration."""
+        left = self._session.sensor.limits_left(self._session.statistics.context)
+        for key, each in left.items():
+            if key not in self._left:
+                self._session.log(
+                    'warning', f'{each.name} has left the range of the calibration, '
+                    f'{each.range_words(each.low, each.high)}: it is '
+                    f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
+                    f'limits of {key}', _FAULT_AGAIN)
+        self._left = frozenset(left)
+
+    def faults(self) -> None:
+        """Log a fault of the stream when it appears, and again while it lasts."""
+        session, statistics = self._session, self._session.statistics
+        faults = stream_faults(session)
+        limit = AGAIN if statistics.age > SILENT else _FAULT_AGAIN
+        again = session.clock() - self._faults_at >= limit
+        kinds = (frozenset(faults), session.mismatches)
+        if faults and (again or kinds != self._faults):
+            waiting, words = not statistics.messages and not session.mismatches, '; '.join(
+                faults.values())
+            session.log('info' if waiting else 'warning',
+                        f'waiting: {words}' if waiting else words)
+            self._faults, self._faults_at = kinds, session.clock()
+        elif not faults and self._faults is not None:
+            session.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
+            self._faults = None

@@ -65,29 +65,11 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
            before: Calibration | None, context: Context) -> Calibration:
     """
-    Return a fit with the mounting of the previous calibration.
+    Return a fit of all poses, in the levelled frame of the calibration before.
 
-    Parameters
-    ----------
-    poses : Poses
-        All poses.
-    units : Units
-        Unit of the readings.
-    settings : CalibratorSettings
-        Model and method.
-    sensor : str
-        Name of the sensor.
-    before : Calibration or None
-        The previous calibration; its levelled frame is kept.
-    context : mapping of str to array
-        Columns that its effects need, one row.
-
-    Raises
-    ------
-    RefusedFitError
-        If the poses do not determine the model; the advice is how to turn the sensor next.
-    InputError
-        If the readings are clearly in another unit.
+    `context` has the columns that the effects of that calibration need, one row. RefusedFitError
+    if the poses do not determine the model; the advice is how to turn the sensor next. InputError
+    if the readings are clearly in another unit.
 
     """
     full = before is not None and not is_partial(before)
@@ -116,16 +98,7 @@ def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) 
     """
     Return a calibration from one rest: the offset along gravity, and the bias of the gyro.
 
-    Parameters
-    ----------
-    rest : Dwell
-        The rest.
-    units : Units
-        Unit of the readings.
-    sensor : str
-        Name of the sensor.
-    before : Calibration or None
-        The previous calibration. The offset and gain of a full fit are kept.
+    The offset and gain of a full fit before are kept.
 
     """
     if before is None or is_partial(before):
@@ -174,25 +147,10 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
             ) -> tuple[Refinement, list[str]]:
     """
-    Return the refinement of a calibration, and what to answer.
+    Return the refinement of a calibration (None: of a fit), and what to answer.
 
-    Parameters
-    ----------
-    poses : Poses
-        All poses.
-    units : Units
-        Unit of the readings.
-    sensor : str
-        Name of the sensor.
-    before : Calibration or None
-        The calibration in use; None: the model that a fit would select.
-
-    Raises
-    ------
-    RefusedFitError
-        If there are too few poses.
-    InputError
-        If the readings are clearly in another unit.
+    RefusedFitError if there are too few poses; InputError if the readings are clearly in another
+    unit.
 
     """
     refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
@@ -204,15 +162,7 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
-    """
-    Return the approximate direction of up in each pose, before a fit.
-
-    Returns
-    -------
-    (n, 3) array
-        Unit vectors; n = 0 if the centre of native readings is not known.
-
-    """
+    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
     if units.is_native and len(poses) < _FEWEST_NATIVE:
         return np.zeros((0, 3))
     try:

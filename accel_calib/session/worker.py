@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A separate process for computations, and the order of the tasks of a session.
+What a session reports and asks for, and the threads and the process that do it.
 
 **Process.** In a thread of the node, fits, refinements and the next pose would share the
 interpreter with the stream, and messages would wait up to 5 ms. The process has its own
@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 import os
@@ -42,11 +43,14 @@ import signal
 import subprocess
 import sys
 from threading import Lock, Thread
+from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, TypeVar
+from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import here, writing_advice
+from ..calibrate import NextPose
 from ..errors import AccelCalibError, InputError
+from ..table import Floats
 
 Found = TypeVar('Found')
 
@@ -62,7 +66,6 @@ _ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 _IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
 
-
 _START = ('import sys; sys.path[:] = filter(None, sys.path); '
           f'from {__name__} import main; main()')
 """Code of the process. The current folder is not searched for modules: it may hold any file."""
@@ -73,15 +76,7 @@ class ClosedError(InputError):
 
 
 class WorkerProcess:
-    """
-    The interface of the node to the process; other threads wait for their turn.
-
-    Parameters
-    ----------
-    idle : bool
-        Run only while the processor is idle.
-
-    """
+    """The interface of the node to the process, which can run only while the processor is idle."""
 
     def __init__(self, *, idle: bool = True) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -106,24 +101,10 @@ class WorkerProcess:
 
     def call(self, function: Callable[..., Found], *given: Any) -> Found:
         """
-        Call a function in the process and wait for its result.
+        Return the result of a module-level function, called in the process.
 
-        Parameters
-        ----------
-        function : callable
-            A module-level function, which can be imported by name.
-        *given
-            Arguments that can be pickled.
-
-        Returns
-        -------
-        object
-            The result of the function. An error of the function is raised here, too.
-
-        Raises
-        ------
-        InputError
-            If the node is ending.
+        Arguments and result are pickled. An error of the function is raised here, too; InputError
+        if the node is ending. Other threads wait for their turn.
 
         """
         with self._turn:
@@ -219,15 +200,10 @@ def _answer(call: Any) -> tuple[bool, Any]:
 
 class Step:
     """
-    What a task waits for: the result of a function.
+    What a task waits for: the result of a function with these arguments.
 
-    Parameters
-    ----------
-    function : callable, optional
-        The function. It does not use the session, and can raise AccelCalibError or OSError, which
-        are raised in the task. None: the task only waits until the steps before it are done.
-    *given
-        Its arguments.
+    The function does not use the session, and can raise AccelCalibError or OSError, which are
+    raised in the task. Without a function, the task only waits until the steps before it are done.
 
     """
 
@@ -270,6 +246,65 @@ An empty answer is not logged. A task can raise AccelCalibError.
 Part = Generator[Step, Any, Found]
 """A part of a task, for ``yield from``."""
 
+Severity = Literal['info', 'warning', 'error']
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log line; lines of one kind, if it has one, are logged at most once in `once_in` [s]."""
+
+    severity: Severity
+    words: str
+    kind: str = ''
+    once_in: float = 0.0
+
+
+@dataclass(frozen=True)
+class Still:
+    """A change of whether the sensor is still."""
+
+    still: bool
+
+
+@dataclass(frozen=True)
+class ShowPoses:
+    """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
+
+    up: Floats
+    asked: NextPose
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
+
+    rotation: Floats
+    frame_id: str
+
+
+Event = Log | Mounting | Still | ShowPoses | Task
+"""What a session reports: log lines, what to publish, and tasks to run."""
+
+
+class LogFilter:
+    """Decide which lines are logged: not empty, and none of the same kind within `once_in`."""
+
+    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+        self._clock = clock
+        self._last: dict[str, float] = {}
+
+    def passes(self, line: Log) -> bool:
+        """Return whether to log a line, and note it."""
+        if not line.kind:
+            return bool(line.words)
+        now = self._clock()
+        if now - self._last.get(line.kind, -line.once_in) < line.once_in:
+            return False
+        self._last[line.kind] = now
+        return True
+
+
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
 
@@ -279,21 +314,10 @@ CallSoon = Callable[[Callable[[], None]], None]
 
 class Worker:
     """
-    The threads for the tasks of a session.
+    The threads for the tasks of a session; `running` names the commands that are not answered.
 
-    Parameters
-    ----------
-    call_soon : callable
-        Function that lets the thread of the session call a function.
-    on_events : callable
-        Function that is called after each step of a task, in the thread of the session.
-    report : callable
-        Function that logs an unexpected error.
-
-    Attributes
-    ----------
-    running : list of str
-        Names of the commands that are not answered, the oldest first.
+    `call_soon` lets the thread of the session call a function. `on_events` is called after each
+    step of a task, in the thread of the session, and `report` for an unexpected error.
 
     """
 

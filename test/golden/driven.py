@@ -77,9 +77,9 @@ class _Driver:
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
-        health = state.health(self.session)
-        return [state.progress(self.session), dict(health_figures(health)), checks(health),
-                self.shown, self.session.sensor.live.book.poses(), self.session.sensor.drift]
+        return [state.progress(self.session), dict(health_figures(self.session)),
+                checks(self.session), self.shown, self.session.sensor.live.book.poses(),
+                self.session.sensor.drift]
 
     def lines(self) -> Any:
         return self.log
