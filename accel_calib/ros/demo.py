@@ -309,16 +309,21 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
             return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
-        stored = Path(folder) / 'accel_calib' / 'demo.yaml'
-        fitted = read_calibration(stored).model
-        report(f'~/refine: {demo.call("calibrator/refine")}')
-        report(f'~/set_level: {demo.level()}')
-        refined = read_calibration(stored).model
+        found, lag_s = _refined(demo, report, Path(folder) / 'accel_calib' / 'demo.yaml')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
-        lag = refined.lags.get('temperature_of_offset')
-        return Outcome(
-            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
-            tuple(name for name in refined.effects if name not in fitted.effects),
+        return Outcome(len(rests), calibrated, again, time.monotonic() - began,
+                       parse_effect(hidden)[0], found, lag_s)
+
+
+def _refined(demo: Demonstration, report: Callable[[str], None], stored: Path
+             ) -> tuple[tuple[str, ...], float]:
+    """Refine and level; return the effects that are new in the stored model, and their lag [s]."""
+    fitted = read_calibration(stored).model
+    report(f'~/refine: {demo.call("calibrator/refine")}')
+    report(f'~/set_level: {demo.level()}')
+    refined = read_calibration(stored).model
+    lag = refined.lags.get('temperature_of_offset')
+    return (tuple(name for name in refined.effects if name not in fitted.effects),
             0.0 if lag is None else lag.seconds)
 
 

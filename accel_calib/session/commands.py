@@ -48,8 +48,6 @@ _AUTO_FIT_EVERY = 60.0
 _NEXT_LATER = 'the next pose is on ~/poses after the computation that is running'
 """Advice while a fit or a refinement occupies the worker process."""
 
-_NO_CALIBRATION = InputError('there is no calibration', 'capture poses and call ~/fit first')
-
 
 class ChangedError(AccelCalibError):
     """The calibration changed during a fit or a refinement."""
@@ -265,7 +263,7 @@ class Commands:
         session, store = self._session, self._session.files.usable()
         calibration = session.sensor.present
         if calibration is None:
-            raise _NO_CALIBRATION
+            raise InputError('there is no calibration', 'capture poses and call ~/fit first')
         yield Calibrations(store.save, calibration, session.sensor.live.book.poses())
         if session.sensor.offered is calibration:
             session.adopt(calibration)

@@ -314,10 +314,11 @@ CallSoon = Callable[[Callable[[], None]], None]
 
 class Worker:
     """
-    The threads for the tasks of a session; `running` names the commands that are not answered.
+    The threads for the tasks of a session.
 
-    `call_soon` lets the thread of the session call a function. `on_events` is called after each
-    step of a task, in the thread of the session, and `report` for an unexpected error.
+    `running` names the commands that are not answered, the oldest first. `call_soon` lets the
+    thread of the session call a function. `on_events` is called after each step of a task, in the
+    thread of the session, and `report` for an unexpected error.
 
     """
 
