@@ -20,7 +20,7 @@ NAMES = ('4', '7', '10')
 @pytest.mark.parametrize(('scale', 'shift'), [(1.0, 0.0), (9.81, 0.0), (4060.0, 33000.0),
                                               (0.3468, 1.775), (1e-6, 5e-6)])
 def test_exact_poses_recover_the_sensor_in_any_unit(name, scale, shift):
-    model = sensor(np.random.default_rng(4), *MODELS[name])
+    model = sensor(np.random.default_rng(4), *MODELS[name].effects)
     reading = predict(model, spread_directions(14), {}) * scale + shift
     mat_w, vec_v = closed_form(name, reading)
     true_w, true_v = model.linear_part
@@ -31,7 +31,7 @@ def test_exact_poses_recover_the_sensor_in_any_unit(name, scale, shift):
 @pytest.mark.parametrize('name', NAMES)
 def test_noisy_poses_give_the_same_result_in_counts_and_in_g(name):
     rng = np.random.default_rng(5)
-    reading = predict(sensor(rng, *MODELS[name]), random_directions(30, rng), {})
+    reading = predict(sensor(rng, *MODELS[name].effects), random_directions(30, rng), {})
     reading = reading + rng.normal(size=reading.shape) * 0.002
     (w_g, v_g), (w_counts, v_counts) = (closed_form(name, each) for each in (
         reading, reading * 16384 + 30000))
@@ -42,7 +42,7 @@ def test_noisy_poses_give_the_same_result_in_counts_and_in_g(name):
 @pytest.mark.parametrize('name', NAMES)
 def test_repeated_poses_give_the_result_of_one_of_each(name):
     rng = np.random.default_rng(6)
-    reading = predict(sensor(rng, *MODELS[name]), random_directions(30, rng), {})
+    reading = predict(sensor(rng, *MODELS[name].effects), random_directions(30, rng), {})
     reading = reading + rng.normal(size=reading.shape) * 0.002
     once, often = closed_form(name, reading), closed_form(name, np.tile(reading, (600, 1)))
     np.testing.assert_allclose(often[0], once[0], atol=1e-9)

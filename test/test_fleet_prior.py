@@ -38,7 +38,7 @@ SPREAD = np.repeat([0.020, 0.008, 0.006], 3)
 
 
 def a_sensor(rng: np.random.Generator, factor: float = 1.0) -> Model:
-    return with_vector(MODELS['10'], MEAN + factor * SPREAD * rng.normal(size=9))
+    return with_vector(MODELS['10'].effects, MEAN + factor * SPREAD * rng.normal(size=9))
 
 
 def poses_of(sensor: Model, count: int, rng: np.random.Generator) -> Poses:
@@ -94,7 +94,7 @@ def test_a_sensor_unlike_the_fleet_is_not_pulled_in(fleet: FleetPrior) -> None:
     without, with_fleet, pulled = [], [], []
     for _ in range(10):
         values = a_sensor(rng).vector + np.eye(9)[2] * 0.25  # 12 spreads in z
-        sensor = with_vector(MODELS['10'], values)
+        sensor = with_vector(MODELS['10'].effects, values)
         poses = poses_of(sensor, 6, rng)
         fitted = fit_with_fleet(poses, IN_G, fleet)
         without.append(error_mg(fit_poses(poses, IN_G), sensor))
@@ -106,7 +106,7 @@ def test_a_sensor_unlike_the_fleet_is_not_pulled_in(fleet: FleetPrior) -> None:
 
 def test_many_poses_outweigh_the_fleet(fleet: FleetPrior) -> None:
     rng = np.random.default_rng(4)
-    sensor = with_vector(MODELS['10'], MEAN + 6.0 * SPREAD * np.tile([1.0, -1.0, 1.0], 3))
+    sensor = with_vector(MODELS['10'].effects, MEAN + 6.0 * SPREAD * np.tile([1.0, -1.0, 1.0], 3))
     poses = poses_of(sensor, 18, rng)
     fitted, alone = fit_with_fleet(poses, IN_G, fleet), fit_poses(poses, IN_G, model='10')
     assert np.all(np.abs(fitted.model.vector - alone.model.vector)
@@ -214,7 +214,7 @@ def test_a_refinement_of_few_noisy_poses_is_better_with_the_fleet(fleet: FleetPr
 
 def test_a_refined_sensor_unlike_the_fleet_is_not_pulled_in(fleet: FleetPrior) -> None:
     rng = np.random.default_rng(10)
-    sensor = with_vector(MODELS['10'], a_sensor(rng).vector + np.eye(9)[2] * 0.25)
+    sensor = with_vector(MODELS['10'].effects, a_sensor(rng).vector + np.eye(9)[2] * 0.25)
     result = refine_with_fleet(poses_of(bent(sensor), 24, rng), IN_G, fleet)
     assert [step.effect for step in result.steps] == ['quadratic']
     away = result.calibration.offset[2] - sensor.vector[2]

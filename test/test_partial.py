@@ -53,7 +53,7 @@ def near_up(rng, count, degrees, axis=(0.0, 0.0, 1.0)):
 
 def common_sensor(rng):
     """Return a random sensor with values as the prior has them."""
-    return with_vector(MODELS['10'], rng.normal(size=9) * typical_spread())
+    return with_vector(MODELS['10'].effects, rng.normal(size=9) * typical_spread())
 
 
 def tilting(seed, count=7, degrees=10.0, noise_g=0.003):
@@ -125,7 +125,7 @@ def test_many_poses_over_the_sphere_outweigh_the_prior():
     rng = np.random.default_rng(4)
     poses = simulate_poses(common_sensor(rng), spread_directions(24), rng)
     full = fit_poses(poses, G, model='10')
-    start = with_vector(MODELS['10'], np.zeros(9))
+    start = with_vector(MODELS['10'].effects, np.zeros(9))
     found = estimate(start, poses.take(slice(None)), common_sensors())
     deviation = np.sqrt(np.diag(full.covariance))
     assert np.all(np.abs(found.model.vector - full.model.vector) < 0.1 * deviation)

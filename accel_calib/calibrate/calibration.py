@@ -17,12 +17,22 @@ from numpy.typing import ArrayLike
 from .context import HELD, limited, of_samples, with_acting
 from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
-from ..effects import AXES, Context, correct, force_slope, Model, parameter_names, predict
+from ..effects import (
+    AXES,
+    Context,
+    correct,
+    force_slope,
+    Model,
+    ModelForm,
+    MODELS,
+    parameter_names,
+    predict,
+)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..table import Floats, Poses, Table
 from ..text import table, with_sd
-from ..units import STANDARD_GRAVITY, UnitName, Units
+from ..units import is_native, UnitName, Units, units_of
 
 _IN_READING_UNITS = ('reading', 'std', 'reference')
 
@@ -166,6 +176,11 @@ class Calibration:
     def warnings(self) -> tuple[str, ...]:
         """What was noted, as lines of text."""
         return tuple(each.words for each in self.noted)
+
+    @property
+    def form(self) -> ModelForm:
+        """The form of the fitted model, before effects were added."""
+        return MODELS[self.name]
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -413,11 +428,11 @@ def conversion(before: UnitName, after: UnitName) -> float:
     """
     if before == after:
         return 1.0
-    if 'native' in (before, after):
+    if is_native(before) or is_native(after):
         raise InputError(f'the calibration is for readings in {before}, but the readings are in '
                          f'{after}, and the scale of native units is not known',
                          f'use readings in {before}, or fit a calibration to poses in {after}')
-    return STANDARD_GRAVITY if after == 'm/s2' else 1.0 / STANDARD_GRAVITY
+    return units_of(after).per_g / units_of(before).per_g
 
 
 def converted(table: _Known, before: UnitName, after: UnitName) -> _Known:

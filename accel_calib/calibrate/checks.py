@@ -65,7 +65,7 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
         return
     level: Level = 'USABLE'
     mirrored = np.linalg.det(mat_q) < 0.0
-    if name == '12':
+    if calibration.form.known_orientation:
         level, effect = 'USABLE' if mirrored else 'GOOD', 'model 12 corrects it'
     elif mirrored:
         level = 'BAD'

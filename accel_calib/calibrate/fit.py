@@ -22,7 +22,7 @@ from .known_orientation import fit_known
 from .mounting import FrameName, heading_is_arbitrary, mounting, with_heading, with_heading_of
 from .rest_noise import with_rest_noise
 from .unknown_orientation import fit_unknown, Method, METHODS
-from ..effects import Context, Model, sensor_force
+from ..effects import Context, Model, MODELS, sensor_force
 from ..errors import InputError, RefusedFitError
 from ..finding import Finding, without
 from ..table import check_units, Floats, Poses
@@ -150,7 +150,8 @@ def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units
 
 
 def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
-    if model == '12' or (model == 'auto' and 'reference' in poses):
+    known = 'reference' in poses if model == 'auto' else MODELS[model].known_orientation
+    if known:
         return fit_known(poses, units, method)
     return fit_unknown(poses, units, model, method)
 

@@ -78,7 +78,7 @@ def _fit(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
     """Fit model 12, without outliers if the other poses determine the model."""
     kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
     poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
-    start = with_vector(MODELS['12'], np.zeros(12))
+    start = with_vector(MODELS['12'].effects, np.zeros(12))
     rejected: tuple[Rejected, ...] = ()
     fit = estimate(start, poses_g)
     while method == 'ml':

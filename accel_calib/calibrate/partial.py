@@ -76,7 +76,7 @@ from ..text import counted
 from ..units import MG, Units
 
 _NAME = '10'
-_EFFECTS = MODELS[_NAME]
+_EFFECTS = MODELS[_NAME].effects
 
 _LOG_KNOCKED = float(np.log(0.01))
 """Logarithm of the probability that a pose was knocked."""

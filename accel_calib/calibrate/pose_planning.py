@@ -32,6 +32,7 @@ from itertools import product
 import numpy as np
 
 from .calibration import Calibration
+from ..effects import MODELS
 from ..errors import RefusedFitError
 from ..estimate import (
     Combination,
@@ -216,7 +217,7 @@ def _is_poor(name: str, information: Floats) -> bool:
 
 def _best(name: str, directions: Floats, information: Floats) -> int | None:
     """Return the index of the untaken orientation that increases det M most; None if all are."""
-    attitudes = _attitudes()[:6] if name == '12' else _attitudes()
+    attitudes = _attitudes()[:6] if MODELS[name].known_orientation else _attitudes()
     up = unit(attitudes)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
     if not np.any(free):
@@ -296,8 +297,8 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     noise = pose_noise(poses.noise, directions)
     uncertainty = _uncertainty(calibration) if calibration.model.effects else np.nan
     planned = asked
-    if asked in ('auto', '12'):  # with wrong orientations model 12 became 10
-        planned = '12' if calibration.name == '12' else '10'
+    if asked == 'auto' or MODELS[asked].known_orientation:  # wrong ones: model 12 became 10
+        planned = calibration.form.largest
     known, noise_g = np.isfinite(uncertainty), None
     if known and determines(calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
@@ -313,7 +314,7 @@ def _uncertainty(calibration: Calibration) -> float:
     if any(key not in known for key in calibration.model.needs):
         return np.nan
     covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
-    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.name == '12'
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
               else np.einsum('ni,nij,nj->n', up, covariance, up))
     return float(np.sqrt(np.mean(errors)))
 
@@ -425,7 +426,7 @@ def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) ->
     """Return a text that offers a smaller model, with the effects that it omits."""
     offer = (f', or use model {smaller}, which these poses determine: it omits '
              f'{joined(left_out(smaller, name))}')
-    if name == '12':
+    if MODELS[name].known_orientation:
         return offer
     return f'{offer}, {_commonly(smaller, name, directions, noise)}'
 

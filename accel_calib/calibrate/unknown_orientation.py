@@ -221,9 +221,10 @@ def _rivals(name: str, fit: Fit, kept: NDArray[np.intp], distinct: NDArray[np.in
             poses_g: Poses) -> tuple[Rival, ...]:
     """Return the rivals of a fit to the poses kept, given the indices without copies."""
     def refit(others: Poses) -> Fit:
-        found = estimate(start_of('10' if name == '9' else name, others.reading), others)
-        return _in_sensing_axes(found.model.linear_part, others) if name == '9' else found
+        found = estimate(start_of(form.norm, others.reading), others)
+        return _in_sensing_axes(found.model.linear_part, others) if form.sensing_axes else found
 
+    form = MODELS[name]
     if len(kept) == len(distinct):
         return ()
     found = rivals(fit, np.searchsorted(distinct, kept), poses_g.take(distinct), refit)
@@ -272,21 +273,23 @@ def _dilutions(model: str, directions: Floats, noise: Floats | None) -> dict[str
 
 def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
     """Fit a model without the outliers; model 9 in its own axes."""
+    form = MODELS[name]
     try:
-        fit, kept = fit_norm('10' if name == '9' else name, poses_g)
+        fit, kept = fit_norm(form.norm, poses_g)
     except NotConvergedError:
         raise RefusedFitError(
             f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
             f'{TAKE_ALL_SIDES}, and hold it still in each') from None
-    return (_in_sensing_axes(fit.model.linear_part, poses_g.take(kept)) if name == '9' else fit,
-            kept)
+    if form.sensing_axes:
+        fit = _in_sensing_axes(fit.model.linear_part, poses_g.take(kept))
+    return fit, kept
 
 
 def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
     """Return model 9 at these poses, from W in any axes, and V."""
     mat_w, vec_v = linear_part
     turned = with_linear_part(lower_triangular(mat_w), vec_v).values
-    model = Model({name: turned.get(name, np.zeros(3)) for name in MODELS['9']})
+    model = Model({name: turned.get(name, np.zeros(3)) for name in MODELS['9'].effects})
     return judge(model, poses_g, TIES)
 
 
@@ -298,14 +301,14 @@ def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     if not np.all(np.isfinite(mat_w)):
         raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
                               TAKE_ALL_SIDES)
-    if name == '9':
+    if MODELS[name].sensing_axes:
         return _in_sensing_axes(_of_the_report(mat_w, vec_v, poses_g), poses_g)
     return judge(start_of(name, poses_g.reading), poses_g)
 
 
 def _of_the_report(mat_w: Floats, vec_v: Floats, poses_g: Poses) -> tuple[Floats, Floats]:
     """Return the W and V that minimise the sum of (|a| - g)², eq. 17 of the ESGI'95 report."""
-    effects = MODELS['10']
+    effects = MODELS['10'].effects
 
     def point_at(values: Floats) -> Point:
         model = with_vector(effects, values)

@@ -18,8 +18,8 @@ import numpy as np
 
 from .parameters import Scatter, scatter_of
 from ..calibrate import Calibration, fit_unknown
-from ..effects import MODELS
 from ..errors import InputError, RefusedFitError
+from ..estimate import NORM_MODELS
 from ..text import counted
 
 _LARGER = {'4': ('7', '10'), '7': ('10',)}
@@ -124,14 +124,14 @@ def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibratio
         Each run, or a fit of the largest model to its poses if they determine it.
 
     """
-    names = {'10' if run.name in ('9', '12') else run.name for run in calibrations}
-    largest = next((name for name in ('10', '7', '4') if name in names), '')
+    names = {run.form.norm for run in calibrations}
+    largest = next((name for name in reversed(NORM_MODELS) if name in names), '')
     return tuple(_fitted_with(largest, run) for run in calibrations)
 
 
 def _fitted_with(name: str, run: Calibration) -> Calibration:
     """Return a fit of a larger model to the poses of a run, or the run if that is not possible."""
-    if name not in _LARGER.get(run.name, ()) or run.model.effects != MODELS[run.name]:
+    if name not in _LARGER.get(run.name, ()) or run.model.effects != run.form.effects:
         return run
     try:
         return fit_unknown(run.used_poses, run.units, name, 'ml')

@@ -384,7 +384,7 @@ def _kind(found: Change) -> str:
     """Return a text about what changed, if the orientations of the rests show it."""
     if not found.clear:
         return ''
-    if found.kind == 'gain':
+    if len(found.shift) == 1:  # the gain
         return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
     x, y, z = found.shift * MG
     return f'; the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'

@@ -282,7 +282,7 @@ def _fit_of(calibration: Calibration) -> Fit:
     model = Model(calibration.model.values)
     poses_g = with_history(in_g(calibration.poses, calibration.units), model)
     poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
-    if calibration.name != '12':
+    if not calibration.form.known_orientation:
         poses_g = Poses({key: values for key, values in poses_g.columns.items()
                          if key != 'reference'}, poses_g.row)
     return judge(model, poses_g, np.eye(len(model.vector)))

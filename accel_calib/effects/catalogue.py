@@ -204,11 +204,11 @@ EFFECTS: dict[str, Effect] = {
     'gain': Effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
                    0.5, ALL_AXES, repeatable_g=0.015),
     'axis_gain': Effect('gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
-                        0.5, by_axis(FORCE), repeatable_g=0.015),
+                        0.5, by_axis(FORCE), includes=('gain',), repeatable_g=0.015),
     'cross_axis': Effect('cross-axis gain, symmetric', 'cross-axis sensitivity',
                          ('xy', 'xz', 'yz'), 'g/g', 0.02, 0.5, CROSS, repeatable_g=0.015),
     'misalignment': Effect('rotation of the sensing axes', 'input-axis misalignment', AXES, 'g/g',
-                           0.02, np.inf, _ROTATION),
+                           0.02, np.inf, _ROTATION, known_orientation=True),
     'quadratic': _bending('square of the force', 'second-order coefficient K2', AXES, 'g/g²',
                           0.001, terms=by_axis(SQUARE)),
     'cubic': _bending('cube of the force', 'third-order coefficient K3', AXES, 'g/g³', 0.001,
@@ -284,7 +284,9 @@ PROCESSES: dict[str, Effect] = {
 
 CHANGES: dict[str, Effect] = {
     f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
-                              factor=lambda context, shape: context['new'], needs=('new',))
+                              factor=lambda context, shape: context['new'], needs=('new',),
+                              includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
+                              base=name)
     for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
 """Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
@@ -330,6 +332,14 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
 
 
+def curve_pairs() -> Iterator[tuple[str, str]]:
+    """Yield the carriers and variables of empirical curves."""
+    for variable in VARIABLES:
+        for carrier in CARRIERS:
+            if variable != 'force' or carrier == 'offset':
+                yield carrier, variable
+
+
 def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
     """Return carrier, variable and modes of an empirical curve; `KeyError` for another name."""
     first, *rest = name.split('-')
@@ -337,8 +347,7 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
         raise KeyError(name)
     modes = tuple(int(part) for part in rest[2:])
     whole, dot, part = rest[0].partition('.')
-    if (whole not in CARRIERS or (dot and part not in CARRIERS[whole])
-            or rest[1] not in VARIABLES or (rest[1] == 'force' and whole != 'offset')
+    if ((whole, rest[1]) not in curve_pairs() or (dot and part not in CARRIERS[whole])
             or list(modes) != sorted(set(modes)) or not 1 <= modes[0] <= modes[-1] <= MODES):
         raise KeyError(name)
     return rest[0], rest[1], modes
@@ -406,6 +415,11 @@ def effect_named(name: str) -> Effect:
     """Return the effect with this name: from the catalogue, or an empirical curve."""
     found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
     return found or empirical(name)
+
+
+def included(names: Iterable[str]) -> set[str]:
+    """Return the names of the effects that these effects contain."""
+    return {each for name in names for each in effect_named(name).includes}
 
 
 _IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')

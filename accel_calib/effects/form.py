@@ -175,6 +175,12 @@ class Effect:
         empty for other effects.
     family : {'', 'force', 'time'}
         Group of effects that can be confused with this one.
+    includes : tuple of str
+        Names of the effects that this one contains. A model has either this effect or those.
+    base : str
+        Name of the effect that changes, for an effect of `CHANGES`; empty for other effects.
+    known_orientation : bool
+        Whether only poses of known orientation show the effect.
     repeatable_g : float
         Largest change between calibrations of one sensor [g]. A larger change indicates another
         sensor.
@@ -199,6 +205,9 @@ class Effect:
     over: tuple[str, ...] = ()
     lagged: str = ''
     family: Family = ''
+    includes: tuple[str, ...] = ()
+    base: str = ''
+    known_orientation: bool = False
     repeatable_g: float = np.inf
     output: Callable[[Floats, Floats], Floats] | None = None
 
@@ -211,6 +220,11 @@ class Effect:
     def linear(self) -> bool:
         """Whether the effect is part of V and W in every context."""
         return self.factor is None and self.output is None and not self.bends
+
+    @property
+    def is_offset(self) -> bool:
+        """Whether the effect is a part of V in every context."""
+        return self.linear and all(term.monomial == ONE for term in self.terms)
 
     @property
     def bends(self) -> bool:

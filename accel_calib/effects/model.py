@@ -30,15 +30,50 @@ from ..errors import InputError
 from ..geometry import unit
 from ..table import COLUMNS, Floats
 
-MODELS: dict[str, tuple[str, ...]] = {
-    'ideal': (),
-    '4': ('offset', 'gain'),
-    '7': ('offset', 'axis_gain'),
-    '9': ('offset', 'axis_gain', 'cross_axis', 'misalignment'),
-    '10': ('offset', 'axis_gain', 'cross_axis'),
-    '12': ('offset', 'axis_gain', 'cross_axis', 'misalignment'),
+
+@dataclass(frozen=True)
+class ModelForm:
+    """
+    One of the models that consist of offset and gains.
+
+    Parameters
+    ----------
+    effects : tuple of str
+        Names of its effects.
+    gains : int
+        Number of parameters of W, apart from a rotation.
+    norm : str
+        Model with the same ellipsoid that |force| = 1 g alone determines.
+    known_orientation : bool
+        Whether it needs poses of known orientation, and then determines the axes of W.
+    sensing_axes : bool
+        Whether its axes are fixed to the sensing axes.
+
+    """
+
+    effects: tuple[str, ...]
+    gains: int
+    norm: str
+    known_orientation: bool = False
+    sensing_axes: bool = False
+
+    @property
+    def largest(self) -> str:
+        """Name of the largest model for poses of the same kind."""
+        return '12' if self.known_orientation else '10'
+
+
+_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
+
+MODELS: dict[str, ModelForm] = {
+    'ideal': ModelForm((), 0, 'ideal'),
+    '4': ModelForm(('offset', 'gain'), 1, '4'),
+    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
+    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
+    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
+    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
 }
-"""Effects of each model. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
+"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
 sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
 
 LARGEST_ITERATIONS = 100
@@ -379,12 +414,18 @@ def with_linear_part(mat_w: Floats, vec_v: Floats, rotation: Floats | None = Non
         ΔR.
 
     """
+    values = linear_values(mat_w, vec_v)
+    kept = [*MODELS['10'].effects, *(['misalignment'] if np.any(values['misalignment']) else [])]
+    return Model({name: values[name] for name in kept},
+                 _IDENTITY if rotation is None else rotation)
+
+
+def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
+    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
     symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
-    values = {'offset': np.array(vec_v, float), 'axis_gain': np.diag(mat_w) - 1.0,
-              'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]]}
-    if np.any(skew):
-        values['misalignment'] = skew[[2, 0, 1], [1, 2, 0]]
-    return Model(values, np.eye(3) if rotation is None else rotation)
+    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
+            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
+            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}
 
 
 def check_context(model: Model, context: Mapping[str, Any]) -> None:

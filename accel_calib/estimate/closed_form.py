@@ -255,8 +255,8 @@ def along_quadrics(values: Floats, step: Floats) -> Floats:
 
 def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
     """Return W and V after a step; arguments as in `along_quadrics`."""
-    mat_w, vec_v = with_vector(MODELS['10'], values).linear_part
-    turned, step_v = with_vector(MODELS['10'], step).linear_part
+    mat_w, vec_v = with_vector(MODELS['10'].effects, values).linear_part
+    turned, step_v = with_vector(MODELS['10'].effects, step).linear_part
     step_w = turned - _IDENTITY
     mat_a = np.linalg.inv(mat_w @ mat_w)
     step_a = -mat_a @ (step_w @ mat_w + mat_w @ step_w) @ mat_a
@@ -291,9 +291,10 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
         W, in the unit of the readings per g, and V; NaN for a set that is not on an ellipsoid.
 
     """
-    if name == '4':
+    gains = MODELS[name].gains
+    if gains == 1:
         return fit_sphere(reading)
-    return quadric(reading, DIAGONAL if name == '7' else SYMMETRIC)
+    return quadric(reading, DIAGONAL if gains == 3 else SYMMETRIC)
 
 
 def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
@@ -374,7 +375,7 @@ def faces(reading: Floats) -> Floats | None:
 
 def _ties() -> Floats:
     """Return the (12, 9) matrix from offset and lower triangle of W to the values of the model."""
-    names = parameter_names(MODELS['9'])
+    names = parameter_names(MODELS['9'].effects)
     ties = np.zeros((len(names), 9))
     for k in range(6):  # offset and axis_gain
         ties[k, k] = 1.0

@@ -56,7 +56,7 @@ sphere have a larger dilution; with a limit of 40, some of them would pass
 WEAK_DILUTION = 10.0
 """Above this dilution a fit warns: the error of |force| is up to ten times that of a pose."""
 
-NORM_MODELS = ('4', '7', '10')
+NORM_MODELS = tuple(name for name, form in MODELS.items() if form.norm == name and form.gains)
 """Models for poses of unknown orientation; the smallest model is first."""
 
 _NEAR = np.cos(np.radians(45.0))
@@ -67,7 +67,8 @@ _SINGULAR, _NOTHING = 1e-6, 1e-14
 
 def effects_of(name: str) -> tuple[str, ...]:
     """Return the effects of a model; model 9 is model 10 in other axes."""
-    return MODELS['10' if name == '9' else name]
+    form = MODELS[name]
+    return MODELS[form.norm].effects if form.sensing_axes else form.effects
 
 
 def parameters_of(name: str) -> tuple[str, ...]:
@@ -83,7 +84,7 @@ def _no_errors(name: str) -> Model:
 def rows_of(name: str, directions: Floats) -> Floats:
     """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
     basis = _no_errors(name).basis(directions, {})
-    return basis.full if name == '12' else basis.along(directions)[:, np.newaxis]
+    return basis.full if MODELS[name].known_orientation else basis.along(directions)[:, np.newaxis]
 
 
 def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
@@ -124,7 +125,8 @@ def free_parameters(name: str) -> int:
 
 def poses_needed(name: str) -> int:
     """Return the smallest number of poses that can determine a model."""
-    return 4 if name == '12' else free_parameters(name)
+    rows = 3 if MODELS[name].known_orientation else 1
+    return free_parameters(name) // rows
 
 
 def _weighted_rows(name: str, directions: Floats, noise: Floats | None) -> Floats:

@@ -43,7 +43,7 @@ from .closed_form import closed_form
 from .equations import belief_in, noise_of
 from .fit import ByPose, estimate, Fit, judge
 from .least_squares import NotConvergedError
-from ..effects import Model, MODELS, parameter_names, with_linear_part
+from ..effects import linear_values, Model, MODELS, parameter_names
 from ..table import Floats, Poses
 
 LEVEL = 0.007
@@ -350,10 +350,8 @@ def start_of(name: str, reading: Floats) -> Model:
     mat_w, vec_v = closed_form(name, reading)
     if not np.all(np.isfinite(mat_w)):
         mat_w, vec_v = closed_form('4', reading)
-    values = with_linear_part(mat_w, vec_v).values
-    if name == '4':
-        values = {**values, 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0])}
-    return Model({effect: values[effect] for effect in MODELS[name]})
+    values = linear_values(mat_w, vec_v)
+    return Model({effect: values[effect] for effect in MODELS[name].effects})
 
 
 def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.intp]:
@@ -417,7 +415,7 @@ def _most(name: str, count: int) -> int:
 
 
 def _free(name: str) -> int:
-    return len(parameter_names(MODELS[name]))
+    return len(parameter_names(MODELS[name].effects))
 
 
 def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool_]:

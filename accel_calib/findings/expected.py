@@ -58,8 +58,7 @@ class Expected:
     @cached_property
     def next_pose(self) -> NextPose:
         """Return the pose that improves the calibration most."""
-        name = '12' if self.calibration.name == '12' else '10'
-        return next_pose(self.directions, name, self.noise)
+        return next_pose(self.directions, self.calibration.form.largest, self.noise)
 
     @cached_property
     def dof(self) -> int:
@@ -67,14 +66,14 @@ class Expected:
         calibration = self.calibration
         rows = 3 if self.is_vector else 1
         count = len(np.unique(self.poses.reading, axis=0)) * rows
-        free = (free_parameters('9') if calibration.name == '9'
+        free = (free_parameters(calibration.name) if calibration.form.sensing_axes
                 else int(np.count_nonzero(np.diag(calibration.covariance))))
         return max(count - free, 0)
 
     @property
     def is_vector(self) -> bool:
         """Whether the errors are those of the force as a vector, not of its length."""
-        return self.calibration.name == '12' and 'reference' in self.poses
+        return self.calibration.form.known_orientation and 'reference' in self.poses
 
     @cached_property
     def is_partial(self) -> bool:
@@ -110,7 +109,7 @@ class Expected:
     def omits(self) -> str:
         """Return the name of the smaller model if values that every sensor has are omitted."""
         effects = [name for name in self.calibration.model.effects if name in LADDER]
-        return next((name for name in ('4', '7') if set(MODELS[name]) == set(effects)), '')
+        return next((name for name in ('4', '7') if set(MODELS[name].effects) == set(effects)), '')
 
     @cached_property
     def omitted_mg(self) -> float:

@@ -81,7 +81,7 @@ _DOF = 4.0
 
 _STEPS = 200
 _CONVERGED = 1e-8
-_NAMES = parameter_names(MODELS['10'])
+_NAMES = parameter_names(MODELS['10'].effects)
 _LEAST_SPREAD_G = 1e-5
 """Smallest spread over sensors [g], far below that of any sensors."""
 

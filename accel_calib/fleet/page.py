@@ -158,7 +158,7 @@ def _typical(fleet: FleetPrior) -> str:
     """Return a table of the typical values and spreads."""
     spread = np.sqrt(np.diag(fleet.prior.covariance))
     rows = []
-    for name, mean, sd in zip(parameter_names(MODELS['10']), fleet.prior.mean, spread,
+    for name, mean, sd in zip(parameter_names(MODELS['10'].effects), fleet.prior.mean, spread,
                               strict=True):
         _, factor, unit = scale_of(name)
         rows.append((name.replace('.', ' ').replace('_', ' '), short(mean * factor),

@@ -252,7 +252,7 @@ def _for_prior(intake: Intake, found: Calibration) -> Row:
     """Return values and covariance of model 10, if the poses determine it."""
     if intake.units.is_native:
         return {}
-    if found.model.effects != MODELS[_WHOLE_MODEL]:
+    if found.model.effects != MODELS[_WHOLE_MODEL].effects:
         try:
             found = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
         except RefusedFitError:

@@ -29,7 +29,7 @@ from .records import LogOptions
 from .selection import Chosen
 from ..errors import InputError
 from ..table import Floats
-from ..units import STANDARD_GRAVITY, UnitName
+from ..units import DEFAULT_UNIT, is_native, known_per_g, STANDARD_GRAVITY, UnitName
 
 _WINDOWS = 400
 """Largest number of windows of a recording."""
@@ -174,7 +174,6 @@ def _radius(still: Floats) -> float:
 _STATED_FACTOR = 2.0
 """Largest factor between the readings at rest and 1 g in a stated unit."""
 
-_PER_G: dict[str, float] = {'m/s2': STANDARD_GRAVITY, 'g': 1.0}
 _THOUSANDS = 1000.0
 
 
@@ -238,7 +237,7 @@ def unit_of_reading(columns: Chosen, raw: Floats, options: LogOptions, *, sample
         _check_named(columns, rests, name)
     own = [columns.sources[each].name for each in READING] == list(READING)
     words = _words(columns, rests, name, factor, stated=bool(stated))
-    assumed = not own or (not stated and name != 'm/s2')
+    assumed = not own or (not stated and name != DEFAULT_UNIT)
     return ReadingUnit(cast(UnitName, name), factor, words, assumed)
 
 
@@ -265,8 +264,7 @@ def _stated(columns: Chosen, options: LogOptions) -> UnitName | str:
 
 def _check_gravity(columns: Chosen, rests: Rests, name: str, gravity: float) -> None:
     """Check that gravity is in the readings."""
-    if name == 'native' or not rests.lack_gravity(gravity if name == 'm/s2' else
-                                                  _PER_G.get(name)):
+    if is_native(name) or not rests.lack_gravity(known_per_g(name, gravity)):
         return
     layout = columns.layout
     instead = formats.record_instead(layout.header, layout.path)
@@ -286,8 +284,8 @@ def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName | str, float]:
 
 def _check_named(columns: Chosen, rests: Rests, name: str) -> None:
     """Check that the readings at rest fit the unit in the names."""
-    if name == 'native' or (1.0 / _STATED_FACTOR <= rests.length / _PER_G[name]
-                            <= _STATED_FACTOR):
+    per_g = known_per_g(name)
+    if per_g is None or 1.0 / _STATED_FACTOR <= rests.length / per_g <= _STATED_FACTOR:
         return
     likely = rests.unit
     advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
@@ -297,14 +295,14 @@ def _check_named(columns: Chosen, rests: Rests, name: str) -> None:
             f'the name {columns.sources["ax"].name!r}')
     raise InputError(f'{columns.layout.path}: {what} states readings in {name}, but at rest they '
                      f'have a length of {rests.length:.4g} {name}, expected about '
-                     f'{_PER_G[name]:.4g}', advice)
+                     f'{per_g:.4g}', advice)
 
 
 def _words(columns: Chosen, rests: Rests, name: str, factor: float, *, stated: bool
            ) -> tuple[str, ...]:
     """Return how the readings are read."""
     words = compact([columns.sources[each].name for each in READING])
-    if name == 'native' and not stated:
+    if is_native(name) and not stated:
         value = f'{_size(rests.per_g)}{" counts" if rests.whole else ""}'
         about = 'at rest' if math.isnan(rests.radius) else '= 1 g'
         return words, f'{value} {about} (native)'

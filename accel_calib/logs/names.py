@@ -178,7 +178,7 @@ def is_unit(text: str) -> bool:
 
 def _parted(words: list[str]) -> list[str]:
     """Return words with axes parted from them, and with pairs of words joined."""
-    if words[:1] == ['g'] and words[1:] and words[1] in ('fx', 'fy', 'fz'):
+    if words[:2] in (['g', 'fx'], ['g', 'fy'], ['g', 'fz']):
         words = ['gf', words[1][1], *words[2:]]
     if not _AXES.keys() & set(words):
         words = [part for word in words for part in _FUSED.get(word, (word,))]

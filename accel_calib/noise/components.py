@@ -34,7 +34,7 @@ from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from .curve import Counts, shares, Spread
-from ..units import Floats, STANDARD_GRAVITY
+from ..units import Floats, is_native, STANDARD_GRAVITY
 
 COMPONENTS = ('quantisation', 'noise_density', 'bias_instability', 'random_walk', 'drift')
 
@@ -435,6 +435,6 @@ class NoiseFigures:
 
 def shown_unit(kind: str, figure: str, unit: str) -> tuple[str, float]:
     """Return the unit of a figure for people, and the factor from the unit of the figure."""
-    if unit == 'native':
+    if is_native(unit):
         return _NATIVE[figure], 1.0
     return _SHOWN[kind, figure]

@@ -47,7 +47,7 @@ from .curve import (
 )
 from .rest import longest_rest, Rest
 from ..table import Floats, Recording
-from ..units import STANDARD_GRAVITY, Units
+from ..units import is_native, STANDARD_GRAVITY, Units
 
 _INSTABILITY_S = 40.0 * 60.0
 """Shortest rest that shows the bias instability of common parts [s]: 100 times τ = 24 s."""
@@ -405,7 +405,7 @@ def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]
     """Return one figure of one sensor for JSON."""
     axes = {axis.axis: axis.figures[figure] for axis in found.of(kind)}
     every = [axes.get(axis) for axis in 'xyz'] if axes else []
-    native = any(axis.unit == 'native' for axis in found.of(kind))
+    native = any(is_native(axis.unit) for axis in found.of(kind))
     value, sd = (None, None) if native else found.common(kind, figure)
     reason = found.needs.get((kind, figure))
     if native:

@@ -378,7 +378,7 @@ def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rej
         poses = with_stored(given.poses, base)
     elif given.joint:
         kept = kept.take(kept['new'] > 0.0)
-    if base.name != '12':
+    if not base.form.known_orientation:
         kept = Poses({key: values for key, values in kept.columns.items()
                       if key not in ('reference', 'orientation')}, kept.row)
     at_poses = judge(model, kept)

@@ -86,7 +86,7 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
         return _without_search(fitted, err.message, err.advice)
     if found.refusal:
         return _without_search(fitted, *found.refusal)
-    if found.calibration.model.effects == MODELS[_BASE]:
+    if found.calibration.model.effects == MODELS[_BASE].effects:
         return _with(found, fitted)
     return _with(found, _combined(found.calibration, found.poses_g, fleet))
 

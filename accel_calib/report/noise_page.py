@@ -24,6 +24,7 @@ from .. import __version__
 from ..disk import write_atomically
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
 from ..text import with_sd
+from ..units import is_native
 
 _COLOURS = {'x': AFTER, 'y': ACCENT, 'z': THIRD}
 _HEIGHT_INCHES = 4.0
@@ -175,7 +176,7 @@ def kalibr_lines(found: NoiseFigures) -> list[str]:
     lines = []
     for (kind, figure), unit in _KALIBR.items():
         value, sd = found.common(kind, figure)
-        if np.isfinite(value) and found.of(kind)[0].unit != 'native':
+        if np.isfinite(value) and not is_native(found.of(kind)[0].unit):
             lines.append(f'{kind}_{figure}: {_scientific(value, sd)} {unit}')
     return [*lines, f'update_rate: {found.rate:.6g} Hz'] if lines else []
 

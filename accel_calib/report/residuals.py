@@ -214,7 +214,7 @@ def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residu
     out = np.isin(own.row, list(reasons))
     kept = poses_g.take(~out)
     force = sensor_force(model, poses_g.reading, poses_g.columns)
-    vectors = calibration.name == '12' and 'reference' in own
+    vectors = calibration.form.known_orientation and 'reference' in own
     before = errors_before(kept, units, vectors=vectors)
     after = errors_after(model, kept, vectors=vectors)
     return Residuals(kept, unit(force[~out]), before * MG, after * MG, own.take(out),

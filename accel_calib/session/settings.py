@@ -21,8 +21,9 @@ from typing import Any, TYPE_CHECKING, TypeVar
 
 from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
 from ..capture import CaptureSettings, REPEATED, Repeated
+from ..effects import MODELS
 from ..errors import InputError
-from ..units import STANDARD_GRAVITY, UNIT_NAMES, UnitName
+from ..units import is_native, STANDARD_GRAVITY, UNIT_NAMES, UnitName
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -121,7 +122,8 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
     return replace(settings, **given)
 
 
-_MODELS = tuple(name for name in MODEL_NAMES if name != '12')  # needs known orientations
+_MODELS = tuple(name for name in MODEL_NAMES
+                if name not in MODELS or not MODELS[name].known_orientation)
 _CAPTURE = CaptureSettings()
 
 
@@ -221,7 +223,7 @@ def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
     try:
         return CaptureSettings(
             settings.still_window,
-            std_max if settings.units == 'native' else std_max / settings.gravity,
+            std_max if is_native(settings.units) else std_max / settings.gravity,
             settings.still_gyro_max, settings.still_norm_tolerance, settings.min_dwell,
             settings.max_dwell or math.inf, settings.min_pose_angle, settings.repeated)
     except ValueError as error:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..refine import PosePlan
 
 _FORMAT = 1
-_NAMES = parameter_names(MODELS['10'])
+_NAMES = parameter_names(MODELS['10'].effects)
 
 _CONTEXT = {'temperature': ('temperature', 1.0), 'supply_voltage': ('supply_voltage', 1.0),
             'std': ('vibration', STANDARD_GRAVITY), 'time': ('wait', 1.0)}
