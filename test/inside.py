@@ -66,7 +66,7 @@ from accel_calib.effects import (
     with_linear_part,
     with_vector,
 )
-from accel_calib.effects.terms import terms_of
+from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import distinct, kinds, noise_of, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations

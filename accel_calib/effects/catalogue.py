@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The catalogue: one entry for each effect with a known cause.
+The catalogue: one entry for each effect with a known cause, and curves without one.
 
 Factors are functions of the context and of the shape of the effect. Shape searches yield the
-shapes that the search tries.
-
-Empirical curves are effects without a known cause, made from their name: a part of the reading,
-the carrier, changes smoothly with a variable. `empirical_name` has the equation.
+shapes that the search tries. An empirical curve is an effect without a known cause, made from its
+name: a part of the reading, the carrier, changes smoothly with a variable (`empirical_name`).
 
 """
 
@@ -68,7 +66,7 @@ _LEAST_SIDE = 5
 
 
 def _times(context: Context) -> Floats:
-    """Return the known times of the poses, sorted; unknown times are NaN."""
+    """Return the known times of the poses, sorted."""
     time: Floats = np.sort(context['time'])
     return time[np.isfinite(time)]
 
@@ -315,18 +313,9 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     """
     Return the name of an empirical curve.
 
-    A part of the reading, the carrier, changes with a variable by Σ_k c_k cos(k π s), where s runs
-    from 0 to 1 over the range of the variable in the poses. Outside of this range, the curve is
-    constant.
-
-    Parameters
-    ----------
-    carrier : str
-        One of `CARRIERS`, or one part of it.
-    variable : str
-        One of `VARIABLES`.
-    modes : iterable of int
-        The k of the cosines, 1 to `MODES`.
+    The carrier, one of `CARRIERS` or one part of it, changes with the variable, one of
+    `VARIABLES`, by Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the
+    range of the variable in the poses. Outside of this range, the curve is constant.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
@@ -415,6 +404,11 @@ def effect_named(name: str) -> Effect:
     """Return the effect with this name: from the catalogue, or an empirical curve."""
     found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
     return found or empirical(name)
+
+
+def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
+    return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
 
 
 def included(names: Iterable[str]) -> set[str]:

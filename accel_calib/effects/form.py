@@ -4,8 +4,8 @@
 """
 The form of an effect: terms, each the product of a factor of the context and a monomial.
 
-Monomials are functions of the components of the force. A term adds parameter · factor · weight ·
-monomial to one axis of the reading.
+A term adds parameter · factor · weight · monomial to one axis of the reading. Monomials are
+functions of the components of the force.
 
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -39,24 +40,13 @@ TO_SEPARATE: dict[Family, str] = {
 
 
 class Monomial(NamedTuple):
-    """
-    A function of the components of the force, for floats and for arrays.
-
-    Parameters
-    ----------
-    value : callable
-        x, y, z -> value.
-    gradient : callable
-        x, y, z -> derivatives by x, y and z.
-
-    """
+    """A function of x, y, z and its derivatives by them, for floats and for arrays."""
 
     value: Callable[[Any, Any, Any], Any]
     gradient: Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 
 
 def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
-    """Return the monomial that is a function of one component of the force."""
     return (Monomial(lambda x, y, z: value(x), lambda x, y, z: (slope(x), 0.0, 0.0)),
             Monomial(lambda x, y, z: value(y), lambda x, y, z: (0.0, slope(y), 0.0)),
             Monomial(lambda x, y, z: value(z), lambda x, y, z: (0.0, 0.0, slope(z))))[axis]
@@ -102,21 +92,7 @@ PRODUCTS = {(0, 1): PRODUCT, (0, 2): PRODUCT + 1, (1, 2): PRODUCT + 2}
 
 
 class Term(NamedTuple):
-    """
-    One term of an effect.
-
-    Parameters
-    ----------
-    parameter : int
-        Index of the parameter that the term is proportional to.
-    axis : int
-        Axis of the reading that the term is added to.
-    monomial : int
-        Index in `MONOMIALS`.
-    weight : float
-        Constant factor.
-
-    """
+    """One term of an effect: indices of its parameter, axis and monomial; constant factor."""
 
     parameter: int
     axis: int
@@ -125,12 +101,7 @@ class Term(NamedTuple):
 
 
 Factor = Callable[[Mapping[str, Any], Floats], Any]
-"""
-Context, shape -> factor of all terms, (n,), or of each term, (t, n).
-
-For one row of context the axis n is missing.
-
-"""
+"""Context, shape -> factor of all terms, (n,), or of each term, (t, n); one row has no axis n."""
 
 Shapes = Callable[[Context], Iterator[Floats]]
 """Context of the poses -> shapes to try."""
@@ -166,13 +137,12 @@ class Effect:
     shapes : callable or None
         Shapes that the search tries; None for an effect without shape.
     usual : tuple of float
-        Shape where a file or a command does not state it; empty: the shape must be stated. The
-        effect is then the plain one, and the search tries this shape first.
+        Shape where a file or a command does not state it, and the first that the search tries;
+        empty: the shape must be stated.
     over : tuple of str
         Columns that the factor is a function of; empty: those in `needs`.
     lagged : str
-        Column of the temperature that acts, for an effect with the shape ``lag``, ``of_sensor``;
-        empty for other effects.
+        Column of the temperature that acts, for the shape ``lag``, ``of_sensor``; else empty.
     family : {'', 'force', 'time'}
         Group of effects that can be confused with this one.
     includes : tuple of str
@@ -182,11 +152,10 @@ class Effect:
     known_orientation : bool
         Whether only poses of known orientation show the effect.
     repeatable_g : float
-        Largest change between calibrations of one sensor [g]. A larger change indicates another
-        sensor.
+        Largest change between calibrations of one sensor [g]; a larger one: another sensor.
     output : callable or None
-        (n, 3) readings, (p,) values -> (n, 3) readings, for an effect on the whole reading. Such
-        an effect cannot be corrected.
+        (n, 3) readings, (p,) values -> (n, 3) readings, for an effect on the whole reading, which
+        cannot be corrected.
 
     """
 
@@ -211,22 +180,22 @@ class Effect:
     repeatable_g: float = np.inf
     output: Callable[[Floats, Floats], Floats] | None = None
 
-    @property
+    @cached_property
     def values(self) -> tuple[str, ...]:
         """Names of all values: parameters, then shape."""
         return self.parameters + self.shape
 
-    @property
+    @cached_property
     def linear(self) -> bool:
         """Whether the effect is part of V and W in every context."""
         return self.factor is None and self.output is None and not self.bends
 
-    @property
+    @cached_property
     def is_offset(self) -> bool:
         """Whether the effect is a part of V in every context."""
         return self.linear and all(term.monomial == ONE for term in self.terms)
 
-    @property
+    @cached_property
     def bends(self) -> bool:
         """Whether the effect is not affine in the force."""
         return any(term.monomial >= AFFINE for term in self.terms)
@@ -258,6 +227,36 @@ class Effect:
     def over_of(self, shape: Floats) -> tuple[str, ...]:
         """Return the columns that the factor is a function of with this shape."""
         return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
+
+
+FITTED_SHAPES = ('tau', 'lag')
+"""Shape constants that a fit changes, unless they have their usual value; the others are found
+once from the data."""
+
+_SHAPE_STEP = 1e-4
+"""Relative step of the numerical derivative by a shape constant; all others are analytic."""
+
+
+def difference(factor: Factor, context: Context, shape: Floats, place: int) -> Floats:
+    """Return the numerical derivative of a factor by one shape constant."""
+    step = np.zeros(len(shape))
+    step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
+    change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
+        2.0 * step[place])
+    return change
+
+
+def fitted_places(effect: Effect, shape: Floats) -> list[int]:
+    """
+    Return the indices of the shape constants that a fit changes.
+
+    A constant at its usual value, such as a lag of 0, is not fitted: the effect stays the plain
+    one.
+
+    """
+    usual = dict(enumerate(effect.usual))
+    return [place for place, name in enumerate(effect.shape)
+            if name in FITTED_SHAPES and usual.get(place) != shape[place]]
 
 
 def by_axis(first: int) -> tuple[Term, ...]:

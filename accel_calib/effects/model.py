@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A model is a list of effects with their values; `correct` is the inverse of `predict`.
+A model is a list of effects with their values.
 
 With the context fixed, the terms of all effects sum to an offset, a gain and bending terms:
 
@@ -15,66 +15,19 @@ With the context fixed, the terms of all effects sum to an offset, a gain and be
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import Context, Effect, effect_named, EFFECTS, is_effect, PROCESSES
-from .terms import Basis, sums, Terms, terms_of
+from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
+from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
 from .thermal import Lag
 from ..errors import InputError
-from ..geometry import unit
 from ..table import COLUMNS, Floats
-
-
-@dataclass(frozen=True)
-class ModelForm:
-    """
-    One of the models that consist of offset and gains.
-
-    Parameters
-    ----------
-    effects : tuple of str
-        Names of its effects.
-    gains : int
-        Number of parameters of W, apart from a rotation.
-    norm : str
-        Model with the same ellipsoid that |force| = 1 g alone determines.
-    known_orientation : bool
-        Whether it needs poses of known orientation, and then determines the axes of W.
-    sensing_axes : bool
-        Whether its axes are fixed to the sensing axes.
-
-    """
-
-    effects: tuple[str, ...]
-    gains: int
-    norm: str
-    known_orientation: bool = False
-    sensing_axes: bool = False
-
-    @property
-    def largest(self) -> str:
-        """Name of the largest model for poses of the same kind."""
-        return '12' if self.known_orientation else '10'
-
-
-_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
-
-MODELS: dict[str, ModelForm] = {
-    'ideal': ModelForm((), 0, 'ideal'),
-    '4': ModelForm(('offset', 'gain'), 1, '4'),
-    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
-    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
-    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
-    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
-}
-"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
-sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
@@ -83,19 +36,157 @@ CONVERGED_G = 1e-13
 LARGEST_FORCE_G = 1e6
 """The iteration has diverged when u is larger than this [g]."""
 
-FITTED_SHAPES = ('tau', 'lag')
-"""Shape constants that a fit changes, unless they have their usual value; the others are found
-once from the data."""
-
-_SHAPE_STEP = 1e-4
-"""Relative step of the numerical derivative by a shape constant; all others are analytic."""
-
-
 _IDENTITY = np.eye(3)
 
+Indices = NDArray[np.intp]
 
-def _identity() -> Floats:
-    return np.eye(3)
+
+@dataclass(frozen=True)
+class Terms:
+    """
+    The t terms of a list of effects as arrays, so that a model adds all of them at once.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        The effects.
+    parts : tuple of slice
+        Values of each effect among all p values.
+    monomials : tuple of int
+        Indices in `MONOMIALS` that the terms use.
+    place : (t,) array of int
+        Index of the term's monomial in `monomials`.
+    axis, value : (t,) array of int
+        Axis of the reading; index of the parameter among all p values.
+    weight : (t,) array
+        Constant factor.
+
+    """
+
+    effects: tuple[Effect, ...]
+    parts: tuple[slice, ...]
+    monomials: tuple[int, ...]
+    place: Indices
+    axis: Indices
+    value: Indices
+    weight: Floats
+
+    @cached_property
+    def size(self) -> int:
+        """p, the number of values."""
+        return self.parts[-1].stop if self.parts else 0
+
+    @cached_property
+    def to_affine(self) -> Floats:
+        """(12, t) array that sums the affine terms into V and, row by row, W - I."""
+        monomial = np.array(self.monomials, np.intp)[self.place]
+        slot = np.where(monomial == ONE, self.axis, 3 + 3 * self.axis + monomial - FORCE)
+        return _sums(np.where(monomial < AFFINE, slot, -1), 12)
+
+    @cached_property
+    def to_value(self) -> Floats:
+        """(p, t) array that sums terms by value."""
+        return _sums(self.value, self.size)
+
+    @cached_property
+    def bending(self) -> Indices:
+        """(b,) array, the terms that bend with the force."""
+        return np.flatnonzero(np.array(self.monomials, np.intp)[self.place] >= AFFINE)
+
+    @cached_property
+    def bends_to_axis(self) -> Floats:
+        """(3, b) array that sums the bending terms by axis."""
+        return _sums(self.axis[self.bending], 3)
+
+    @cached_property
+    def fixed(self) -> bool:
+        """Whether all terms are independent of the context."""
+        return all(effect.factor is None for effect in self.effects)
+
+    def factors(self, shapes: list[Floats], context: Mapping[str, Any], rows: tuple[int, ...]
+                ) -> Floats:
+        """Return the (t, *rows) factors of the terms; a factor is 0 where its context is NaN."""
+        found = np.ones((len(self.weight), *rows))
+        start = 0
+        for effect, shape in zip(self.effects, shapes, strict=True):
+            if effect.factor is not None:
+                found[start:start + len(effect.terms)] = effect.factor(context, shape)
+            start += len(effect.terms)
+        return np.nan_to_num(found, copy=False)
+
+    def monomials_at(self, u: Floats) -> Floats:
+        """Return the (m, n) monomials of (n, 3) forces."""
+        x, y, z = u.T
+        found = np.empty((len(self.monomials), len(u)))
+        for k, index in enumerate(self.monomials):
+            found[k] = MONOMIALS[index].value(x, y, z)
+        return found
+
+    def gradients_at(self, u: Floats) -> Floats:
+        """Return the (m, 3, n) derivatives of the monomials by the force."""
+        x, y, z = u.T
+        found = np.empty((len(self.monomials), 3, len(u)))
+        for k, index in enumerate(self.monomials):
+            for axis, part in enumerate(MONOMIALS[index].gradient(x, y, z)):
+                found[k, axis] = part
+        return found
+
+
+@lru_cache(maxsize=512)
+def terms_of(names: tuple[str, ...]) -> Terms:
+    """Return the terms of the effects of these names; ValueError for other names."""
+    for name in names:
+        if name in PROCESSES or not is_effect(name):
+            raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
+    effects = tuple(effect_named(name) for name in names)
+    used = sorted({term.monomial for effect in effects for term in effect.terms} | {ONE})
+    rows, parts, start = [], [], 0
+    for effect in effects:
+        rows += [(used.index(term.monomial), term.axis, start + term.parameter, term.weight)
+                 for term in effect.terms]
+        parts.append(slice(start, start + len(effect.values)))
+        start += len(effect.values)
+    place, axis, value, weight = np.array(rows, float).reshape(-1, 4).T
+    return Terms(effects, tuple(parts), tuple(used), place.astype(np.intp), axis.astype(np.intp),
+                 value.astype(np.intp), weight)
+
+
+def _sums(index: Indices, size: int) -> Floats:
+    """Return the (size, t) matrix that sums t numbers by their index."""
+    found: Floats = (index == np.arange(size)[:, np.newaxis]).astype(float)
+    return found
+
+
+@dataclass(frozen=True)
+class Basis:
+    """
+    Derivative of the reading by the values of a model, term by term.
+
+    Parameters
+    ----------
+    terms : (t, n) array
+        What each term adds to its axis per unit of its value.
+    axis : (t,) array of int
+        Axis of each term.
+    to_value : (p, t) array
+        Sums the terms by value.
+
+    """
+
+    terms: Floats
+    axis: Indices
+    to_value: Floats
+
+    @property
+    def full(self) -> Floats:
+        """(n, 3, p) array, the derivative."""
+        return np.stack([self.to_value[:, self.axis == axis] @ self.terms[self.axis == axis]
+                         for axis in range(3)]).T.swapaxes(1, 2)
+
+    def along(self, rows: Floats) -> Floats:
+        """Return the (n, p) product of the derivative with an (n, 3) row per pose."""
+        found: Floats = (self.to_value @ (self.terms * rows.T[self.axis])).T
+        return found
 
 
 @dataclass(frozen=True)
@@ -185,28 +276,33 @@ class Model:
     rotation : (3, 3) array
         ΔR, transforms from the levelled frame to the sensor axes.
 
+    Attributes
+    ----------
+    terms : Terms
+        Terms of the effects.
+
     """
 
     values: Mapping[str, Floats]
-    rotation: Floats = field(default_factory=_identity)
+    rotation: Floats = field(default_factory=_IDENTITY.copy)
+    terms: Terms = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        filled = {}
-        for name, values in self.values.items():
-            if name in PROCESSES or not is_effect(name):
-                raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
-            effect = effect_named(name)
-            filled[name] = effect.filled(values)
-            if np.shape(filled[name]) != (len(effect.values),):
+        terms, filled = terms_of(tuple(self.values)), {}
+        for part, effect, (name, values) in zip(terms.parts, terms.effects, self.values.items()):
+            expected = (part.stop - part.start,)
+            filled[name] = values if np.shape(values) == expected else effect.filled(values)
+            if np.shape(filled[name]) != expected:
                 raise ValueError(f'effect {name} has values of shape {np.shape(values)}, expected '
-                                 f'{len(effect.values)}')
+                                 f'{expected[0]}')
         object.__setattr__(self, 'values', filled)
+        object.__setattr__(self, 'terms', terms)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how to make the model again; its caches contain functions."""
+        """Return how to make the model again; its terms and caches contain functions."""
         return Model, (dict(self.values), self.rotation)
 
-    @property
+    @cached_property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
         return tuple(self.values)
@@ -217,17 +313,12 @@ class Model:
         return np.concatenate([np.zeros(0), *self.values.values()])
 
     @cached_property
-    def terms(self) -> Terms:
-        """Terms of the effects."""
-        return terms_of(self.effects)
-
-    @property
     def needs(self) -> tuple[str, ...]:
         """Keys of the context that the model needs."""
         return tuple(dict.fromkeys(key for effect, shape in self._by_effect
                                    for key in effect.needs_of(shape)))
 
-    @property
+    @cached_property
     def over(self) -> tuple[str, ...]:
         """Columns that the factors of the effects are functions of."""
         return tuple(dict.fromkeys(key for effect, shape in self._by_effect
@@ -249,59 +340,39 @@ class Model:
     @cached_property
     def fitted(self) -> NDArray[np.bool_]:
         """(p,) mask of the values that a fit changes."""
-        found = [np.zeros(0, bool)]
-        for effect, shape in self._by_effect:
-            own = np.ones(len(effect.values), bool)
-            own[len(effect.parameters):] = np.isin(np.arange(len(shape)),
-                                                   fitted_places(effect, shape))
-            found.append(own)
-        return np.concatenate(found)
+        found = np.zeros(self.terms.size, bool)
+        for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
+            end = part.stop - len(shape)
+            found[part.start:end] = True
+            found[[end + place for place in fitted_places(effect, shape)]] = True
+        return found
 
-    @property
+    @cached_property
     def _by_effect(self) -> list[tuple[Effect, Floats]]:
         """Effects with their shapes."""
-        return list(zip(self.terms.effects, self._shapes, strict=True))
+        return [(effect, values[len(effect.parameters):]) for effect, values in zip(
+            self.terms.effects, self.values.values(), strict=True)]
 
     @cached_property
     def linear_part(self) -> tuple[Floats, Floats]:
         """W (3, 3) and V (3,), from the effects that need no context [g]."""
-        kept = {name: values for name, values in self.values.items()
-                if effect_named(name).factor is None}
-        here = Model(kept).at({})
-        return here.mat_w, here.vec_v
-
-    @cached_property
-    def _shapes(self) -> list[Floats]:
-        return [effect.split(values)[1]
-                for effect, values in zip(self.terms.effects, self.values.values(), strict=True)]
+        kept = self if self.terms.fixed else Model({
+            name: values for effect, (name, values) in zip(self.terms.effects, self.values.items())
+            if effect.factor is None})
+        return kept.at({}).mat_w, kept.at({}).vec_v
 
     @cached_property
     def _without_context(self) -> AtContext:
         return self._at(np.ones((len(self.terms.weight), 1)))
 
     def at(self, context: Context) -> AtContext:
-        """
-        Return the model with its context fixed.
-
-        Parameters
-        ----------
-        context : mapping of str to array
-            Columns that the effects need, n rows each.
-
-        Raises
-        ------
-        InputError
-            If a column is missing.
-
-        """
-        if self.terms.fixed:
-            return self._without_context
-        return self._at(self._factors(context))
+        """Return the model at columns of n rows; raise InputError if a needed one is missing."""
+        return self._without_context if self.terms.fixed else self._at(self._factors(context))
 
     def _factors(self, context: Context) -> Floats:
         check_context(self, context)
         rows = len(np.asarray(context[self.needs[0]])) if self.needs else 1
-        return self.terms.factors(self._shapes, context, (rows,))
+        return self.terms.factors([shape for _, shape in self._by_effect], context, (rows,))
 
     def _at(self, factors: Floats) -> AtContext:
         """Sum the affine terms, given the (t, n) factors."""
@@ -316,7 +387,7 @@ class Model:
 
     def basis(self, u: Floats, context: Context, direction: Floats | None = None) -> Basis:
         """
-        Return the derivative of the reading by each value.
+        Return the derivative of the reading by each value, in the order of ``model.vector``.
 
         Parameters
         ----------
@@ -327,11 +398,6 @@ class Model:
         direction : (n, 3) array, optional
             If given, return the derivative of the basis along this direction of the force.
 
-        Returns
-        -------
-        Basis
-            The derivative, in the order of ``model.vector``.
-
         """
         terms = self.terms
         if direction is None:
@@ -341,213 +407,32 @@ class Model:
         plain = monomials[terms.place] * terms.weight[:, np.newaxis]
         if terms.fixed:
             return Basis(plain, terms.axis, terms.to_value)
-        found = plain * self._factors(context)
-        moved, of, index = self._by_shape(plain, context)
-        return Basis(np.concatenate([found, moved]), np.concatenate([terms.axis, terms.axis[of]]),
-                     np.hstack([terms.to_value, sums(index, terms.size)]))
+        found: list[Floats] = [plain * self._factors(context)]
+        axes, sums = [terms.axis], [terms.to_value]
+        for rows, which, value in self._by_shape(plain, context):
+            found.append(rows)
+            axes.append(terms.axis[which])
+            sums.append(_sums(np.full(len(rows), value), terms.size))
+        return Basis(np.concatenate(found), np.concatenate(axes), np.hstack(sums))
 
     def _by_shape(self, plain: Floats, context: Context
-                  ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
-        """Return the terms of the derivative by the fitted shape constants."""
-        moved, of, index = [plain[:0]], [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
-        ends = np.cumsum(self.terms.count)
-        for k, effect in enumerate(self.terms.effects):
-            shape = self._shapes[k]
-            which = np.arange(ends[k] - self.terms.count[k], ends[k])
-            for place in fitted_places(effect, shape):
-                values = self.vector[self.terms.value[which]][:, np.newaxis]
-                if effect.factor is not None and np.any(values):
+                  ) -> Iterator[tuple[Floats, slice, int]]:
+        """Yield the derivative by each fitted shape constant: rows, their terms, the value."""
+        start = 0
+        for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
+            which = slice(start, start + len(effect.terms))
+            start += len(effect.terms)
+            values = self.vector[self.terms.value[which]][:, np.newaxis]
+            if effect.factor is not None and np.any(values):
+                for place in fitted_places(effect, shape):
                     change = difference(effect.factor, context, shape, place)
-                    moved.append(plain[which] * values * np.nan_to_num(change))
-                    of.append(which)
-                    start = self.terms.starts[k] + len(effect.parameters) + place
-                    index.append(np.full(len(which), start, np.intp))
-        return np.concatenate(moved), np.concatenate(of), np.concatenate(index)
-
-
-def difference(factor: Callable[[Mapping[str, Any], Floats], Any], context: Context,
-               shape: Floats, place: int) -> Floats:
-    """Return the numerical derivative of a factor by one shape constant."""
-    step = np.zeros(len(shape))
-    step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
-    change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
-        2.0 * step[place])
-    return change
-
-
-def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
-    return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
-
-
-def fitted_places(effect: Effect, shape: Floats) -> list[int]:
-    """
-    Return the indices of the shape constants that a fit changes.
-
-    A constant at its usual value, such as a lag of 0, is not fitted: the effect stays the plain
-    one.
-
-    """
-    usual = dict(enumerate(effect.usual))
-    return [place for place, name in enumerate(effect.shape)
-            if name in FITTED_SHAPES and usual.get(place) != shape[place]]
-
-
-def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
-    """Return the model of these effects with the (p,) vector of all values and ΔR = I."""
-    sizes = [len(effect_named(name).values) for name in effects]
-    parts = np.split(vector, np.cumsum(sizes)[:-1]) if sizes else []
-    return Model(dict(zip(effects, parts, strict=True)))
-
-
-def with_linear_part(mat_w: Floats, vec_v: Floats, rotation: Floats | None = None) -> Model:
-    """
-    Return the model whose gain is W and whose offset is V.
-
-    Parameters
-    ----------
-    mat_w : (3, 3) array
-        Gain; its skew part becomes `misalignment`.
-    vec_v : (3,) array
-        Zero-g offset [g].
-    rotation : (3, 3) array, optional
-        ΔR.
-
-    """
-    values = linear_values(mat_w, vec_v)
-    kept = [*MODELS['10'].effects, *(['misalignment'] if np.any(values['misalignment']) else [])]
-    return Model({name: values[name] for name in kept},
-                 _IDENTITY if rotation is None else rotation)
-
-
-def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
-    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
-    symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
-    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
-            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
-            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}
+                    yield (plain[which] * values * np.nan_to_num(change), which,
+                           part.stop - len(shape) + place)
 
 
 def check_context(model: Model, context: Mapping[str, Any]) -> None:
-    """
-    Check that the context holds what the effects of the model need.
-
-    Raises
-    ------
-    InputError
-        If a column is missing.
-
-    """
+    """Check that the context holds what the effects of the model need; raise InputError."""
     missing = [', '.join(COLUMNS[key].names) for key in model.needs if key not in context]
     if missing:
         raise InputError(f'the effects of the model need {" and ".join(missing)}, which the input '
                          'does not have', 'record these columns together with the readings')
-
-
-def predict(model: Model, force: Floats, context: Context) -> Floats:
-    """
-    Compute the readings of a sensor.
-
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    force : (n, 3) array
-        Specific force in the levelled frame [g].
-    context : mapping of str to array
-        Columns that the effects need, n rows each.
-
-    Returns
-    -------
-    (n, 3) array
-        Readings [g].
-
-    """
-    return reading_of(model, force @ model.rotation.T, context)
-
-
-def reading_of(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3) readings for the (n, 3) force u in the sensor axes [g]."""
-    reading = model.at(context).reading(u)
-    for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
-        if effect.output is not None:
-            reading = effect.output(reading, values)
-    return reading
-
-
-def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
-    """
-    Compute the specific force in the sensor axes from the readings.
-
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    reading : (n, 3) array
-        Readings [g].
-    context : mapping of str to array
-        Columns that the effects need, n rows each.
-
-    Returns
-    -------
-    (n, 3) array
-        u [g].
-
-    Raises
-    ------
-    InputError
-        If the effects are so large that the force of a reading is not unique.
-
-    """
-    u = model.at(context).force(reading)
-    if np.any(np.isnan(u) & ~np.isnan(reading)):
-        raise too_large()
-    return u
-
-
-def too_large() -> InputError:
-    """Return the error for a reading whose force is not unique."""
-    return InputError('the effects of the model are too large to be corrected at this reading',
-                      'calibrate again, with readings in the range in which the sensor is used')
-
-
-def correct(model: Model, reading: Floats, context: Context) -> Floats:
-    """
-    Compute the specific force from the readings; the inverse of `predict`.
-
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    reading : (n, 3) array
-        Readings [g].
-    context : mapping of str to array
-        Columns that the effects need, n rows each.
-
-    Returns
-    -------
-    (n, 3) array
-        Specific force in the levelled frame [g].
-
-    Raises
-    ------
-    InputError
-        If the effects are so large that the force of a reading is not unique.
-
-    """
-    return sensor_force(model, reading, context) @ model.rotation
-
-
-def parameter_basis(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3, p) derivative of the reading by each value, at (n, 3) forces u [g]."""
-    return model.basis(u, context).full
-
-
-def force_slope(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3, 3) derivative of the reading by the force u in the sensor axes."""
-    return model.at(context).slope(u)
-
-
-def length_rows(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3) derivative of |u| by the reading: ûᵀA⁻¹, with A the slope."""
-    return times(np.swapaxes(model.at(context).inverse_slope(u), -1, -2), unit(u))
