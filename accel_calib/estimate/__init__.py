@@ -4,10 +4,10 @@
 """
 The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
 
-`equations` sets up the equations of the poses and defines the weight of their measured noise.
-`fit` minimises the residuals and computes the covariance. `outliers` finds outliers, also those
-that would distort a fit. `closed_form` computes start values. `geometry` computes what poses
-determine before any fit.
+`equations` sets up the equations of the poses. `fit` minimises the residuals and computes the
+covariance. `outliers` finds outliers and defines the weight of the measured noise. `robust` fits
+without gross outliers, and finds mistakes that the poses do not locate or show. `closed_form`
+computes start values. `geometry` computes what poses determine before any fit.
 
 """
 
@@ -20,8 +20,8 @@ from .closed_form import (
     sensing_axes,
     TIES,
 )
-from .equations import Equations, kinds, noise_of, variance_factor
-from .fit import by_pose, estimate, Fit, judge, Prior
+from .equations import Equations, kinds, noise_of, originals
+from .fit import estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
     Combination,
     coverage,
@@ -43,9 +43,8 @@ from .geometry import (
     uncovered,
     WEAK_DILUTION,
 )
-from .least_squares import NotConvergedError, Point, solve
-from .mistakes import covariance_with, Rival, rivals, unseen_mistakes
-from .outliers import fit_norm, LARGEST_SHARE, originals, outliers, outliers_among, start_of
+from .outliers import by_pose, LARGEST_SHARE, outliers_among, variance_factor
+from .robust import covariance_with, fit_norm, outliers, Rival, rivals, start_of, unseen_mistakes
 
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',

@@ -27,28 +27,23 @@ with the exact derivative. A value that adds B(u) to the reading changes (|u| - 
 where N is the covariance of the reading, and B'(u)g is the derivative of B along g. (The change of
 A with u, by bending terms, is neglected: it is of the order of e times these terms.)
 
-**Noise.** Weight of the measured noise of poses against the residuals of a fit.
+**Copies.** Rows of a table that are one measurement, entered several times, count as one pose.
 
-The variance of a residual is λ times the variance predicted by the noise of its pose. Either the
-noise is correct and λ = 1, or poses repeat worse or better than their samples predict. Then log λ
-is uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both (Bayes' rule
-with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then a mixture of
-normal distributions. Its stated variance is chosen so that ±1.96 standard deviations contain 95 %
-of the mixture. If the noise was not measured, λ is estimated from the residuals alone, and the
-mixture is Student's t. If there are no degrees of freedom either, the noise of a common sensor is
-assumed.
-
-In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
-2004).
+Copies agree with each other far better than their noise allows. Counted as separate poses, they
+would make the noise seem smaller than it is, and the other poses would look like outliers. Two
+rests in the same orientation are no copies: by chance, only one pair in 5000 differs by less than
+`_ALIKE` of the noise on all axes.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
+from itertools import product
 import math
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,36 +61,31 @@ _NO_NOISE_G = 1e-9
 LEAST_NOISE = 0.1
 """Smallest noise of a pose, relative to the median over the poses."""
 
-_BELIEF = 8.0
-_BELIEF_IN_USUAL = 3.0
-"""Degrees of freedom in a test that measured noise, and assumed noise, count as."""
+_ALIKE = 0.1
+"""Largest difference between the readings of copies, relative to the noise of a pose. Differences
+up to half of it always count as none."""
 
-_RIGHT = 0.7
-"""Prior probability that the measured noise is correct."""
+_EQUAL_G = 1e-7
+"""The same if the noise is not known [g]."""
 
-_INTERVAL = 0.95
-_NORMAL = 1.959964
-_SCALES = np.logspace(-2.0, 4.0, 121)
-_ONE = 40
-"""Values of λ; index of λ = 1."""
+_DECIMALS = 7
+"""Number of decimals in which the context of copies is equal."""
 
-_BEYOND = 1e3
-"""chi² per degree of freedom above which the measured noise is ignored."""
+_OF_READING = ('reading', 'std', 'count', 'label')
+"""Columns that are not context."""
+
+_TURNS = 5
+_STRAIGHT = 1e-9
+"""Most turns of a common direction, and the turn at which it is found [rad]."""
+
+Indices = NDArray[np.intp]
 
 
 def believable(noise: Floats | None) -> Floats | None:
     """
-    Return the noise of poses, raised where it is far below that of the other poses.
+    Return the (n, 3) noise of pose means [g], raised where it is far below that of other poses.
 
-    Parameters
-    ----------
-    noise : (n, 3) array or None
-        Standard deviation of pose means [g].
-
-    Returns
-    -------
-    (n, 3) array or None
-        None if the noise is not known, or is zero for most poses.
+    None if the noise is not known, or is zero for most poses.
 
     """
     if noise is None or not len(noise):
@@ -104,78 +94,101 @@ def believable(noise: Floats | None) -> Floats | None:
     return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
-def belief_in(noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as in a test."""
-    return _BELIEF if noise_known else _BELIEF_IN_USUAL
+def noise_of(poses_g: Poses) -> Floats | None:
+    """Return the believable (n, 3) noise of the pose means [g]; None if it is not known."""
+    return believable(poses_g.noise)
 
 
-@cache
-def _grid() -> tuple[Floats, Floats]:
-    """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
-    from scipy.special import ndtr
-
-    width = np.geomspace(0.15, 250.0, 141)
-    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
-
-
-def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
+def originals(poses_g: Poses) -> Indices:
     """
-    Return the ratio of the stated variance to the variance predicted by the noise.
+    Return the (n,) index of the first pose that each pose in g is a copy of, or its own.
 
-    Parameters
-    ----------
-    chi2 : float
-        Sum of the squared residuals in units of the noise.
-    dof : int
-        Number of equations minus number of free values.
-    noise_known : bool
-        Whether the noise was measured; otherwise the unit of `chi2` is `USUAL_NOISE_G`.
+    Context, such as the temperature, is compared, too.
 
     """
-    if dof <= 0:
-        return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
-    if not noise_known or chi2 > _BEYOND * dof:
-        return chi2 / dof * _student(dof)
-    return _of_mixture(chi2, dof)
+    reading, noise = poses_g.reading, noise_of(poses_g)
+    found = np.arange(len(reading))
+    cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
+    place = reading / cell
+    if np.all(np.diff(np.sort(place[:, 0])) > 1.0):
+        return found
+    context = [values.round(_DECIMALS) for key, values in poses_g.columns.items()
+               if key not in _OF_READING]
+    # Two readings half a cell apart are in the same cell of at least one of these grids.
+    for shift in product((0.0, 0.5), repeat=3):
+        rows = np.column_stack([np.floor(place + shift), *context])
+        _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        found = np.minimum(found, first[which.ravel()])
+    return found[found]
 
 
-def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    from scipy.special import stdtrit
+def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
+    """
+    Return the indices of poses of known, shared and unknown orientation.
 
-    return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+    Returns
+    -------
+    (a,) array, list of arrays, (c,) array
+        Poses of known orientation, groups of poses with the same orientation, and poses of which
+        only |force| = 1 g is known.
 
-
-def _of_mixture(chi2: float, dof: int) -> float:
-    """Return the factor for measured noise, which may be correct."""
-    width, held = _grid()
-    likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
-    largest = np.max(likelihood)
-    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
-    weight[_ONE] += _RIGHT * len(_SCALES) * np.exp(-largest)
-    part = (weight / np.sum(weight)) @ held
-    above = int(np.argmax(part >= _INTERVAL))
-    share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
-    between = width[above - 1] * (width[above] / width[above - 1]) ** share
-    return float(between / _NORMAL) ** 2
-
-
-Indices = NDArray[np.intp]
-
-
-_TURNS = 5
-_STRAIGHT = 1e-9
-"""Most turns of a common direction, and the turn at which it is found [rad]."""
+    """
+    everyone, columns = np.arange(len(poses.row)), poses.columns
+    if 'reference' in columns:
+        return everyone, [], everyone[:0]
+    if 'orientation' not in columns:
+        return everyone[:0], [], everyone
+    _, group, size = np.unique(columns['orientation'], return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind='stable')
+    groups = np.split(order, np.cumsum(size)[:-1])
+    return (everyone[:0], [each for each in groups if len(each) > 1],
+            np.array([each[0] for each in groups if len(each) == 1], np.intp))
 
 
-class _Part(Protocol):
-    """The equations of poses of one kind."""
+class _Kind(NamedTuple):
+    """
+    Poses of one kind of orientation.
 
-    residual: Any
-    pose: Indices
+    Their indices among all poses, the group of each for shared orientations, context, reading and
+    noise s of the means [g].
 
-    def columns(self, model: Model) -> Floats:
-        """Return the (m, p) derivative of the prediction by the values of a model."""
+    """
+
+    which: Indices
+    group: Indices
+    context: Context
+    reading: Floats
+    s: Floats
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Poses in g by kind of orientation, and their noise; see `measured`."""
+
+    known: _Kind
+    shared: _Kind
+    alone: _Kind
+    count: int
+    noise_known: bool
+
+
+def measured(poses_g: Poses) -> Measured:
+    """Return poses in g as the equations use them, without the noise that is not believable."""
+    noise, reading = noise_of(poses_g), poses_g.reading
+    s = np.full(reading.shape, USUAL_NOISE_G) if noise is None else noise
+    known, shared, alone = kinds(poses_g)
+
+    def kind(groups: Sequence[Indices]) -> _Kind:
+        which = np.concatenate([known[:0], *groups])
+        group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
+        if not len(which):
+            return _Kind(which, group, {}, reading[:0], s[:0])
+        if np.array_equal(which, np.arange(len(s))):
+            return _Kind(which, group, poses_g.columns, reading, s)
+        context = {key: values[which] for key, values in poses_g.columns.items()}
+        return _Kind(which, group, context, reading[which], s[which])
+
+    return Measured(kind([known]), kind(shared), kind([alone]), len(s), noise is not None)
 
 
 @dataclass(frozen=True)
@@ -204,12 +217,12 @@ class Equations:
     count: int
     noise_known: bool
 
-    @property
+    @cached_property
     def residual(self) -> Floats:
         """(m,) array, the residuals in units of the noise."""
         return _joined([part.residual for part in self.parts])
 
-    @property
+    @cached_property
     def pose(self) -> Indices:
         """(m,) array, index of the pose that each equation belongs to."""
         return _joined([part.pose for part in self.parts])
@@ -232,97 +245,59 @@ def _joined(arrays: list[NDArray[Any]]) -> NDArray[Any]:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def noise_of(poses_g: Poses) -> Floats | None:
-    """Return the believable (n, 3) noise of the pose means [g]; None if it is not known."""
-    return believable(poses_g.noise)
+class _Part(Protocol):
+    """The equations of poses of one kind, in units of the noise, and `pose` of each equation."""
+
+    residual: Any
+    pose: Indices
+    force: Floats
+    scale: Floats
+
+    def columns(self, model: Model) -> Floats:
+        """Return the (m, p) derivative of the prediction by the values of a model."""
 
 
-def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
+def equations(model: Model, poses: Measured) -> Equations:
     """
-    Return the indices of poses of known, shared and unknown orientation.
+    Set up the equations of poses near a model with ΔR = I.
 
-    Returns
-    -------
-    (a,) array, list of arrays, (c,) array
-        Poses of known orientation, groups of poses with the same orientation, and poses of which
-        only |force| = 1 g is known.
-
-    """
-    everyone = np.arange(len(poses))
-    if 'reference' in poses:
-        return everyone, [], everyone[:0]
-    if 'orientation' not in poses:
-        return everyone[:0], [], everyone
-    _, group, size = np.unique(poses['orientation'], return_inverse=True, return_counts=True)
-    order = np.argsort(group, kind='stable')
-    groups = np.split(order, np.cumsum(size)[:-1])
-    return (everyone[:0], [each for each in groups if len(each) > 1],
-            np.array([each[0] for each in groups if len(each) == 1], np.intp))
-
-
-def equations(model: Model, poses_g: Poses, noise: Floats | None) -> Equations:
-    """
-    Set up the equations of poses near a model.
-
-    Parameters
-    ----------
-    model : Model
-        The model, with ΔR = I.
-    poses_g : Poses
-        Poses in g.
-    noise : (n, 3) array or None
-        Noise of the pose means, as `noise_of` returns it [g].
-
-    Returns
-    -------
-    Equations
-        The equations; a residual is NaN where the force of the reading is not unique.
+    A residual is NaN where the force of the reading is not unique.
 
     """
-    known, shared, alone = kinds(poses_g)
-    s = np.full(poses_g.reading.shape, USUAL_NOISE_G) if noise is None else noise
     parts: list[_Part] = []
-    force, scale = np.empty_like(s), np.empty(len(s))
-    if len(known):
-        parts.append(_Known(model, poses_g, s))
-        force, scale = poses_g['reference'], np.sqrt(np.mean(s ** 2, axis=1))
-    if shared:
-        which = np.concatenate(shared)
-        part = _Shared(model, poses_g.take(which), s[which], which,
-                       np.repeat(np.arange(len(shared)), [len(group) for group in shared]))
-        parts.append(part)
-        force[which], scale[which] = part.force, np.sqrt(np.mean(s[which] ** 2, axis=1))
-    if len(alone):
-        everyone = len(alone) == len(s)
-        one = _Alone(model, poses_g if everyone else poses_g.take(alone), s[alone], alone)
-        parts.append(one)
-        force[alone], scale[alone] = one.force, one.sigma
-    count = sum(len(part.residual) for part in parts) - 2 * len(shared)
-    return Equations(tuple(parts), force, scale, count, noise is not None)
+    force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
+    for make, kind in ((_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)):
+        if len(kind.which):
+            part: _Part = make(model, kind)
+            parts.append(part)
+            force[kind.which], scale[kind.which] = part.force, part.scale
+    groups = poses.shared.group
+    count = sum(len(part.residual) for part in parts) - (2 * (int(groups[-1]) + 1)
+                                                         if len(groups) else 0)
+    return Equations(tuple(parts), force, scale, count, poses.noise_known)
 
 
 class _Alone:
     """Equations of poses of which only |force| = 1 g is known; symbols as in the module."""
 
-    def __init__(self, model: Model, poses_g: Poses, s: Floats, pose: Indices) -> None:
-        self.pose = pose
-        self._context: Context = poses_g.columns
+    def __init__(self, model: Model, poses: _Kind) -> None:
+        self.pose, self._context = poses.which, poses.context
         here = model.at(self._context)
-        u = here.force(poses_g.reading)
+        u = here.force(poses.reading)
         length = np.sqrt(np.sum(u * u, axis=1))[:, np.newaxis]
         self.force = u / length
         inverse = here.inverse_slope(u)
         transposed = inverse.swapaxes(-1, -2)
         a = times(transposed, self.force)
-        spread = a * s ** 2
+        spread = a * poses.s ** 2
         variance = np.sum(a * spread, axis=1)[:, np.newaxis]
         g = times(inverse, spread / variance)
         across = g - self.force * np.sum(self.force * g, axis=1)[:, np.newaxis]
         h = times(transposed, across / length)
         e = length - 1.0
-        self.sigma = np.sqrt(variance[:, 0])
-        self.residual = e[:, 0] / self.sigma
-        weighted = a / self.sigma[:, np.newaxis]
+        self.scale = np.sqrt(variance[:, 0])
+        self.residual = e[:, 0] / self.scale
+        weighted = a / self.scale[:, np.newaxis]
         self._rows = weighted - self.residual[:, np.newaxis] * h
         self._rows_along = weighted * e
         self._at, self._along = u, g
@@ -336,15 +311,16 @@ class _Alone:
 class _Known:
     """Equations of poses of known orientation."""
 
-    def __init__(self, model: Model, poses_g: Poses, s: Floats) -> None:
-        self._sigma, self._poses = s.ravel(), poses_g
-        self.pose = np.repeat(np.arange(len(s)), 3)
-        reading = model.at(poses_g.columns).reading(poses_g['reference'])
-        self.residual = (poses_g.reading - reading).ravel() / self._sigma
+    def __init__(self, model: Model, poses: _Kind) -> None:
+        self._sigma, self._context = poses.s.ravel(), poses.context
+        self.pose = np.repeat(poses.which, 3)
+        self.force, self.scale = poses.context['reference'], np.sqrt(np.mean(poses.s ** 2, axis=1))
+        reading = model.at(self._context).reading(self.force)
+        self.residual = (poses.reading - reading).ravel() / self._sigma
 
     def columns(self, model: Model) -> Floats:
         """Return the derivative; see `Equations.columns`."""
-        basis = model.basis(self._poses['reference'], self._poses.columns).full
+        basis = model.basis(self.force, self._context).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
 
@@ -358,21 +334,20 @@ class _Shared:
 
     """
 
-    def __init__(self, model: Model, poses_g: Poses, s: Floats, pose: Indices, group: Indices
-                 ) -> None:
-        self._sigma, self._context, self._group = s, poses_g.columns, group
-        self.pose = np.repeat(pose, 3)
-        here = model.at(poses_g.columns)
-        mean = np.array([np.bincount(group, column) for column in
-                         here.force(poses_g.reading).T]).T
+    def __init__(self, model: Model, poses: _Kind) -> None:
+        self._sigma, self._context, group = poses.s, poses.context, poses.group
+        self._group, self.pose = group, np.repeat(poses.which, 3)
+        self.scale = np.sqrt(np.mean(poses.s ** 2, axis=1))
+        here = model.at(self._context)
+        mean = np.array([np.bincount(group, column) for column in here.force(poses.reading).T]).T
         self.force = unit(mean)[group]
         for _ in range(_TURNS):
-            off, tangents = self._around(here, poses_g.reading)
+            off, tangents = self._around(here, poses.reading)
             turn = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ off)
             if np.max(np.abs(turn)) < _STRAIGHT:
                 break
             self.force = unit(self.force + (tangents @ turn[group])[:, :, 0])
-        off, _ = self._around(here, poses_g.reading)
+        off, _ = self._around(here, poses.reading)
         self.residual = self._projected(off).ravel()
 
     def _around(self, here: AtContext, reading: Floats) -> tuple[Floats, Floats]:

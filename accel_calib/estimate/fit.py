@@ -4,8 +4,10 @@
 """
 The maximum likelihood fit of any list of effects to poses of any kind, by least squares.
 
-`.equations` sets up the equations of the poses, and `.least_squares` minimises the sum of their
-squared residuals. The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`, because
+`.equations` sets up the equations of the poses. Damped least squares (Levenberg 1944, Marquardt
+1963) within bounds minimises the sum of their squared residuals; for a dozen poses,
+`scipy.optimize.least_squares` takes several times as long, mostly because of overhead
+(`benchmarks/fits.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.outliers`, because
 poses often repeat worse than the noise of their samples predicts.
 
 The bounds of each parameter limit its contribution to a reading to `Effect.plausible_g`. A fitted
@@ -25,26 +27,44 @@ determines the weight of the prior.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .closed_form import along_quadrics
-from .equations import belief_in, Equations, equations, noise_of, variance_factor
-from .least_squares import NOWHERE, Point, solve
+from .equations import Equations, equations, measured
+from .outliers import belief_in, by_pose, ByPose, variance_factor
 from ..effects import (
     CHANGES,
-    effect_named,
     fitted_places,
     LADDER,
     Model,
     parameter_names,
     with_vector,
 )
+from ..errors import RefusedFitError
 from ..geometry import unit
 from ..table import Floats, Poses
+
+_MOST_STEPS = 60
+_FIRST_DAMPING = 1e3   # relative to the smallest determined square
+_LARGEST_DAMPING = 1e9
+
+_NEAR = 1e-12
+"""The fit has converged when a full step lowers the cost by less than this part."""
+
+_NEAR_ENOUGH = 1e-5
+"""If rounding prevents this, the fit accepts this part of the cost per degree of freedom."""
+
+_ROUNDING = 1e-20
+"""Decreases of the cost below this are rounding errors [noise²]."""
+
+_SINGULAR_STEP = 1e-6
+"""Relative square of a singular value below which the residuals do not determine a combination."""
 
 _SINGULAR_WITH_PRIOR = 1e-12
 """As `Point.singular`; a prior determines all combinations."""
@@ -63,55 +83,6 @@ _WHOLE = 1e-6
 
 _SHAPE_ROOM = 5.0
 """Factor by which a fitted shape constant may exceed the range that the search tries."""
-
-
-@dataclass(frozen=True)
-class ByPose:
-    """
-    The equations of a fit, by pose.
-
-    Parameters
-    ----------
-    residual : (n, k) array
-        Residuals in units of the noise, padded with 0.
-    columns : (n, k, q) array
-        Derivative of the prediction, padded with 0.
-    rows : (n,) array of int
-        Number of equations of each pose.
-    prior : Point or None
-        Residuals and columns of the prior; None without a prior.
-
-    """
-
-    residual: Floats
-    columns: Floats
-    rows: NDArray[np.int64]
-    prior: Point | None = None
-
-    @cached_property
-    def spread(self) -> Floats:
-        """(q, q) array, (JᵀJ)⁻¹."""
-        flat = self.flat
-        normal = flat.T @ flat
-        if self.prior is not None:
-            normal = normal + self.prior.columns.T @ self.prior.columns
-        return np.linalg.pinv(normal, hermitian=True)
-
-    @property
-    def downhill(self) -> Floats:
-        """(q,) array, Jᵀ times the residuals; zero at the solution."""
-        along = self.flat.T @ self.residual.ravel()
-        return along if self.prior is None else along + self.prior.columns.T @ self.prior.residual
-
-    @property
-    def flat(self) -> Floats:
-        """(n k, q) array, the derivative with one row per equation."""
-        return self.columns.reshape(self.residual.size, self.columns.shape[2])
-
-    def own(self, spread: Floats) -> Floats:
-        """Return the (n, k, k) matrices I - leverage of each pose."""
-        return (np.eye(self.columns.shape[1])
-                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
 
 
 @dataclass(frozen=True)
@@ -220,23 +191,6 @@ class Fit:
         return variance_factor(self.chi2, self.dof, self.noise_known)
 
 
-def by_pose(residual: Floats, columns: Floats, pose: NDArray[np.intp],
-            prior: Point | None = None) -> ByPose:
-    """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
-    rows = np.bincount(pose)
-    count = len(rows)
-    if len(pose) == count:
-        order = np.argsort(pose)
-        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
-    order = np.argsort(pose, kind='stable')
-    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
-    by_row = np.zeros((count, int(rows.max())))
-    derivative = np.zeros((*by_row.shape, columns.shape[1]))
-    by_row[pose[order], slot] = residual[order]
-    derivative[pose[order], slot] = columns[order]
-    return ByPose(by_row, derivative, rows, prior)
-
-
 def free_of(model: Model) -> Floats:
     """Return the (p, q) matrix from the fitted values of a model to all its values."""
     return np.eye(len(model.fitted))[:, model.fitted]
@@ -250,8 +204,112 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
 
     """
     ties = free_of(model) if ties is None else ties
-    near = equations(model, poses_g, noise_of(poses_g))
+    near = equations(model, measured(poses_g))
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
+
+
+class NotConvergedError(RefusedFitError):
+    """The fit did not converge, so it has no result."""
+
+    def __init__(self) -> None:
+        super().__init__('the fit did not converge, so it has no result',
+                         'check the poses for mistakes, or take more poses')
+
+
+class Point(NamedTuple):
+    """The (m,) residuals and (m, q) derivative at some values, and the object they are from."""
+
+    residual: Floats
+    columns: Floats
+    source: Any = None
+    singular: float = _SINGULAR_STEP
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals; infinite if a residual or derivative is not finite."""
+        cost = float(self.residual @ self.residual)
+        return cost if np.isfinite(cost) and np.all(np.isfinite(self.columns)) else np.inf
+
+
+NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
+"""A point without a prediction; its cost is infinite."""
+
+
+def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
+          move: Callable[[Floats, Floats], Floats] = np.add) -> tuple[Floats, Point]:
+    """
+    Compute the values that minimise the sum of squared residuals.
+
+    Parameters
+    ----------
+    point_at : callable
+        (q,) values -> residuals and derivative. The step solves residual = columns · step.
+    start : (q,) array
+        Start values.
+    lower, upper : (q,) array
+        Bounds of the values.
+    move : callable
+        Values and step to first order -> values after the step; by default their sum.
+
+    Returns
+    -------
+    (q,) array, Point
+        The values at the minimum, with residuals and derivative.
+
+    Raises
+    ------
+    NotConvergedError
+        If the fit has not converged after `_MOST_STEPS` steps.
+
+    """
+    values = np.clip(start, lower, upper)
+    now, damping = point_at(values), 0.0
+    first = _FIRST_DAMPING * now.singular
+    if not np.isfinite(now.cost):
+        raise NotConvergedError
+    for _ in range(_MOST_STEPS):
+        free = _free(values, now, lower, upper)
+        full, fall = _step(now, free, 0.0)
+        if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
+            break
+        step = full if damping == 0.0 else _step(now, free, damping)[0]
+        tried_at = np.clip(move(values, step), lower, upper)
+        tried = point_at(tried_at)
+        if tried.cost < now.cost:
+            values, now, damping = tried_at, tried, damping / 10.0
+            damping = 0.0 if damping < first else damping
+        else:
+            damping = max(10.0 * damping, first)
+    _, fall = _step(now, _free(values, now, lower, upper), 0.0)
+    spare = max(len(now.residual) - len(values), 1)
+    if not fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING:
+        raise NotConvergedError
+    return values, now
+
+
+def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
+    """Return which values are free: not at a bound beyond which the cost would decrease."""
+    downhill = now.columns.T @ now.residual
+    held = ((values <= lower) & (downhill < 0.0)) | ((values >= upper) & (downhill > 0.0))
+    return ~held
+
+
+def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
+    """
+    Return the (q,) damped Gauss-Newton step, and the predicted decrease of the cost.
+
+    Combinations of values that the residuals do not determine are not changed.
+
+    """
+    columns = now.columns * free
+    size = np.sqrt(np.sum(columns ** 2, axis=0))
+    size[size == 0.0] = 1.0
+    columns = columns / size
+    scales, axes = np.linalg.eigh(columns.T @ columns)
+    downhill = axes.T @ (columns.T @ now.residual)
+    determined = scales > now.singular * scales[-1]
+    along = np.where(determined, downhill, 0.0) / (np.where(determined, scales, 1.0) + damping)
+    return axes @ along / size, float(along @ downhill)
 
 
 @dataclass(frozen=True)
@@ -311,8 +369,9 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         If the fit does not converge.
 
     """
-    fitted, noise = start.fitted, noise_of(poses_g)
-    vector = start.vector.copy()
+    if not np.any(start.fitted):
+        return judge(start, poses_g)
+    fitted, vector, poses = start.fitted, start.vector.copy(), measured(poses_g)
     weight = np.sqrt(1.0 if factor is None else factor)
 
     def model_at(values: Floats) -> Model:
@@ -323,14 +382,12 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         model = model_at(values)
         with np.errstate(all='ignore'):
             try:
-                near = equations(model, poses_g, noise)
+                near = equations(model, poses)
                 return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
                                    values, prior, weight)
             except np.linalg.LinAlgError:
                 return NOWHERE
 
-    if not np.any(fitted):
-        return judge(start, poses_g)
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
@@ -354,8 +411,7 @@ def _with_prior(point: Point, values: Floats, prior: Prior | None, weight: float
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
     """Return (p,) lower and (p,) upper bounds of all values; they include the start values."""
     lower, upper = [], []
-    for name, values in start.values.items():
-        effect = effect_named(name)
+    for effect, (name, values) in zip(start.terms.effects, start.values.items(), strict=True):
         limits = np.full((2, len(values)), np.inf) * [[-1.0], [1.0]]
         if name not in LADDER and name not in CHANGES:
             size = _largest_contribution(Model({name: values}), poses_g)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Outliers: poses that were knocked or not still.
+Outliers, and the weight of the measured noise in tests and in the covariance.
 
 The pose with the largest residual against a fit of the other poses (externally studentised, with
 the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. The
@@ -13,38 +13,51 @@ are extreme relative to the median are removed at once.
 
 A gross outlier can distort the first fit. `fit_norm` then starts from poses that agree.
 
-**Gross outliers.** Fits that are robust against gross outliers.
+**Noise.** Weight of the measured noise of poses against the residuals of a fit.
 
-A single wrong row, such as zeros or a reading in another unit, can distort the closed form and the
-fit of all poses so far that the residuals do not show which row is wrong. If the fit of all poses
-is suspicious, subsets are therefore fitted in closed form. The subset with the smallest trimmed
-squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
-agrees with it.
+The variance of a residual is λ times the variance predicted by the noise of its pose. Either the
+noise is correct and λ = 1, or poses repeat worse or better than their samples predict. Then log λ
+is uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both (Bayes' rule
+with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then a mixture of
+normal distributions. Its stated variance is chosen so that ±1.96 standard deviations contain 95 %
+of the mixture. If the noise was not measured, λ is estimated from the residuals alone, and the
+mixture is Student's t. If there are no degrees of freedom either, the noise of a common sensor is
+assumed.
 
-**Copies.** Rows of a table that are one measurement, entered several times.
-
-Copies agree with each other far better than their noise allows. Counted as separate poses, they
-would make the noise seem smaller than it is, and the other poses would look like outliers. They
-count as one pose. Two rests in the same orientation are no copies: by chance, only one pair in
-5000 differs by less than `_ALIKE` of the noise on all axes.
+In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
+2004).
 
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations, product
-from math import comb
+from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .closed_form import closed_form
-from .equations import belief_in, noise_of
-from .fit import ByPose, estimate, Fit, judge
-from .least_squares import NotConvergedError
-from ..effects import linear_values, Model, MODELS, parameter_names
-from ..table import Floats, Poses
+from ..table import Floats
+
+if TYPE_CHECKING:
+    from .fit import Point
+
+_BELIEF = 8.0
+_BELIEF_IN_USUAL = 3.0
+"""Degrees of freedom in a test that measured noise, and assumed noise, count as."""
+
+_RIGHT = 0.7
+"""Prior probability that the measured noise is correct."""
+
+_INTERVAL = 0.95
+_NORMAL = 1.959964
+_SCALES = np.logspace(-2.0, 4.0, 121)
+_ONE = 40
+"""Values of λ; index of λ = 1."""
+
+_BEYOND = 1e3
+"""chi² per degree of freedom above which the measured noise is ignored."""
 
 LEVEL = 0.007
 """Probability that a pose of a set without outliers is removed."""
@@ -54,19 +67,6 @@ LARGEST_SHARE = 0.25
 
 _LEAST_OWN = 1e-6
 """1 - leverage below this: this pose alone determines a parameter, and cannot be tested."""
-
-_ALIKE = 0.1
-"""Largest difference between the readings of copies, relative to the noise of a pose. Differences
-up to half of it always count as none."""
-
-_EQUAL_G = 1e-7
-"""The same if the noise is not known [g]."""
-
-_DECIMALS = 7
-"""Number of decimals in which the context of copies is equal."""
-
-_OF_READING = ('reading', 'std', 'count', 'label')
-"""Columns that are not context."""
 
 _MANY = 200
 
@@ -80,34 +80,126 @@ _DOUBTED = 1.0
 """Degrees of freedom that contradicted noise counts as."""
 
 
-def originals(poses_g: Poses) -> NDArray[np.intp]:
+def belief_in(noise_known: bool) -> float:
+    """Return the degrees of freedom that the noise counts as in a test."""
+    return _BELIEF if noise_known else _BELIEF_IN_USUAL
+
+
+@cache
+def _grid() -> tuple[Floats, Floats]:
+    """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
+    from scipy.special import ndtr
+
+    width = np.geomspace(0.15, 250.0, 141)
+    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
+
+
+def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     """
-    Find the copies among poses.
+    Return the ratio of the stated variance to the variance predicted by the noise.
 
     Parameters
     ----------
-    poses_g : Poses
-        Poses in g. Context, such as the temperature, is compared, too.
-
-    Returns
-    -------
-    (n,) array of int
-        Index of the first pose that each pose is equal to; its own index if it is not a copy.
+    chi2 : float
+        Sum of the squared residuals in units of the noise.
+    dof : int
+        Number of equations minus number of free values.
+    noise_known : bool
+        Whether the noise was measured; otherwise the unit of `chi2` is `USUAL_NOISE_G`.
 
     """
-    found, noise = np.arange(len(poses_g)), noise_of(poses_g)
-    cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
-    place = poses_g.reading / cell
-    if np.all(np.diff(np.sort(place[:, 0])) > 1.0):
-        return found
-    context = [values.round(_DECIMALS) for key, values in poses_g.columns.items()
-               if key not in _OF_READING]
-    # Two readings half a cell apart are in the same cell of at least one of these grids.
-    for shift in product((0.0, 0.5), repeat=3):
-        rows = np.column_stack([np.floor(place + shift), *context])
-        _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        found = np.minimum(found, first[which.ravel()])
-    return found[found]
+    if dof <= 0:
+        return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
+    if not noise_known or chi2 > _BEYOND * dof:
+        return chi2 / dof * _student(dof)
+    return _of_mixture(chi2, dof)
+
+
+def _student(dof: float) -> float:
+    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+
+
+def _of_mixture(chi2: float, dof: int) -> float:
+    """Return the factor for measured noise, which may be correct."""
+    width, held = _grid()
+    likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
+    largest = np.max(likelihood)
+    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
+    weight[_ONE] += _RIGHT * len(_SCALES) * np.exp(-largest)
+    part = (weight / np.sum(weight)) @ held
+    above = int(np.argmax(part >= _INTERVAL))
+    share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
+    between = width[above - 1] * (width[above] / width[above - 1]) ** share
+    return float(between / _NORMAL) ** 2
+
+
+@dataclass(frozen=True)
+class ByPose:
+    """
+    The equations of a fit, by pose.
+
+    Parameters
+    ----------
+    residual : (n, k) array
+        Residuals in units of the noise, padded with 0.
+    columns : (n, k, q) array
+        Derivative of the prediction, padded with 0.
+    rows : (n,) array of int
+        Number of equations of each pose.
+    prior : Point or None
+        Residuals and columns of the prior; None without a prior.
+
+    """
+
+    residual: Floats
+    columns: Floats
+    rows: NDArray[np.int64]
+    prior: Point | None = None
+
+    @cached_property
+    def spread(self) -> Floats:
+        """(q, q) array, (JᵀJ)⁻¹."""
+        flat = self.flat
+        normal = flat.T @ flat
+        if self.prior is not None:
+            normal = normal + self.prior.columns.T @ self.prior.columns
+        return np.linalg.pinv(normal, hermitian=True)
+
+    @property
+    def downhill(self) -> Floats:
+        """(q,) array, Jᵀ times the residuals; zero at the solution."""
+        along = self.flat.T @ self.residual.ravel()
+        return along if self.prior is None else along + self.prior.columns.T @ self.prior.residual
+
+    @property
+    def flat(self) -> Floats:
+        """(n k, q) array, the derivative with one row per equation."""
+        return self.columns.reshape(self.residual.size, self.columns.shape[2])
+
+    def own(self, spread: Floats) -> Floats:
+        """Return the (n, k, k) matrices I - leverage of each pose."""
+        return (np.eye(self.columns.shape[1])
+                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
+
+
+def by_pose(residual: Floats, columns: Floats, pose: NDArray[np.intp],
+            prior: Point | None = None) -> ByPose:
+    """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
+    rows = np.bincount(pose)
+    count = len(rows)
+    if len(pose) == count:
+        order = np.argsort(pose)
+        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
+    order = np.argsort(pose, kind='stable')
+    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
+    by_row = np.zeros((count, int(rows.max())))
+    derivative = np.zeros((*by_row.shape, columns.shape[1]))
+    by_row[pose[order], slot] = residual[order]
+    derivative[pose[order], slot] = columns[order]
+    return ByPose(by_row, derivative, rows, prior)
 
 
 @dataclass(frozen=True)
@@ -116,27 +208,6 @@ class Outliers:
 
     poses: NDArray[np.intp]
     chi2: float
-
-
-def outliers(fit: Fit, total: int) -> Outliers:
-    """
-    Find the outliers among the poses of a fit.
-
-    Parameters
-    ----------
-    fit : Fit
-        Fit to the poses that are kept so far.
-    total : int
-        Number of poses before any was left out.
-
-    Returns
-    -------
-    Outliers
-        At most `LARGEST_SHARE` of all poses, and at most so many that the other equations identify
-        them.
-
-    """
-    return outliers_among(fit.by_pose, fit.chi2, fit.dof, total, noise_known=fit.noise_known)
 
 
 def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_known: bool
@@ -283,189 +354,3 @@ def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bo
     largest = np.argsort(-size, kind='stable')[:limit]
     found = np.sort(largest[extreme[largest]])
     return Outliers(found, max(chi2 - float(np.sum(alone[found])), 0.0))
-
-
-_ROUNDS = 6
-"""Largest number of fits after which poses are left out or included."""
-
-_SUSPICIOUS = 4.0
-"""chi² per degree of freedom above which the fit of all poses is suspicious."""
-
-_CLEARLY = 10.0
-"""Ratio of the variances above which a pose that the robust fit leaves out is an outlier. The
-choice among subsets makes small differences look significant, so a smaller ratio is ignored;
-`.outliers` decides about the other poses."""
-
-_MOST_SUBSETS = 400
-"""Largest number of subsets that are fitted."""
-
-_SPARE = 3
-"""Number of poses in a random subset beyond the free parameters."""
-
-_CONCENTRATIONS = 3
-"""Number of closed forms after each of which the nearest poses are selected again."""
-
-
-def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
-    """
-    Fit a model to poses of unknown orientation, without the outliers.
-
-    Parameters
-    ----------
-    name : {'4', '7', '10'}
-        The model.
-    poses_g : Poses
-        Poses in g, at least as many as free parameters.
-
-    Returns
-    -------
-    Fit, (k,) array of int
-        The fit, and the indices of the poses used.
-
-    Raises
-    ------
-    NotConvergedError
-        If the poses are not on an ellipsoid.
-
-    """
-    everyone = np.arange(len(poses_g))
-    direct = _without_outliers(name, poses_g, everyone)
-    if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):
-        return direct
-    robust = _from_those_that_agree(name, poses_g)
-    if robust is None:
-        if direct is None:
-            raise NotConvergedError
-        return direct
-    found, gross = direct, _grossest_first(*robust, poses_g)
-    for count in range(len(gross) + 1):
-        if found is not None and found[0].variance <= _CLEARLY * robust[0].variance:
-            return found
-        found = _without_outliers(name, poses_g, np.setdiff1d(everyone, gross[:count + 1]))
-    return robust
-
-
-def start_of(name: str, reading: Floats) -> Model:
-    """Return start values by the closed form; a sphere if the poses are not on an ellipsoid."""
-    mat_w, vec_v = closed_form(name, reading)
-    if not np.all(np.isfinite(mat_w)):
-        mat_w, vec_v = closed_form('4', reading)
-    values = linear_values(mat_w, vec_v)
-    return Model({effect: values[effect] for effect in MODELS[name].effects})
-
-
-def _grossest_first(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.intp]:
-    """Return the poses that a fit leaves out, in decreasing order of the residual."""
-    out = np.setdiff1d(np.arange(len(poses_g)), kept)
-    away = np.abs(judge(fit.model, poses_g).residual[out])
-    return out[np.argsort(-away, kind='stable')]
-
-
-def _without_outliers(name: str, poses_g: Poses, kept: NDArray[np.intp]
-                      ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
-    fit = _fit(name, poses_g, kept)
-    for _ in range(_ROUNDS):
-        out = () if fit is None else outliers(fit, len(poses_g)).poses
-        if not len(out):
-            break
-        kept = np.delete(kept, out)
-        fit = _fit(name, poses_g, kept)
-    if fit is None:
-        return None
-    if len(kept) < len(poses_g):
-        return _with_those_that_agree(name, poses_g, kept) or (fit, kept)
-    return fit, kept
-
-
-def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Fit the poses that agree best, and include those that agree with them."""
-    most = _most(name, len(poses_g))
-    if most < 1:
-        return None
-    return _with_those_that_agree(name, poses_g, _agreeing(name, poses_g, most))
-
-
-def _with_those_that_agree(name: str, poses_g: Poses, kept: NDArray[np.intp]
-                           ) -> tuple[Fit, NDArray[np.intp]] | None:
-    """Include the poses that agree with a fit, leave out the others; None if too few agree."""
-    tried: set[bytes] = set()
-    while (fit := _fit(name, poses_g, kept)) is not None:
-        tried.add(kept.tobytes())
-        agreeing = np.flatnonzero(_agrees(fit, kept, poses_g))
-        if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
-            return None
-        if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
-            return fit, kept
-        kept = agreeing
-    return None
-
-
-def _fit(name: str, poses_g: Poses, kept: NDArray[np.intp]) -> Fit | None:
-    now = poses_g.take(kept)
-    try:
-        return estimate(start_of(name, now.reading), now)
-    except NotConvergedError:
-        return None
-
-
-def _most(name: str, count: int) -> int:
-    """Return the largest number of poses that can be left out."""
-    return min(int(LARGEST_SHARE * count), (count - _free(name)) // 2)
-
-
-def _free(name: str) -> int:
-    return len(parameter_names(MODELS[name].effects))
-
-
-def _agrees(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> NDArray[np.bool_]:
-    """Return which poses agree with a fit to the poses kept."""
-    data = judge(fit.model, poses_g).by_pose
-    leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
-    inside = np.isin(np.arange(len(poses_g)), kept)
-    spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
-    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
-    size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
-    agrees: NDArray[np.bool_] = beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
-    return agrees
-
-
-def _agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
-    """Return the indices of all poses but `most`, selected so that they agree best."""
-    count = len(poses_g)
-    reading = poses_g.reading
-    noise = noise_of(poses_g)
-    noise = np.ones_like(reading) if noise is None else noise
-    nearest = _subsets(count, most, _free(name))
-    for _ in range(_CONCENTRATIONS):
-        squared = _squared_distances(name, reading, nearest, noise)
-        nearest = np.argsort(squared, axis=1)[:, :count - most]
-        trimmed = np.take_along_axis(squared, nearest, axis=1).sum(axis=1)
-        nearest = nearest[np.argsort(trimmed)[:10]]
-    return np.sort(nearest[0])
-
-
-def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
-    """Return all subsets of count - most poses, or `_MOST_SUBSETS` random subsets."""
-    if comb(count, most) <= _MOST_SUBSETS:
-        out = np.array(list(combinations(range(count), most)))
-        inside = np.ones((len(out), count), bool)
-        np.put_along_axis(inside, out, False, axis=1)
-        return np.nonzero(inside)[1].reshape(len(out), -1)
-    size = min(free + _SPARE, count - most)
-    rng = np.random.default_rng(count)
-    return np.argsort(rng.random((_MOST_SUBSETS, count)), axis=1)[:, :size]
-
-
-def _squared_distances(name: str, reading: Floats, subsets: NDArray[np.intp], noise: Floats
-                       ) -> Floats:
-    """Return the (s, n) squared distances of all poses from the closed form of each subset."""
-    with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane
-        mat_w, vec_v = closed_form(name, reading[subsets])
-        sound = np.isfinite(mat_w).all(axis=(1, 2)) & (np.abs(np.linalg.det(mat_w)) > 0.0)
-        inverse = np.linalg.inv(np.where(sound[:, np.newaxis, np.newaxis], mat_w, np.eye(3)))
-        u = (reading - vec_v[:, np.newaxis]) @ np.swapaxes(inverse, 1, 2)
-        length = np.linalg.norm(u, axis=2)
-        along = (u / length[:, :, np.newaxis]) @ inverse
-        squared = (length - 1.0) ** 2 / np.sum((along * noise) ** 2, axis=2)
-    return np.where(sound[:, np.newaxis] & np.isfinite(squared), squared, np.inf)

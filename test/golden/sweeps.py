@@ -50,6 +50,7 @@ from inside import (
     equations,
     fault_of,
     is_over,
+    measured,
     missing_poses,
     Model,
     mounting,
@@ -460,7 +461,7 @@ def near_models() -> Any:
             'orientation': K // 2}, 'mixed': {'orientation': np.maximum(K // 2, 5) + (
                 K > 20) * K}}.items():
         poses = made.with_columns(**columns)
-        near = equations(model, poses, noise_of(poses))
+        near = equations(model, measured(poses))
         found[name] = [near.residual, near.pose, near.scale, near.count, near.force, near.columns(
             model), near.of_poses(near.residual), attempt(lambda poses=poses: of_fit(
                 estimate(model, poses)))]
