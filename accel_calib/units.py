@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, get_args, Literal
 
 import numpy as np
@@ -47,12 +48,12 @@ class Units:
         if not self.per_g > 0.0:
             raise ValueError(f'per_g is {self.per_g}, expected a positive number')
 
-    @property
+    @cached_property
     def is_native(self) -> bool:
         """Whether the scale is not known, and a fit estimates it."""
         return is_native(self.name)
 
-    @property
+    @cached_property
     def is_si(self) -> bool:
         """Whether it is m/s², the unit of Imu messages."""
         return self.name == 'm/s2'

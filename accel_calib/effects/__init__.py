@@ -88,7 +88,6 @@ from .forward import (
     too_large,
     turn_between,
     with_linear_part,
-    with_vector,
 )
 from .model import (
     AtContext,
@@ -98,6 +97,7 @@ from .model import (
     LARGEST_ITERATIONS,
     Model,
     times,
+    with_vector,
 )
 from .thermal import (
     acting_temperature,

@@ -342,8 +342,7 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
     return rest[0], rest[1], modes
 
 
-@cache
-def empirical(name: str) -> Effect:
+def _empirical(name: str) -> Effect:
     """Return the effect of an empirical curve, from its name."""
     carrier, variable, modes = empirical_parts(name)
     whole, _, part = carrier.partition('.')
@@ -400,12 +399,14 @@ def is_effect(name: str) -> bool:
     return True
 
 
+@cache
 def effect_named(name: str) -> Effect:
     """Return the effect with this name: from the catalogue, or an empirical curve."""
     found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
-    return found or empirical(name)
+    return found or _empirical(name)
 
 
+@cache
 def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
     return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)

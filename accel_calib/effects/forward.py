@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from .catalogue import EFFECTS
 from .form import Context
-from .model import Model, terms_of, times
+from .model import Model, times
 from ..errors import InputError
 from ..geometry import unit
 from ..table import Floats, numbered, Poses, Recording
@@ -69,12 +69,6 @@ MODELS: dict[str, ModelForm] = {
 }
 """The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
 sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
-
-
-def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
-    """Return the model of these effects with the (p,) vector of all values and ΔR = I."""
-    parts = terms_of(effects).parts
-    return Model({name: vector[part] for name, part in zip(effects, parts, strict=True)})
 
 
 def with_linear_part(mat_w: Floats, vec_v: Floats) -> Model:
@@ -282,16 +276,9 @@ def _between(start: Floats, end: Floats) -> Floats:
 def turn_between(start: Floats, end: Floats, seconds: float, count: int
                  ) -> tuple[Floats, Floats]:
     """
-    Return a smooth turn along the shortest arc, as `path` does.
+    Return a smooth turn between two directions along the shortest arc, as `path` does.
 
-    Parameters
-    ----------
-    start, end : (3,) array
-        Directions of up, unit vectors.
-    seconds : float
-        Duration [s].
-    count : int
-        Number of samples, all of them between both directions.
+    It takes `seconds` and has `count` samples, all of them between both directions.
 
     """
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
@@ -307,21 +294,10 @@ def turn_between(start: Floats, end: Floats, seconds: float, count: int
 
 def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple[Floats, Floats]:
     """
-    Return the path of a sensor that rests in each direction and turns smoothly to the next.
+    Return force [g] and angular rate [rad/s] along a path, (m, 3) each, in the levelled frame.
 
-    Parameters
-    ----------
-    directions : (n, 3) array
-        Unit vectors.
-    rate_hz : float
-        Samples per second.
-    dwell, turn : float
-        Duration of each rest and of each turn [s].
-
-    Returns
-    -------
-    (m, 3) array, (m, 3) array
-        Specific force [g] and angular rate [rad/s] of each sample, both in the levelled frame.
+    The sensor rests in each of the (n, 3) directions for `dwell` [s], and turns smoothly to the
+    next in `turn` [s].
 
     """
     resting, turning = max(1, round(dwell * rate_hz)), max(1, round(turn * rate_hz))

@@ -46,20 +46,9 @@ class Terms:
     """
     The t terms of a list of effects as arrays, so that a model adds all of them at once.
 
-    Parameters
-    ----------
-    effects : tuple of Effect
-        The effects.
-    parts : tuple of slice
-        Values of each effect among all p values.
-    monomials : tuple of int
-        Indices in `MONOMIALS` that the terms use.
-    place : (t,) array of int
-        Index of the term's monomial in `monomials`.
-    axis, value : (t,) array of int
-        Axis of the reading; index of the parameter among all p values.
-    weight : (t,) array
-        Constant factor.
+    `parts` are the values of each effect among all p values. For each term, `place` is the index
+    in `monomials` (those of `MONOMIALS` that are used), `axis` that of the reading, `value` that
+    of its parameter among all values, and `weight` the constant factor.
 
     """
 
@@ -159,19 +148,7 @@ def _sums(index: Indices, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Basis:
-    """
-    Derivative of the reading by the values of a model, term by term.
-
-    Parameters
-    ----------
-    terms : (t, n) array
-        What each term adds to its axis per unit of its value.
-    axis : (t,) array of int
-        Axis of each term.
-    to_value : (p, t) array
-        Sums the terms by value.
-
-    """
+    """Derivative of the reading: (t, n) terms, the axis of each, and (p, t) sums by value."""
 
     terms: Floats
     axis: Indices
@@ -194,16 +171,8 @@ class AtContext:
     """
     A model with its context fixed, for each of n poses or in common for all poses.
 
-    Parameters
-    ----------
-    mat_w : (n, 3, 3) or (3, 3) array
-        W of each pose, or of all.
-    vec_v : (n, 3) or (3,) array
-        V of each pose, or of all [g].
-    terms : Terms
-        All terms of the model.
-    bend : (b, n) or (b, 1) array
-        Coefficients of the bending terms.
+    W is (n, 3, 3) or (3, 3), V (n, 3) or (3,) [g]; `bend` (b, n) or (b, 1) are the coefficients of
+    the bending terms among `terms`.
 
     """
 
@@ -344,7 +313,8 @@ class Model:
         for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
             end = part.stop - len(shape)
             found[part.start:end] = True
-            found[[end + place for place in fitted_places(effect, shape)]] = True
+            if len(shape):
+                found[[end + place for place in fitted_places(effect, shape)]] = True
         return found
 
     @cached_property
@@ -428,6 +398,12 @@ class Model:
                     change = difference(effect.factor, context, shape, place)
                     yield (plain[which] * values * np.nan_to_num(change), which,
                            part.stop - len(shape) + place)
+
+
+def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
+    """Return the model of these effects with the (p,) vector of all values and ΔR = I."""
+    parts = terms_of(effects).parts
+    return Model({name: vector[part] for name, part in zip(effects, parts, strict=True)})
 
 
 def check_context(model: Model, context: Mapping[str, Any]) -> None:

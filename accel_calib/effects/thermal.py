@@ -73,23 +73,11 @@ def rate_at(context: Mapping[str, Any]) -> Any:
 
 def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sensor: bool) -> Any:
     """
-    Return the temperature that acts with a lag [°C].
+    Return the (n,) temperature that acts with a lag [°C].
 
-    Parameters
-    ----------
-    context : mapping of str to array
-        Columns ``time`` and ``temperature``, n rows each. The rows are the whole history.
-    key : str
-        Column of the context that is returned if it is present.
-    lag : float
-        Lag [s].
-    of_sensor : bool
-        Whether the temperature sensor lags; otherwise the die lags.
-
-    Returns
-    -------
-    (n,) array
-        The temperature; for one row alone it is the recorded temperature.
+    The rows of ``time`` and ``temperature`` are the whole history; for one row alone it is the
+    recorded temperature. The temperature sensor lags if `of_sensor`, otherwise the die. The column
+    `key` is returned if it is present.
 
     """
     if key in context:
@@ -102,20 +90,7 @@ def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sens
 
 
 def rate_of(time: Floats, temperature: Floats) -> Floats:
-    """
-    Estimate the rate of the temperature at poses.
-
-    Parameters
-    ----------
-    time, temperature : (n,) array
-        Time [s] and temperature [°C] of each pose.
-
-    Returns
-    -------
-    (n,) array
-        Rate [°C/s]; NaN where time or temperature is NaN.
-
-    """
+    """Return the (n,) rate of the temperature at poses [°C/s]; NaN where an input is NaN."""
     known = np.isfinite(time) & np.isfinite(temperature)
     rate = np.full(len(time), np.nan)
     moments, place = np.unique(_merged(time[known]), return_inverse=True)
@@ -174,22 +149,10 @@ def _motion(step: Floats) -> tuple[Floats, Floats]:
 def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats | None = None
                ) -> Floats:
     """
-    Return the low pass of a temperature, which starts in equilibrium.
+    Return the (n,) low pass of a temperature [°C], which starts in equilibrium.
 
-    Parameters
-    ----------
-    time, temperature : (n,) array
-        Time [s] and temperature [°C]; at equal times the temperature jumps.
-    lag : float
-        Time constant [s].
-    rate : (n,) array, optional
-        Rate of the temperature at these times [°C/s]; by default the temperature is linear between
-        them.
-
-    Returns
-    -------
-    (n,) array
-        The low pass [°C]; NaN where time or temperature is NaN.
+    At equal times the temperature jumps. With `rate` [°C/s] the temperature is cubic between the
+    times, otherwise linear. NaN where time or temperature is NaN.
 
     """
     found = np.full(len(time), np.nan)
@@ -360,15 +323,8 @@ class ThermalStream:
         """
         Add samples, in the order of time, and return the columns at each.
 
-        Parameters
-        ----------
-        time, temperature : (n,) array
-            Time [s] and temperature [°C]; rows without one of them have the columns NaN.
-
-        Returns
-        -------
-        dict of str to (n,) array
-            Temperatures that act [°C] and ``temperature_rate`` [°C/s].
+        Rows without time [s] or temperature [°C] have the columns NaN. The columns are the
+        temperatures that act [°C] and ``temperature_rate`` [°C/s].
 
         """
         keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))

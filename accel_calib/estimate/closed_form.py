@@ -11,9 +11,7 @@ they have any direction.
 Poses of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report,
 section 3).
 
-**Quadric.** The quadric through the readings of a still sensor, from the moments of the readings.
-
-Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
+**Quadric.** Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
 
     readingᵀ A reading - 2 readingᵀ A V + VᵀA V - B² = 0,   W⁻¹ = (A / B²)^(1/2)
 
@@ -22,11 +20,9 @@ the monomials of a reading. This cost depends on origin and scale. The readings 
 shifted and scaled by the sphere that fits them. Counts and volts then lead to the same result as
 m/s², without a loss of digits. Leading axes of all arrays are sensors.
 
-**Sensing axes.** The 9-parameter model: shifts, scales and the angles between the sensing axes
-(ESGI'95 report).
-
-Sensing axis i is a unit vector f_i with the reading m_i = b_i (f_i · a) + s_i. The reference axes
-e are fixed to the sensing axes by e1 = f1 and e2 in the f1-f2 plane, so that in these axes
+**Sensing axes.** Model 9 of the ESGI'95 report has shifts, scales and angles. Sensing axis i is a
+unit vector f_i with the reading m_i = b_i (f_i · a) + s_i. The reference axes e are fixed to the
+sensing axes by e1 = f1 and e2 in the f1-f2 plane, so that in these axes
 
     f1 = (1, 0, 0)
     f2 = (cos φ, sin φ, 0)
@@ -41,9 +37,7 @@ is lower triangular. The angles need not be small.
 then rotated (`lower_triangular`). `TIES` maps its nine parameters to the twelve values of the
 model.
 
-**Step.** A step of model 10 along the quadrics through the readings.
-
-With A = W⁻², b = A V and k = VᵀA V, |W⁻¹ (reading - V)| = 1 is
+**Step.** With A = W⁻², b = A V and k = VᵀA V, |W⁻¹ (reading - V)| = 1 of model 10 is
 
     readingᵀ A' reading - 2 b'ᵀ reading = 1,   A' = A / (1 - k),  b' = b / (1 - k)
 
@@ -77,15 +71,7 @@ _IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
 
 @dataclass(frozen=True)
 class Form:
-    """
-    The quadratic monomials r_i r_j of a quadric.
-
-    Parameters
-    ----------
-    first, second : (k,) array of int
-        i and j; pairs with i = j are first.
-
-    """
+    """The monomials r_i r_j of a quadric: (k,) arrays of i and j; pairs with i = j are first."""
 
     first: NDArray[np.intp]
     second: NDArray[np.intp]
@@ -131,24 +117,11 @@ def centred(reading: Floats) -> tuple[Floats, Floats]:
 
 def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
     """
-    Return the sphere from moments about the mean.
+    Return centre (..., 3) and radius (...) of the sphere through n readings r minus their mean.
 
     It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses. The
-    sum of all r is zero.
-
-    Parameters
-    ----------
-    second : (..., 3, 3) array
-        Sum of r rᵀ.
-    third : (..., 3) array
-        Sum of |r|² r.
-    count : int
-        Number of poses.
-
-    Returns
-    -------
-    (..., 3) array, (...) array
-        Centre and radius.
+    sum of all r is zero. `second` is the sum of r rᵀ, (..., 3, 3), and `third` that of |r|² r,
+    (..., 3).
 
     """
     trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
@@ -160,19 +133,9 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
 
 def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
     """
-    Fit the quadric whose matrix A has the entries of this form; other entries are zero.
+    Return W (..., 3, 3) and V (..., 3) of the quadric through (..., n, 3) readings in any unit.
 
-    Parameters
-    ----------
-    reading : (..., n, 3) array
-        Readings in any unit.
-    form : Form
-        `DIAGONAL` or `SYMMETRIC`.
-
-    Returns
-    -------
-    (..., 3, 3) array, (..., 3) array
-        W and V; NaN where the quadric is no ellipsoid.
+    Entries of A that are not in the form are zero. NaN where the quadric is no ellipsoid.
 
     """
     mean, r = centred(reading)
@@ -232,17 +195,9 @@ def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
 
 def along_quadrics(values: Floats, step: Floats) -> Floats:
     """
-    Return the values of model 10 after a step that is straight in A' and b'.
+    Return the (9,) values of model 10 after a step that is straight in A' and b'.
 
-    Parameters
-    ----------
-    values, step : (9,) array
-        Values of model 10, and the step to first order.
-
-    Returns
-    -------
-    (9,) array
-        The values after the step; NaN where the quadric is no ellipsoid.
+    The step is to first order. NaN where the quadric is no ellipsoid.
 
     """
     with np.errstate(all='ignore'):
@@ -298,20 +253,7 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
 
 
 def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
-    """
-    Fit an offset and one gain for all axes (AN5286 eq. 10-14).
-
-    Parameters
-    ----------
-    reading : (..., n, 3) array
-        Readings in any unit, n >= 4. Leading axes are separate sets.
-
-    Returns
-    -------
-    (..., 3, 3) array, (..., 3) array
-        W, in the unit of the readings per g, and V.
-
-    """
+    """Fit an offset and one gain (AN5286 eq. 10-14); arguments and result as `closed_form`."""
     mean, r = centred(reading)
     third = (r @ np.sum(r * r, axis=-2)[..., np.newaxis])[..., 0]
     centre, radius = sphere_of(r @ r.swapaxes(-1, -2), third, r.shape[-1])
@@ -351,17 +293,9 @@ def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
 
 def faces(reading: Floats) -> Floats | None:
     """
-    Return the direction of up in each pose, if the poses are exactly the six faces.
+    Return the (n, 3) directions of up if poses are exactly the six faces; otherwise None.
 
-    Parameters
-    ----------
-    reading : (n, 3) array
-        Readings in any unit.
-
-    Returns
-    -------
-    (n, 3) array or None
-        Unit vectors along the axes; None if the poses are not the six faces.
+    The readings are in any unit; the directions are unit vectors along the axes.
 
     """
     centre = (reading.max(axis=0) + reading.min(axis=0)) / 2.0
@@ -423,17 +357,9 @@ def sensing_axes(mat_w: Floats, vec_v: Floats) -> SensingAxes:
 
 def lower_triangular(mat_w: Floats) -> Floats:
     """
-    Rotate the axes of W so that e1 = f1 and e2 is in the f1-f2 plane.
+    Rotate the axes of W (3, 3) so that e1 = f1 and e2 is in the f1-f2 plane.
 
-    Parameters
-    ----------
-    mat_w : (3, 3) array
-        Gain in any axes.
-
-    Returns
-    -------
-    (3, 3) array
-        W Q for the rotation Q that makes it lower triangular with a positive diagonal.
+    W Q is lower triangular with a positive diagonal, for a rotation Q.
 
     """
     return np.linalg.cholesky(mat_w @ mat_w.T)

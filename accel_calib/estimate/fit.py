@@ -197,12 +197,7 @@ def free_of(model: Model) -> Floats:
 
 
 def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
-    """
-    Return a model at poses without fitting it; parameters as in `Fit`.
-
-    By default, all fitted values of the effects are free.
-
-    """
+    """Return a model at poses without a fit; by default all values that a fit changes are free."""
     ties = free_of(model) if ties is None else ties
     near = equations(model, measured(poses_g))
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
@@ -244,17 +239,10 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     ----------
     point_at : callable
         (q,) values -> residuals and derivative. The step solves residual = columns · step.
-    start : (q,) array
-        Start values.
-    lower, upper : (q,) array
-        Bounds of the values.
+    start, lower, upper : (q,) array
+        Start values, and bounds of the values.
     move : callable
         Values and step to first order -> values after the step; by default their sum.
-
-    Returns
-    -------
-    (q,) array, Point
-        The values at the minimum, with residuals and derivative.
 
     Raises
     ------
@@ -295,12 +283,7 @@ def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[n
 
 
 def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
-    """
-    Return the (q,) damped Gauss-Newton step, and the predicted decrease of the cost.
-
-    Combinations of values that the residuals do not determine are not changed.
-
-    """
+    """Return the damped step, 0 along undetermined values, and the predicted fall of the cost."""
     columns = now.columns * free
     size = np.sqrt(np.sum(columns ** 2, axis=0))
     size[size == 0.0] = 1.0
@@ -314,17 +297,7 @@ def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, 
 
 @dataclass(frozen=True)
 class Prior:
-    """
-    Normal distribution of the values of model 10 over sensors, before any pose.
-
-    Parameters
-    ----------
-    mean : (9,) array
-        Means [g].
-    covariance : (9, 9) array
-        Covariance [g²], positive definite.
-
-    """
+    """Distribution of the (9,) values of model 10 over sensors, before any pose [g], [g²]."""
 
     mean: Floats
     covariance: Floats
@@ -352,16 +325,10 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     poses_g : Poses
         Poses in g, of known, shared or unknown orientation, with the context of the effects.
     prior : Prior, optional
-        Distribution of the fitted values over sensors. The effects are then those of model 10. By
-        default there is no prior.
+        Distribution of the values of model 10 over sensors; by default none.
     factor : float, optional
         Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
         that of the residuals in the covariance.
-
-    Returns
-    -------
-    Fit
-        The model at the solution.
 
     Raises
     ------

@@ -17,14 +17,9 @@ relative to the noise of a pose, is
     √(Φ(d) M⁻¹ Φ(d)ᵀ)
 
 The largest value over the sphere is the dilution. It is about 1 for 12 poses that are spread
-evenly. `accel_calib.estimate.geometry` describes what the poses do not determine.
-
-**Identifiability.** Which parameters poses determine, how well, and which combinations they do not
-determine.
-
-The singular vectors of the rows of `accel_calib.estimate.geometry` are combinations of parameters,
-ordered by how well the poses determine them. The combinations that raise the dilution above the
-limit for a fit are not determined. They are described by as few parameters as possible.
+evenly. The singular vectors of the rows are combinations of parameters, ordered by how well the
+poses determine them. The combinations that raise the dilution above the limit for a fit are not
+determined. They are described by as few parameters as possible.
 
 """
 
@@ -141,25 +136,10 @@ def spectrum(name: str, directions: Floats, noise: Floats | None = None
     """
     Return the combinations of parameters of a model, ordered by how well poses determine them.
 
-    Parameters
-    ----------
-    name : {'4', '7', '9', '10', '12'}
-        The model.
-    directions : (n, 3) array
-        Unit vectors of force in the sensor axes; n can be 0.
-    noise : (n,) array, optional
-        Noise of each pose, in any unit; by default equal for all poses.
-
-    Returns
-    -------
-    (p,) array
-        Standard deviation of each combination, relative to the noise of a pose, in increasing
-        order; infinite if the poses do not determine the combination.
-    (p, p) array
-        The combinations as rows of length 1.
-    (p, m) array
-        Squared error of |force| in m directions, relative to that of a pose, from all
-        combinations up to this one.
+    Arguments as in `identifiability`; n can be 0. Returns the (p,) standard deviation of each
+    combination, relative to the noise of a pose, in increasing order (infinite: not determined);
+    the (p, p) combinations as rows of length 1; and the (p, m) squared error of |force| in m
+    directions, relative to that of a pose, from all combinations up to this one.
 
     """
     triangle = np.linalg.qr(_weighted_rows(name, directions, noise), mode='r')
@@ -180,13 +160,9 @@ def times(share: Floats, deviations: Floats) -> Floats:
 
 def dilution(name: str, directions: Floats, noise: Floats | None = None) -> float:
     """
-    Return the dilution of poses for a model; parameters as in `spectrum`.
+    Return the largest error of |force| over the sphere, relative to that of a pose.
 
-    Returns
-    -------
-    float
-        Largest error of |force| over the sphere, relative to that of a pose; infinite if the poses
-        do not determine a parameter.
+    Infinite if the poses do not determine a parameter. Arguments as in `identifiability`.
 
     """
     rows = _weighted_rows(name, directions, noise)
@@ -301,12 +277,16 @@ class Identifiability:
 def identifiability(name: str, directions: Floats, noise: Floats | None = None
                     ) -> Identifiability:
     """
-    Compute what poses determine; parameters as in `accel_calib.estimate.geometry.spectrum`.
+    Return what poses determine of a model; it depends only on directions and noise.
 
-    Returns
-    -------
-    Identifiability
-        The result, which depends only on directions and noise.
+    Parameters
+    ----------
+    name : {'4', '7', '9', '10', '12'}
+        The model.
+    directions : (n, 3) array
+        Unit vectors of force in the sensor axes.
+    noise : (n,) array, optional
+        Noise of each pose, in any unit; by default equal for all poses.
 
     """
     deviations, axes, errors = spectrum(name, directions, noise)
@@ -341,24 +321,12 @@ def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
 def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats | None = None
                   ) -> float:
     """
-    Return the typical error of |force| if a model omits effects of a larger model.
+    Return the typical error of |force| if a model omits effects of a larger model [g].
 
     The omitted effects have their typical size (`accel_calib.effects`). The fit to these poses
-    partly absorbs them in its parameters, which changes the correction over the whole sphere.
-
-    Parameters
-    ----------
-    smaller, larger : {'4', '7', '9', '10'}
-        The models.
-    directions : (n, 3) array
-        Unit vectors of force in the sensor axes.
-    noise : (n,) array, optional
-        Noise of each pose, in any unit; by default equal for all poses.
-
-    Returns
-    -------
-    float
-        RMS over the sphere [g].
+    partly absorbs them in its parameters, which changes the correction over the whole sphere; the
+    error is RMS over the sphere. Both models are for poses of unknown orientation; directions and
+    noise as in `identifiability`.
 
     """
     effects = [effect for effect in left_out(smaller, larger) for _ in EFFECTS[effect].values]

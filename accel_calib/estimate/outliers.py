@@ -139,18 +139,10 @@ def _of_mixture(chi2: float, dof: int) -> float:
 @dataclass(frozen=True)
 class ByPose:
     """
-    The equations of a fit, by pose.
+    The equations of a fit by pose: k rows each, padded with 0.
 
-    Parameters
-    ----------
-    residual : (n, k) array
-        Residuals in units of the noise, padded with 0.
-    columns : (n, k, q) array
-        Derivative of the prediction, padded with 0.
-    rows : (n,) array of int
-        Number of equations of each pose.
-    prior : Point or None
-        Residuals and columns of the prior; None without a prior.
+    `residual` (n, k) and the derivative `columns` (n, k, q) are in units of the noise; `rows` (n,)
+    are the numbers of equations; `prior` has the rows of a prior.
 
     """
 
@@ -263,16 +255,9 @@ class _Removed:
     """
     Poses removed in turn.
 
-    Parameters
-    ----------
-    pose, rows : (k,) array of int
-        Index of the removed pose, and its number of equations.
-    size : (k,) array
-        Squared residual of this pose against the others, in units of its variance.
-    rss : (k + 1,) array
-        Sum of squared residuals before each removal, and at the end.
-    dof, count : int
-        Degrees of freedom and number of poses at the start.
+    `pose` and `rows` (k,) are the index and the number of equations of each; `size` (k,) its
+    squared residual against the others, in units of its variance; `rss` (k + 1,) the sum of
+    squared residuals before each removal, and at the end; `dof` and `count` belong to the start.
 
     """
 

@@ -91,24 +91,10 @@ _HARDLY = 0.1
 
 def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
     """
-    Fit a model to poses of unknown orientation, without the outliers.
+    Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
-    Parameters
-    ----------
-    name : {'4', '7', '10'}
-        The model.
-    poses_g : Poses
-        Poses in g, at least as many as free parameters.
-
-    Returns
-    -------
-    Fit, (k,) array of int
-        The fit, and the indices of the poses used.
-
-    Raises
-    ------
-    NotConvergedError
-        If the poses are not on an ellipsoid.
+    The poses are at least as many as free parameters. Returns the fit and the (k,) indices of the
+    poses used. Raises `NotConvergedError` if the poses are not on an ellipsoid.
 
     """
     everyone = np.arange(len(poses_g))
@@ -269,14 +255,9 @@ class Rival(NamedTuple):
     """
     A pose that may be wrong instead of a pose that was left out.
 
-    Parameters
-    ----------
-    left_out, instead : int
-        Indices of the pose left out and of its rival.
-    fit : Fit
-        Fit without the rival.
-    odds : float
-        Ratio of the probabilities: that the rival is wrong, over that the other pose is.
+    `left_out` and `instead` are the indices of the pose left out and of its rival, `fit` the fit
+    without the rival, and `odds` the probability that the rival is wrong over that of the other
+    pose.
 
     """
 
@@ -348,21 +329,10 @@ def _look_alikes(fit: Fit, kept: NDArray[np.intp], poses_g: Poses) -> Iterator[t
 
 def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Floats:
     """
-    Return the part of the residuals by a mistake of one pose that the other poses explain.
+    Return the (n,) part of the residuals by a mistake of one pose that each other pose explains.
 
-    Parameters
-    ----------
-    shift : (k,) array
-        The mistake, in units of the noise.
-    own, others : (k, q), (n, k, q) array
-        Derivative of the prediction at the pose and at the others.
-    spread : (q, q) array
-        (JᵀJ)⁻¹ of the others.
-
-    Returns
-    -------
-    (n,) array
-        Part that a mistake of each other pose explains, if all poses are fitted.
+    The mistake is `shift` (k,), in units of the noise. `own` (k, q) and `others` (n, k, q) are the
+    derivatives at the poses, and `spread` is (JᵀJ)⁻¹ of the others.
 
     """
     onto = spread @ own.T
@@ -391,13 +361,9 @@ def _log_probability(fit: Fit, belief: float) -> float:
 
 def unseen_mistakes(fit: Fit) -> Floats:
     """
-    Return the largest mistakes of poses that the test for outliers does not find.
+    Return the (n,) largest mistakes of poses along the force that the test does not find [g].
 
-    Returns
-    -------
-    (n,) array
-        Mistakes along the force [g]; 0 for poses that the others check well, and infinite for
-        poses that alone determine a parameter.
+    0 for poses that the others check well, infinite for poses that alone determine a parameter.
 
     """
     from scipy.special import stdtrit
