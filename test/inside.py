@@ -95,15 +95,22 @@ from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
 from accel_calib.live.server import PageServer, policy_hash
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.logs import are_samples, bag, bounded_bags, layout_with, open_bag, text
+from accel_calib.logs import (
+    are_samples,
+    bag_samples,
+    bounded_bags,
+    layout_with,
+    open_bag,
+    text,
+)
 from accel_calib.logs.ardupilot import read_dataflash
-from accel_calib.logs.bag import open_samples, together
+from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
+from accel_calib.logs.flight import MAGIC as ULG_MAGIC
+from accel_calib.logs.flight import read_ulg
 from accel_calib.logs.formats import named as format_named
-from accel_calib.logs.formats import recognise, record_instead
+from accel_calib.logs.formats import record_instead
 from accel_calib.logs.names import meaning, unit_of
-from accel_calib.logs.px4 import MAGIC as ULG_MAGIC
-from accel_calib.logs.px4 import read_ulg
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
@@ -187,8 +194,8 @@ PAGE_FOLDER = Path(server.__file__).parent / 'page'
 
 # Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
 ROWS_OF_A_TEXT = text, 'ROWS'
-ROWS_OF_A_BAG = bag, '_ROWS'
-BLOCK_OF_A_BAG = bag, 'BLOCK'
+ROWS_OF_A_BAG = bag_samples, '_ROWS'
+BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_VALUES_WRITTEN = calibration_yaml, 'MOST_VALUES'
 MOST_BYTES_WRITTEN = calibration_yaml, 'MOST_BYTES'

@@ -11,11 +11,12 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
+from accel_calib.logs import LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import units_of
-from inside import model_with, open_samples, simulate_poses, spread_directions, together
+from inside import model_with, simulate_poses, spread_directions, together
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
@@ -106,7 +107,7 @@ def write(path: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'mca
 
 
 def read(path: Path, **asked: str) -> tuple[Recording, tuple[str, ...]]:
-    with open_samples(path, **asked) as opened:
+    with open_log(path, LogOptions(**asked)) as opened:
         return together(list(opened.blocks)), opened.notes
 
 

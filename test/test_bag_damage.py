@@ -13,12 +13,11 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
-from accel_calib.logs import read_recording
+from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from bag_files import a_calibration, copied, COUNT, execute, MAKES, messages, TOPICS
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
-from inside import open_samples
 from mcap_file import McapFile, STORE
 import numpy as np
 import pytest
@@ -118,7 +117,7 @@ def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(
     (killed / 'bag.db3-shm').unlink()
     before = {each.name: each.read_bytes() for each in killed.iterdir()}
     for each in (killed, killed / 'bag.db3'):
-        with open_samples(each) as opened:
+        with open_log(each) as opened:
             assert sum(map(len, opened.blocks)) == 2 * COUNT
             assert 'its last messages are read from bag.db3-wal' in opened.notes[0]
     assert correct_bag(killed, calibration, tmp_path / 'out') == 2 * COUNT
@@ -159,7 +158,7 @@ def test_a_damaged_journal_ends_in_one_line_or_in_a_result(
 def test_a_folder_without_metadata_is_read(whole: dict[str, Path], tmp_path: Path) -> None:
     path = copied(whole['mcap folder'], tmp_path)
     (path / 'metadata.yaml').unlink()
-    with open_samples(path) as opened:
+    with open_log(path) as opened:
         assert sum(map(len, opened.blocks)) == COUNT
     assert opened.notes == (f'{path} has no metadata.yaml, as after a recorder was killed; '
                             'bag.mcap is read without it',)
@@ -169,7 +168,7 @@ def test_a_file_that_the_metadata_do_not_list_is_noted(whole: dict[str, Path],
                                                        tmp_path: Path) -> None:
     path = copied(whole['mcap folder'], tmp_path)
     shutil.copy(path / 'bag.mcap', path / 'later.mcap')
-    with open_samples(path) as opened:
+    with open_log(path) as opened:
         assert sum(map(len, opened.blocks)) == COUNT
     assert 'does not list file later.mcap' in opened.notes[0]
 
@@ -178,7 +177,7 @@ def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibratio
                                  tmp_path: Path) -> None:
     path = copied(whole['sqlite3'], tmp_path)
     execute(path / 'bag.db3', 'DELETE FROM messages WHERE rowid % 2')
-    with open_samples(path) as opened:
+    with open_log(path) as opened:
         found = sum(map(len, opened.blocks))
     assert 0 < found < COUNT
     expected = (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '

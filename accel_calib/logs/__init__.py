@@ -10,13 +10,22 @@ the fields in serialized messages, and `tables` writes our own tables.
 
 """
 
-from .bag import first_frame_id, imu_topic, is_bag, lost, of_sensor, plausible_samples
-from .bag_context import context_of, ContextTopics, QUANTITIES
-from .bag_reader import Bag, damage_as_input_error, open_bag
+from .bag import (
+    Bag,
+    damage_as_input_error,
+    first_frame_id,
+    imu_topic,
+    is_bag,
+    lost,
+    of_sensor,
+    open_bag,
+    plausible_samples,
+)
+from .bag_samples import context_of, ContextTopics, QUANTITIES
+from .columns import LogOptions
 from .formats import NAMES
-from .incoming import LineReader
-from .read import open_log, open_own, OwnTable, read_log, read_recording
-from .records import are_samples, Log, LogOptions, OpenLog, Progress
+from .quantities import are_samples
+from .read import LineReader, Log, open_log, OpenLog, Progress, read_log, read_recording
 from .serialized import (
     ACCELERATION,
     ACCELERATION_COVARIANCE,
@@ -47,8 +56,8 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
            'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'QUANTITIES', 'STAMP', 'STAMP_AT',
            'THREE', 'Bag', 'ContextTopics', 'Layout', 'LineReader', 'Log', 'LogOptions',
-           'Messages', 'OpenLog', 'OwnTable', 'Progress', 'are_samples', 'context_of',
+           'Messages', 'OpenLog', 'Progress', 'are_samples', 'context_of',
            'damage_as_input_error', 'doubles_at', 'first_frame_id', 'imu_topic', 'is_bag',
            'joined', 'layout_of', 'layout_with', 'lost', 'of_sensor', 'open_bag', 'open_log',
-           'open_own', 'plausible_samples', 'put_doubles', 'read_log', 'read_poses',
+           'plausible_samples', 'put_doubles', 'read_log', 'read_poses',
            'read_recording', 'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -19,17 +19,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import cast
+from typing import cast, Literal
 
 import numpy as np
 
 from . import formats
+from .columns import Chosen, LogOptions
 from .names import READING, unit_of
-from .records import LogOptions
-from .selection import Chosen
 from ..errors import InputError
 from ..table import Floats
-from ..units import DEFAULT_UNIT, is_native, known_per_g, STANDARD_GRAVITY, UnitName
+from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
 _WINDOWS = 400
 """Largest number of windows of a recording."""
@@ -63,16 +62,9 @@ _MG = (1000.0 / 1.3, 1012.0)
 @dataclass(frozen=True)
 class Rests:
     """
-    Readings at rest.
+    Readings at rest: median length, and radius of the sphere through them.
 
-    Parameters
-    ----------
-    length : float
-        Median length of the readings at rest.
-    radius : float
-        Radius of the sphere through them; NaN if they do not determine one.
-    whole : bool
-        Whether all readings are whole numbers.
+    The radius is NaN if they do not determine one. `whole`: all readings are whole numbers.
 
     """
 
@@ -91,7 +83,7 @@ class Rests:
         return all(1.0 / factor <= length / per_g <= factor for length in lengths)
 
     @property
-    def unit(self) -> tuple[str, float] | None:
+    def unit(self) -> tuple[UnitName, float] | None:
         """Return the unit of the readings and the factor to it; None if it is not common."""
         if self.near(STANDARD_GRAVITY):
             return 'm/s2', 1.0
@@ -105,10 +97,7 @@ class Rests:
         """
         Return whether gravity is not in the readings: they are small and on no sphere.
 
-        Parameters
-        ----------
-        per_g : float or None
-            1 g in the stated unit of the readings, or None if the unit is not known.
+        `per_g` is 1 g in the stated unit of the readings, or None if the unit is not known.
 
         """
         small = _SMALL if per_g is None else _SMALL_G * per_g
@@ -116,17 +105,7 @@ class Rests:
 
 
 def rests_of(reading: Floats, *, samples: bool) -> Rests:
-    """
-    Return the readings at rest of the first block of a log.
-
-    Parameters
-    ----------
-    reading : (n, 3) array
-        Readings, in the unit of the file.
-    samples : bool
-        Whether rows are samples; otherwise each row is a pose at rest.
-
-    """
+    """Return the rests in (n, 3) readings in the unit of the file; rows are samples or poses."""
     still = _quiet(reading) if samples else reading
     with np.errstate(over='ignore', invalid='ignore'):
         length = float(np.median(np.linalg.norm(still, axis=1)))
@@ -184,7 +163,7 @@ class ReadingUnit:
 
     Parameters
     ----------
-    name : {'m/s2', 'g', 'native'}
+    units : Units
         The unit.
     factor : float
         Factor from the unit of the file.
@@ -195,7 +174,7 @@ class ReadingUnit:
 
     """
 
-    name: UnitName
+    units: Units
     factor: float
     words: tuple[str, ...]
     assumed: bool
@@ -230,41 +209,43 @@ def unit_of_reading(columns: Chosen, raw: Floats, options: LogOptions, *, sample
         factor = 1.0
     rests = rests_of(raw * factor, samples=samples)
     name = stated or named
-    _check_gravity(columns, rests, name, options.gravity)
+    _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
     if not name:
         name, factor = _at_rest(columns, rests)
     elif not stated:
-        _check_named(columns, rests, name)
-    own = [columns.sources[each].name for each in READING] == list(READING)
-    words = _words(columns, rests, name, factor, stated=bool(stated))
-    assumed = not own or (not stated and name != DEFAULT_UNIT)
-    return ReadingUnit(cast(UnitName, name), factor, words, assumed)
+        _check_named(columns, rests, units_of(name))
+    units = units_of(name, options.gravity)
+    words = _words(columns, rests, units, factor, stated=bool(stated))
+    assumed = (columns.names(READING) != list(READING) or not (stated or units.is_si))
+    return ReadingUnit(units, factor, words, assumed)
 
 
-def _named(columns: Chosen) -> tuple[UnitName | str, float]:
+def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
     """Return the unit that the maker or the names state, and the factor to it."""
     if columns.maker is not None and columns.maker.units:
         return columns.maker.units, columns.maker.scales.get('ax', 1.0)
     found = {unit_of('reading', columns.sources[name].unit) for name in READING}
     if len(found) > 1:
-        words = ', '.join(columns.sources[name].name for name in READING)
-        raise InputError(f'{columns.layout.path} has the columns {words} in several units, '
-                         'expected one unit', 'correct the names, or convert the columns')
-    return found.pop() or ('', 1.0)
+        raise InputError(f'{columns.layout.path} has the columns '
+                         f'{", ".join(columns.names(READING))} in several units, expected one '
+                         'unit', 'correct the names, or convert the columns')
+    name, factor = found.pop() or ('', 1.0)
+    return cast(UnitName, name), factor
 
 
-def _stated(columns: Chosen, options: LogOptions) -> UnitName | str:
+def _stated(columns: Chosen, options: LogOptions) -> UnitName | Literal['']:
     """Return the unit that the user or a comment states."""
-    path, of_file = columns.layout.path, str(columns.layout.about.get('units', ''))
+    path, of_file = columns.layout.path, columns.layout.about.get('units', '')
     if options.units and of_file and options.units != of_file:
         raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
                          'remove --units, or correct the file')
-    return options.units or of_file
+    return options.units or cast(UnitName, of_file)
 
 
-def _check_gravity(columns: Chosen, rests: Rests, name: str, gravity: float) -> None:
-    """Check that gravity is in the readings."""
-    if is_native(name) or not rests.lack_gravity(known_per_g(name, gravity)):
+def _check_gravity(columns: Chosen, rests: Rests, units: Units | None) -> None:
+    """Check that gravity is in the readings; `units` is the stated unit, if any."""
+    per_g = None if units is None else units.per_g
+    if (units is not None and units.is_native) or not rests.lack_gravity(per_g):
         return
     layout = columns.layout
     instead = formats.record_instead(layout.header, layout.path)
@@ -274,7 +255,7 @@ def _check_gravity(columns: Chosen, rests: Rests, name: str, gravity: float) -> 
                      'acceleration')
 
 
-def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName | str, float]:
+def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName, float]:
     """Return the unit that the readings at rest show, and the factor to it."""
     own = columns.sources['ax'].name == 'ax'
     if own and rests.unit is None and rests.near(STANDARD_GRAVITY, _STATED_FACTOR):
@@ -282,27 +263,27 @@ def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName | str, float]:
     return rests.unit or ('native', 1.0)
 
 
-def _check_named(columns: Chosen, rests: Rests, name: str) -> None:
+def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
     """Check that the readings at rest fit the unit in the names."""
-    per_g = known_per_g(name)
-    if per_g is None or 1.0 / _STATED_FACTOR <= rests.length / per_g <= _STATED_FACTOR:
+    if units.is_native or (1.0 / _STATED_FACTOR <= rests.length / units.per_g
+                           <= _STATED_FACTOR):
         return
     likely = rests.unit
     advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
               'correct the name, or add --units native')
-    of_maker = columns.maker is not None and bool(columns.maker.units)
-    what = (f'the format {columns.maker.name}' if columns.maker is not None and of_maker else
+    maker = columns.maker
+    what = (f'the format {maker.name}' if maker is not None and maker.units else
             f'the name {columns.sources["ax"].name!r}')
-    raise InputError(f'{columns.layout.path}: {what} states readings in {name}, but at rest they '
-                     f'have a length of {rests.length:.4g} {name}, expected about '
-                     f'{per_g:.4g}', advice)
+    raise InputError(f'{columns.layout.path}: {what} states readings in {units.name}, but at rest '
+                     f'they have a length of {rests.length:.4g} {units.name}, expected about '
+                     f'{units.per_g:.4g}', advice)
 
 
-def _words(columns: Chosen, rests: Rests, name: str, factor: float, *, stated: bool
+def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool
            ) -> tuple[str, ...]:
     """Return how the readings are read."""
-    words = compact([columns.sources[each].name for each in READING])
-    if is_native(name) and not stated:
+    words, name = compact(columns.names(READING)), units.name
+    if units.is_native and not stated:
         value = f'{_size(rests.per_g)}{" counts" if rests.whole else ""}'
         about = 'at rest' if math.isnan(rests.radius) else '= 1 g'
         return words, f'{value} {about} (native)'

@@ -38,14 +38,12 @@ from .flight import (
     choose,
     finite,
     FlightLog,
-    is_number,
     Message,
     MICRO,
     missing,
-    others,
-    RATES,
+    sound,
     sound_log,
-    sound_rows,
+    taken,
 )
 from ..errors import InputError
 from ..table import Floats
@@ -76,7 +74,7 @@ _Table = dict[str, NDArray[Any]]
 
 def is_dataflash(path: Path) -> bool:
     """Return whether a file is an ArduPilot log, binary or text, from its first bytes."""
-    return path.is_file() and _kind(path) != ''
+    return path.is_file() and bool(_kind(path))
 
 
 def _kind(path: Path) -> Literal['binary', 'text', '']:
@@ -102,11 +100,6 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     sensor : str
         Number of the sensor; by default the lowest. Another text is a name for the sensor.
 
-    Returns
-    -------
-    FlightLog
-        The samples in m/s².
-
     Raises
     ------
     InputError
@@ -122,21 +115,16 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
                          'check that this is the intended file')
     tables, notes = _binary(path) if kind == 'binary' else _text(path)
     found = _messages(tables)
-    chosen = choose(found, PREFERRED, topic, sensor, str(path))
-    columns = {key: np.asarray(chosen.fields[name], float) for key, name in zip(AXES, _READING)}
-    valid = sound_rows(columns)
-    if not np.all(valid):
-        notes.append(f'{counted(int(np.sum(~valid)), "row")} of {chosen} left out: the reading '
-                     'is not a number')
-    time = chosen.time[valid]
-    warm = _temperature(chosen, time, found)
-    name = sensor if sensor and not is_number(sensor, found) else str(chosen)
-    read_as = (f'ArduPilot log, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, x forward, y right, '
-               'z down' + (', temperature T' if warm else ''))
-    notes += [*others(chosen, found, PREFERRED), *_corrected(tables)]
-    return FlightLog({'time': time, **{key: values[valid] for key, values in columns.items()},
-                      **_rates(chosen, time, found), **warm}, 'm/s2', name, read_as,
-                     tuple(notes))
+    choice = choose(found, PREFERRED, topic, sensor, str(path))
+    chosen = choice.message
+    columns, dropped = sound(
+        chosen, {'time': chosen.time, **taken(chosen.fields, AXES, _READING)},
+        'the reading is not a number')
+    sources = (each for each in (chosen, *found) if each.instance == chosen.instance)
+    columns |= choice.rates(columns['time'], sources, _RATES)
+    columns |= _temperature(chosen, columns['time'], found)
+    return choice.log('ArduPilot log', columns, 'temperature T',
+                      (*notes, *dropped, *choice.others(), *_corrected(tables)))
 
 
 def _messages(tables: Mapping[str, _Table]) -> list[Message]:
@@ -151,9 +139,9 @@ def _messages(tables: Mapping[str, _Table]) -> list[Message]:
         instances = _instances(table, len(table[stamp]), max(int(match[2] or 1) - 1, 0))
         for instance in np.unique(instances).tolist():
             of = instances == instance
-            time = table[stamp][of].astype(float) * _STAMPS[stamp]
-            found.append(Message(match[1], instance, {key: values[of] for key, values
-                                                      in table.items()}, time))
+            fields = {key: values[of] for key, values in table.items()}
+            found.append(Message(match[1], instance, fields,
+                                 fields[stamp].astype(float) * _STAMPS[stamp]))
     return found
 
 
@@ -176,25 +164,13 @@ def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dic
     return {}
 
 
-def _rates(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
-    """Return the angular rates of IMU, or of GYR with the same number, if they are as dense."""
-    for each in (chosen, *found):
-        if (each.instance == chosen.instance and set(_RATES) <= set(each.fields)
-                and each.rate_hz >= 0.5 * chosen.rate_hz):
-            rates = {key: np.asarray(each.fields[name], float)
-                     for key, name in zip(RATES, _RATES)}
-            if finite(*rates.values()):
-                return {key: at(time, each, values) for key, values in rates.items()}
-    return {}
-
-
 def _corrected(tables: Mapping[str, _Table]) -> list[str]:
     """Return a note on the calibration that the readings hold already."""
     values = _parameters(tables.get('PARM', {}))
-    stored = {name: value for name, value in values.items() if _CALIBRATED.fullmatch(name)
-              and value != (1.0 if 'SCAL' in name else 0.0)}
     if not values:
         return ['readings are corrected by the INS_ACC parameters that the vehicle had']
+    stored = {name: value for name, value in values.items() if _CALIBRATED.fullmatch(name)
+              and value != (1.0 if 'SCAL' in name else 0.0)}
     if not stored:
         return []
     shown = ', '.join(f'{name} {value:.4g}' for name, value in sorted(stored.items())[:3])
@@ -244,11 +220,14 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
         starts = np.array(log.offsets[number], dtype=np.int64) + 3
         if not _wanted(form.name) or not len(starts) or not _is_sound(form):
             continue
-        layout = _layout(form.format, form.columns)
+        layout = np.dtype([(name, _TYPES[letter])
+                           for name, letter in zip(form.columns, form.format)])
         whole = starts[starts + layout.itemsize <= len(data)]
         cut += len(starts) - len(whole)
         rows = data[whole[:, np.newaxis] + np.arange(layout.itemsize)]
-        tables[form.name] = _scaled(rows.view(layout)[:, 0], form.format, form.columns)
+        values = rows.view(layout)[:, 0]
+        tables[form.name] = {name: values[name] * _SCALES[letter] if letter in _SCALES
+                             else values[name] for name, letter in zip(form.columns, form.format)}
     notes = [f'{counted(cut, "message")} cut off at the end'] if cut else []
     known = sum(len(log.offsets[number]) * form.len for number, form in log.formats.items())
     if known < len(data):
@@ -259,17 +238,6 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
 def _is_sound(form: Any) -> bool:
     """Return whether a message has one letter for each field, and a name of its own for each."""
     return all(form.columns) and len(form.format) == len(form.columns) == len(set(form.columns))
-
-
-def _layout(letters: str, names: Sequence[str]) -> np.dtype[Any]:
-    """Return the type of a message from its letters and the names of its fields."""
-    return np.dtype([(name, _TYPES[letter]) for name, letter in zip(names, letters)])
-
-
-def _scaled(rows: NDArray[Any], letters: str, names: Sequence[str]) -> _Table:
-    """Return the fields of a message, in the units that their letters imply."""
-    return {name: rows[name] * _SCALES[letter] if letter in _SCALES else rows[name]
-            for name, letter in zip(names, letters)}
 
 
 def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:

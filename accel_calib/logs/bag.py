@@ -2,107 +2,290 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reader of the samples in bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
+Open bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-Serialized messages are joined to blocks of arrays (`accel_calib.logs.serialized`), so the memory
-needed does not depend on the length of the bag.
+`rosbags` reads the serialized messages. Damaged bytes cause many kinds of errors there, also long
+after the bag is open. `damage_as_input_error` is the only place that converts them.
 
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass
+import errno
+from functools import cache
+from itertools import islice
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .bag_context import context_of, ContextTopic, ContextTopics, Track
-from .bag_reader import Bag, BLOCK, IMU, is_bag, open_bag, Received, SUFFIXES
-from .serialized import frame_ids, Messages, samples_of
+from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
+from ..disk import check_regular
 from ..errors import InputError
-from ..table import Floats, Recording
+from ..table import Floats
 
-__all__ = ['Bag', 'OpenSamples', 'SUFFIXES', 'first_frame_id', 'imu_samples', 'imu_topic',
-           'is_bag', 'lost', 'of_sensor', 'open_bag', 'open_samples', 'plausible_samples',
-           'together']
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.typesys.store import Typestore
 
-_ROWS = 65536
-"""Smallest number of samples in a block of a recording."""
+IMU = 'sensor_msgs/msg/Imu'
+SUFFIXES = ('.bag', '.mcap', '.db3')
+BLOCK = 4096
+"""Number of messages per block; a block fits in the cache of the processor."""
 
 LARGEST = 1e6
 """Larger accelerations [m/s²] and rates [rad/s] are those of damaged bytes."""
 
-_HELD_BACK = 8
-"""Largest number of blocks that wait for a later temperature."""
+_BLOCK_BYTES = 1 << 24
+_AT_ONCE = 64
+"""Number of bytes above which a block ends, and of messages after which they are counted."""
+
+_LONGEST_REASON = 400
+"""Longest reason that is shown [characters]; damaged files have names of any length."""
+
+_BY_VALUE = (errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG,
+             errno.ENAMETOOLONG, errno.ENOTDIR)
+"""System errors that a damaged size or place in a file causes; others are not about its bytes."""
+
+NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
+           'uint64')
+_TIMES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
+
+Received = tuple['Connection', int, bytes]
+"""Connection, time of receipt [ns] and serialized message."""
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path names a bag rather than a table."""
+    return path.is_dir() or path.suffix in SUFFIXES
 
 
 @dataclass(frozen=True)
-class OpenSamples:
+class Bag:
     """
-    The samples of an open bag; `open_samples` makes it.
-
-    Parameters
-    ----------
-    blocks : iterator of Recording
-        The samples, in order. The size of a block does not depend on that of the bag.
-    samples : int
-        Number of samples, according to the index of the bag.
-    topic, sensor : str
-        Imu topic, and frame_id of its messages.
-    found : list of str
-        Notes; the last block can add some.
-
-    """
-
-    blocks: Iterator[Recording]
-    samples: int
-    topic: str
-    sensor: str
-    found: list[str]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return notes about topics and lost messages; complete after the last block."""
-        return tuple(self.found)
-
-
-@contextmanager
-def open_samples(path: Path, topic: str = '', sensor: str = '', *, temperature_topic: str = '',
-                 supply_topic: str = '') -> Iterator[OpenSamples]:
-    """
-    Open the samples of a bag.
+    An open bag; `open_bag` makes it.
 
     Parameters
     ----------
     path : Path
-        A rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``.
-    topic : str
-        Imu topic, for a bag with several Imu topics.
-    sensor : str
-        frame_id of the messages to read, for a topic with several sensors.
-    temperature_topic, supply_topic : str
-        As in `accel_calib.logs.bag_context.context_of`.
+        File or folder.
+    reader : Reader
+        The reader of `rosbags`.
+    ros2 : bool
+        Whether it is a rosbag2; otherwise it is a ROS 1 bag.
+    notes : tuple of str
+        Parts of the bag that are not read or were recovered.
+
+    """
+
+    path: Path
+    reader: Reader1 | Reader2
+    ros2: bool
+    notes: tuple[str, ...] = ()
+
+    def topics(self, msgtype: str) -> list[str]:
+        """Return the topics of a type, sorted."""
+        return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
+
+    def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
+        """Return the connections of a topic; a topic can have several."""
+        return [c for c in self.reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
+
+    def count(self, topic: str) -> int:
+        """Return the number of Imu messages of a topic, according to the index of the bag."""
+        return sum(connection.msgcount for connection in self.connections(topic))
+
+    @property
+    def stored(self) -> int:
+        """Return the number of all messages, according to the files rather than metadata.yaml."""
+        storage = getattr(self.reader, 'storage', self.reader)
+        return sum(connection.msgcount for file in getattr(storage, 'storages', [storage])
+                   for connection in file.connections)
+
+    def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
+               ) -> Iterator[list[Received]]:
+        """
+        Yield blocks of messages, in order of receipt; by default those of all connections.
+
+        A block has at most `size` messages; large messages make it shorter. A damaged bag is an
+        InputError.
+
+        """
+        with damage_as_input_error(self.path):
+            messages = self.reader.messages(connections)
+        while True:
+            with damage_as_input_error(self.path):
+                block = _next_block(messages, size)
+            if not block:
+                return
+            yield block
+
+    def first(self, topic: str, msgtype: str = IMU, size: int = 1) -> list[Received]:
+        """Return the first messages of a topic."""
+        return next(self.blocks(self.connections(topic, msgtype), size), [])
+
+    def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
+               ) -> Messages:
+        """Return messages of a topic as arrays; `before` is the number of earlier messages."""
+        return joined(raws, doubles, f'{self.path}, {topic}', ros2=self.ros2, before=before)
+
+    def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> list[tuple[Any, Any]]:
+        """Return stamp of the header (or None) and value of a field such as ``status.voltage``."""
+        with damage_as_input_error(self.path):
+            store = _types(block[0][0], ros2=self.ros2)
+            read = store.deserialize_cdr if self.ros2 else store.deserialize_ros1
+            rows = []
+            for _, _, raw in block:
+                value: Any = read(raw, msgtype)
+                stamp = getattr(getattr(value, 'header', None), 'stamp', None)
+                for name in field.split('.'):
+                    value = getattr(value, name)
+                rows.append((stamp, value))
+            return rows
+
+    def numbers(self, connection: Connection) -> tuple[str, ...]:
+        """Return the paths of the single numbers of a message, without headers and times."""
+        from rosbags.interfaces import Nodetype
+
+        with damage_as_input_error(self.path):
+            types = _types(connection, ros2=self.ros2).fielddefs
+
+            def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
+                for name, (kind, about) in types[msgtype][1]:
+                    if kind == Nodetype.BASE and str(about[0]) in NUMBERS:
+                        yield '.'.join((*path, name))
+                    elif kind == Nodetype.NAME and str(about) not in _TIMES:
+                        yield from below(str(about), (*path, name))
+
+            known = connection.msgtype in types
+            return tuple(below(connection.msgtype, ())) if known else ()
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """
+    Open a bag for reading.
 
     Raises
     ------
     InputError
-        If the bag is damaged, or a topic is missing or ambiguous; also while it is read.
-    OSError
-        If the file cannot be read.
+        If the bag is damaged; also later, while it is read.
+    FileNotFoundError
+        If the file is missing.
 
     """
-    with open_bag(path) as bag:
-        name = imu_topic(bag, topic)
-        of = sensor or first_frame_id(bag, name)
-        context = context_of(bag, name, of, temperature_topic, supply_topic)
-        found = [*bag.notes, *context.notes]
-        blocks = imu_samples(bag, name, of, chosen=bool(sensor), context=context, notes=found)
-        yield OpenSamples(blocks, bag.count(name), name, of, found)
+    from .bounded_bags import readable, Reader1, Reader2
 
+    if not path.is_dir():
+        check_regular(path)
+    ros2 = path.suffix != '.bag'
+    with ExitStack() as stack:
+        with damage_as_input_error(path):
+            source, notes = readable(path, stack)
+            reader = (Reader2 if ros2 else Reader1)(source)
+            reader.open()
+            stack.callback(_close, path, reader)
+            _check(reader)
+        yield Bag(path, reader, ros2, tuple(notes))
+
+
+def _close(path: Path, reader: Reader1 | Reader2) -> None:
+    with damage_as_input_error(path):
+        reader.close()
+
+
+@contextmanager
+def damage_as_input_error(path: Path) -> Iterator[None]:
+    """
+    Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside.
+
+    Errors of the system, such as a missing file or permission, pass.
+
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # damaged bytes cause many kinds of errors
+        if isinstance(err, OSError) and err.errno is not None and err.errno not in _BY_VALUE:
+            raise
+        reason = ' '.join(str(err)[:_LONGEST_REASON].split())
+        what = reason if ' ' in reason else f'{type(err).__name__} {reason}'.strip()
+        inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
+        raise InputError(f'{path} is damaged or not a bag ({what}), expected a rosbag2 folder, '
+                         '.mcap, .db3 or .bag', f'use another file{inside}; ros2 bag reindex may '
+                         'repair this one') from err
+
+
+def _check(reader: Any) -> None:
+    """Check the types of what `rosbags` reads from YAML or SQLite as stored."""
+    files = getattr(getattr(reader, 'storage', None), 'files', [])
+    if not isinstance(files, list):  # `rosbags` clears this list when it closes the bag
+        raise ValueError(f'files in metadata.yaml is {files!r}')
+    for each in reader.connections:
+        if not (isinstance(each.topic, str) and isinstance(each.msgtype, str)):
+            raise ValueError(f'a topic has the name {each.topic!r} and the type {each.msgtype!r}')
+        if not isinstance(each.msgcount, int) or each.msgcount < 0:
+            raise ValueError(f'topic {each.topic} has {each.msgcount!r} messages')
+
+
+def _next_block(messages: Iterator[Received], size: int) -> list[Received]:
+    """Return the next messages: at most `size`, and not many more bytes than `_BLOCK_BYTES`."""
+    block: list[Received] = []
+    left = _BLOCK_BYTES
+    while left > 0 and len(block) < size:
+        part = list(islice(messages, min(_AT_ONCE, size - len(block))))
+        _check_messages(part)
+        if not part:
+            break
+        block += part
+        left -= sum(len(raw) for _, _, raw in part)
+    return block
+
+
+def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
+    """Check the types of messages, which SQLite returns as stored."""
+    for kinds, position, what in (((int,), 1, 'time of receipt'),
+                                  ((bytes, memoryview, bytearray), 2, 'content')):
+        if not {type(each[position]) for each in block} <= {*kinds}:
+            bad = next(each for each in block if type(each[position]) not in kinds)
+            raise ValueError(f'a message on {bad[0].topic} has the {what} '
+                             f'{str(bad[position])[:20]!r}')
+
+
+def _types(connection: Connection, *, ros2: bool) -> Typestore:
+    """Return the types of a connection: those that the bag defines, otherwise the usual ones."""
+    from rosbags.typesys import get_typestore, Stores
+
+    definition = connection.msgdef
+    if definition.data:
+        return _defined(definition.format.name, definition.data, connection.msgtype)
+    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+
+
+@cache
+def _defined(kind: str, text: str, msgtype: str) -> Typestore:
+    """Return the types in a definition; an IDL definition has a line before each type."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+
+    store = get_typestore(Stores.EMPTY)
+    if kind == 'MSG':
+        store.register(get_types_from_msg(text, msgtype))
+        return store
+    types, parts = {}, text.split(80 * '=' + '\n')
+    for part in [each.partition('\n')[2] for each in parts[1:]] or parts:
+        types.update(get_types_from_idl(part))
+    store.register(types)
+    return store
+
+
+# ------------------------------------------------------------------------------ Imu messages
 
 def imu_topic(bag: Bag, topic: str = '') -> str:
     """
@@ -129,17 +312,9 @@ def imu_topic(bag: Bag, topic: str = '') -> str:
 
 
 def first_frame_id(bag: Bag, topic: str) -> str:
-    """
-    Return the frame_id of the first message of an Imu topic.
-
-    Raises
-    ------
-    InputError
-        If there is no message, or the message is damaged.
-
-    """
-    block = next(bag.blocks(bag.connections(topic), 1), None)
-    if block is None:
+    """Return the frame_id of the first message of an Imu topic; no message is an InputError."""
+    block = bag.first(topic)
+    if not block:
         raise InputError(f'{bag.path} has no message on {topic}, expected Imu messages',
                          'record while the sensor publishes')
     return frame_ids(bag.joined([block[0][2]], topic, 0))[0]
@@ -161,12 +336,7 @@ def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str
     sensor : str
         frame_id of the sensor.
     chosen : bool
-        Whether the user chose the sensor; otherwise messages of another sensor are refused.
-
-    Raises
-    ------
-    InputError
-        If a message is from another sensor, and the user did not choose a sensor.
+        Whether the user chose the sensor; otherwise messages of another sensor are an InputError.
 
     """
     names = frame_ids(messages)
@@ -180,73 +350,6 @@ def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str
     return np.broadcast_to(same, len(messages))
 
 
-def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
-                context: ContextTopics | None = None, notes: list[str] | None = None
-                ) -> Iterator[Recording]:
-    """
-    Yield the samples of an Imu topic in blocks.
-
-    Parameters
-    ----------
-    bag, topic, sensor, chosen
-        As in `of_sensor`.
-    context : ContextTopics, optional
-        Topics of temperature and supply voltage; by default that of `context_of`.
-    notes : list of str, optional
-        List to which a note about lost messages is added at the end.
-
-    Raises
-    ------
-    InputError
-        If a message is damaged, contains NaN, or is from another sensor.
-
-    """
-    used = (context or context_of(bag, topic, sensor)).used
-    tracks = {each.quantity.key: Track(np.zeros(0), np.zeros(0)) for each in used}
-    waiting: deque[Recording] = deque()
-    parts: list[Recording] = []
-    before = 0
-    for imus, others in _blocks(bag, topic, used):
-        for each, block in zip(used, others, strict=True):
-            if block:
-                tracks[each.quantity.key] = tracks[each.quantity.key].plus(*each.values(block))
-        if imus:
-            waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
-            before += len(imus)
-        parts += _ready(waiting, tracks)
-        if sum(map(len, parts)) >= _ROWS:
-            yield together(parts)
-            parts = []
-    parts += [_with_context(part, tracks) for part in waiting]
-    if parts:
-        yield together(parts)
-    if notes is not None:
-        notes += lost(bag, topic, before)
-
-
-def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
-    """Return the blocks whose context is known, and discard context that is too old for others."""
-    parts = []
-    while waiting and (len(waiting) > _HELD_BACK
-                       or all(track.covers(waiting[0]) for track in tracks.values())):
-        parts.append(_with_context(waiting.popleft(), tracks))
-    if waiting:
-        for key, track in tracks.items():
-            tracks[key] = track.since(waiting[0]['time'][0])
-    return parts
-
-
-def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
-            ) -> Iterator[tuple[list[bytes], list[list[Received]]]]:
-    """Yield blocks of serialized Imu messages and of the other topics, in one pass."""
-    own = [{id(connection) for connection in each.connections} for each in used]
-    imu = {id(connection) for connection in bag.connections(topic)}
-    wanted = [each for each in bag.reader.connections if id(each) in imu.union(*own)]
-    for block in bag.blocks(wanted, BLOCK):
-        yield ([raw for connection, _, raw in block if id(connection) in imu],
-               [[each for each in block if id(each[0]) in ids] for ids in own])
-
-
 def lost(bag: Bag, topic: str, found: int) -> list[str]:
     """Return a note if fewer messages of a topic were found than the bag states."""
     stated = bag.count(topic)
@@ -254,50 +357,22 @@ def lost(bag: Bag, topic: str, found: int) -> list[str]:
             'states them, but they are not in the bag'] if found < stated else []
 
 
-def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
-             ) -> Recording:
-    """Return Imu messages as samples; parameters as in `of_sensor`."""
-    messages = bag.joined(raws, topic, before)
-    which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
-    columns = plausible_samples(bag, messages, before)
-    row = np.arange(before, before + len(raws)) + 1
-    samples = Recording(columns, row, 'm/s2', sensor)
-    return samples if np.all(which) else samples.take(which)
-
-
-def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
-    columns = {key: track.at(samples['time']) for key, track in tracks.items()}
-    return samples.with_columns(**columns) if columns else samples
-
-
-def together(parts: Sequence[Recording]) -> Recording:
-    """Concatenate one or more recordings."""
-    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
-    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
-
-
 def plausible_samples(bag: Bag, messages: Messages, before: int) -> dict[str, Floats]:
     """
     Return Imu messages as columns of `accel_calib.table`; `before` counts the earlier messages.
 
-    Raises
-    ------
-    InputError
-        If an acceleration is not finite, or a number is beyond any sensor.
+    An acceleration that is not finite, or a number beyond any sensor, is an InputError.
 
     """
     columns = samples_of(messages)
-    _check_plausible(bag, columns['reading'], before, 'acceleration')
-    _check_plausible(bag, np.nan_to_num(columns['rate']), before, 'angular velocity')
+    for values, what in ((columns['reading'], 'acceleration'),
+                         (np.nan_to_num(columns['rate']), 'angular velocity')):
+        sound = np.all(np.abs(values) < LARGEST, axis=1)
+        if not np.all(sound):
+            first = int(np.argmin(sound))
+            found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
+                     f'has the {what} {np.max(np.abs(values[first])):.3g}')
+            raise InputError(f'{bag.path}: Imu message {before + first + 1} {found}, expected '
+                             f'finite numbers below {LARGEST:g}',
+                             'fix the driver, or record again')
     return columns
-
-
-def _check_plausible(bag: Bag, values: Floats, before: int, what: str) -> None:
-    """Check that accelerations or rates are finite, and not those of damaged bytes."""
-    sound = np.all(np.abs(values) < LARGEST, axis=1)
-    if not np.all(sound):
-        first = int(np.argmin(sound))
-        found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
-                 f'has the {what} {np.max(np.abs(values[first])):.3g}')
-        raise InputError(f'{bag.path}: Imu message {before + first + 1} {found}, expected finite '
-                         f'numbers below {LARGEST:g}', 'fix the driver, or record again')

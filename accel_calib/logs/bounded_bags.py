@@ -15,7 +15,10 @@ check the stated sizes before they allocate, and stop as soon as a size is excee
 - A db3 file consists of plain tables, which are read in a number of steps that depends on its
   size. A view, a trigger or a computed column could run any statement without end.
 
-`rosbags` converts none of these to one kind of error; `bag_reader.damage_as_input_error` does.
+`bag.damage_as_input_error` converts the errors here and those of `rosbags`, of many kinds.
+
+A recorder that was killed leaves the last messages of a db3 file in a second file, the journal of
+SQLite (``-wal`` or ``-journal``). `rosbags` ignores it. SQLite joins both files, in a copy.
 
 """
 
@@ -23,14 +26,18 @@ from __future__ import annotations
 
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, ExitStack
+from functools import partial
 import io
 from itertools import pairwise
 from pathlib import Path, PosixPath
 import re
+import shutil
+import sqlite3
 import sys
+from tempfile import TemporaryDirectory
 import threading
-from typing import Any, Protocol
+from typing import Any
 
 import apsw
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -43,6 +50,8 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 import yaml
 
 from ..disk import check_regular
+from ..errors import InputError
+from ..text import listed
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -73,42 +82,23 @@ _LARGEST_EXPANDED = 64 * _MB
 _DEEPEST_METADATA = 50
 _ZSTD_MAGIC = re.compile(rb'\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18')
 
-Messages = Generator[tuple[Connection, int, bytes], None, None]
+_JOURNALS = ('-wal', '-journal')
+_IN_URI = {'?', '#', '%'}
+"""Letters that `rosbags` does not escape when it opens a db3 file by its URI."""
 
-
-class _Decompressor(Protocol):
-    """The common part of the decompressors of bz2, lz4 and zstd."""
-
-    eof: bool
-    needs_input: bool
-    unused_data: bytes
-
-    def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Return at most so many bytes."""
+_Messages = Generator[tuple[Connection, int, bytes], None, None]
 
 
 def largest(compressed: int, always: int = _ALWAYS) -> int:
-    """Return the largest allowed size of data [bytes] that are compressed to a size [bytes]."""
+    """Return the largest allowed size [bytes] of data with this compressed size [bytes]."""
     return max(always, _RATIO * compressed)
 
 
 def decompressed(make: Callable[[], Any], data: bytes, stated: int | None = None) -> bytes:
     """
-    Return decompressed data.
+    Return the data of one or more compressed frames; `make` is the class of the decompressor.
 
-    Parameters
-    ----------
-    make : callable
-        Class of the decompressor.
-    data : bytes
-        One or more compressed frames.
-    stated : int, optional
-        Stated size of the result [bytes].
-
-    Raises
-    ------
-    ValueError
-        If the result is larger than stated or than `largest`, or the data end early.
+    Data that are larger than stated [bytes] or than `largest`, or end early, are a ValueError.
 
     """
     size = len(data)
@@ -116,22 +106,21 @@ def decompressed(make: Callable[[], Any], data: bytes, stated: int | None = None
     left = largest(size) if stated is None else stated
     parts = []
     while data:
-        one: _Decompressor = make()
-        while not one.eof:
-            if not data and one.needs_input:
+        decompressor = make()
+        while not decompressor.eof:
+            if not data and decompressor.needs_input:
                 raise ValueError(f'{size} compressed bytes end early')
-            parts.append(one.decompress(data, max_length=left + 1))
+            parts.append(decompressor.decompress(data, max_length=left + 1))
             data, left = b'', left - len(parts[-1])
             if left < 0:
                 raise ValueError(f'{size} compressed bytes hold more than '
                                  f'{sum(map(len, parts)) - 1} bytes')
-        data = one.unused_data or b''
+        data = decompressor.unused_data or b''
     return b''.join(parts)
 
 
 def _check_size(stated: int, compressed: int, what: str = 'a chunk', always: int = _ALWAYS
                 ) -> None:
-    """Check a stated size before anything is allocated."""
     if stated > largest(compressed, always):
         raise ValueError(f'{what} of {compressed} bytes states {stated} bytes, more than '
                          f'{_RATIO} times as many')
@@ -157,8 +146,6 @@ class _BoundedPath(PosixPath):
         return _File(Path(self))
 
 
-# ------------------------------------------------------------------------------------- ROS 1
-
 class Reader1(rosbag1.Reader):
     """Reader of ROS 1 bags."""
 
@@ -167,12 +154,12 @@ class Reader1(rosbag1.Reader):
         self._places: set[int] = set()
 
     def read_chunk_info(self) -> rosbag1_reader.ChunkInfo:
-        """Read the information about a chunk; refuse a chunk that is there twice."""
-        found = super().read_chunk_info()
-        if found.pos in self._places:
-            raise ValueError(f'the index lists the chunk at {found.pos} twice')
-        self._places.add(found.pos)
-        return found
+        """Read the place of a chunk; refuse a chunk that is listed twice."""
+        chunk = super().read_chunk_info()
+        if chunk.pos in self._places:
+            raise ValueError(f'the index lists the chunk at {chunk.pos} twice')
+        self._places.add(chunk.pos)
+        return chunk
 
     def read_chunk(self) -> rosbag1_reader.Chunk:
         """Read the header of a chunk."""
@@ -181,17 +168,10 @@ class Reader1(rosbag1.Reader):
         header = rosbag1_reader.Header.read(self.bio, rosbag1_reader.RecordType.CHUNK)
         stated, kind = header.get_uint32('size'), header.get_string('compression')
         self.bio.seek(place)
-        found = super().read_chunk()
+        chunk = super().read_chunk()
         make = {'bz2': BZ2Decompressor, 'lz4': LZ4FrameDecompressor}.get(kind)
-        if make is None:
-            return found
-        return found._replace(decompressor=lambda data: decompressed(make, data, stated))
-
-
-# -------------------------------------------------------------------------------------- MCAP
-
-def _by_table(make: Callable[[], Any]) -> Callable[[bytes, int], bytes]:
-    return lambda data, size: decompressed(make, data, size)
+        return chunk if make is None else chunk._replace(
+            decompressor=lambda data: decompressed(make, data, stated))
 
 
 class _Mcap(storage_mcap.McapReader):
@@ -200,18 +180,17 @@ class _Mcap(storage_mcap.McapReader):
     def __init__(self, path: Any) -> None:
         super().__init__(_BoundedPath(path))
         # `rosbags` looks its decompressors up in this table, also when it scans a file to open it.
-        storage_mcap.DECOMPRESSORS.update(lz4=_by_table(LZ4FrameDecompressor),
-                                          zstd=_by_table(zstd.ZstdDecompressor))
+        storage_mcap.DECOMPRESSORS.update(lz4=partial(decompressed, LZ4FrameDecompressor),
+                                          zstd=partial(decompressed, zstd.ZstdDecompressor))
 
     def open(self) -> None:  # noqa: A003
         """Open the file, and check the sizes that its index states."""
         super().open()
-        try:
+        with ExitStack() as stack:
+            stack.callback(self.close)
             _check_places(self.chunks)
             _check_together(self.chunks)
-        except BaseException:
-            self.close()
-            raise
+            stack.pop_all()
 
 
 def _check_places(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:
@@ -221,10 +200,10 @@ def _check_places(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:
         if each.compressed_size > each.chunk_length:
             raise ValueError(f'a chunk of {each.chunk_length} bytes states '
                              f'{each.compressed_size} compressed bytes')
-    for one, two in pairwise(sorted(chunks, key=lambda each: each.chunk_start_offset)):
-        if one.chunk_start_offset + one.chunk_length > two.chunk_start_offset:
-            raise ValueError(f'the chunks at {one.chunk_start_offset} and '
-                             f'{two.chunk_start_offset} overlap')
+    for before, after in pairwise(sorted(chunks, key=lambda each: each.chunk_start_offset)):
+        if before.chunk_start_offset + before.chunk_length > after.chunk_start_offset:
+            raise ValueError(f'the chunks at {before.chunk_start_offset} and '
+                             f'{after.chunk_start_offset} overlap')
     _check_size(sum(each.uncompressed_size for each in chunks),
                 sum(each.compressed_size for each in chunks), 'all chunks', _IN_ALL)
 
@@ -241,66 +220,52 @@ def _check_together(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:
         _check_size(size, compressed, 'chunks of the same time', _TOGETHER)
 
 
-# ------------------------------------------------------------------------------------ SQLite
-
-class _Steps:
-    """Counter of the steps of SQLite."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit, self.count = limit, 0
-
-    def __call__(self) -> bool:
-        """Count; raise ValueError above the limit."""
-        self.count += _EVERY
-        if self.count > self.limit:
-            raise ValueError(f'a query needs more than {self.limit} steps of SQLite')
-        return False
-
-
 class _Sqlite(Sqlite3Reader):
     """Reader of db3 files."""
 
     def open(self) -> None:  # noqa: A003
         """Open the file, and check that it consists of plain tables."""
         self._size = self.path.stat().st_size
-        self._steps = _Steps(_STEPS + _STEPS_PER_BYTE * self._size)
-        with _counted(self._steps):
-            connection = apsw.Connection(f'file:{self.path}?immutable=1', flags=(
-                apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI))
-            try:
+        self._steps = 0
+        with self._counted():
+            flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+            with closing(apsw.Connection(f'file:{self.path}?immutable=1', flags)) as connection:
                 _check_schema(connection, self._size)
-            finally:
-                connection.close()
             super().open()
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
-                 stop: int | None = None) -> Messages:
-        """Yield the messages; raise ValueError once they are larger than the file."""
-        size = 0
-        self._steps.count = 0
+                 stop: int | None = None) -> _Messages:
+        """Yield the messages; raise ValueError if they are larger than the file."""
+        size = self._steps = 0
         for found in super().messages(connections, start, stop):
             size += _stored_size(found[2:])
             if size > self._size:
                 raise ValueError(f'the messages are larger than the {self._size} bytes of the '
                                  'file')
             yield found
-            self._steps.count = 0
+            self._steps = 0
 
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        """Count the steps of all connections that this thread opens in the block."""
+        thread = threading.get_ident()
 
-@contextmanager
-def _counted(steps: _Steps) -> Iterator[None]:
-    """Count the steps of all connections that this thread opens in the block."""
-    thread = threading.get_ident()
+        def hook(connection: apsw.Connection) -> None:
+            if threading.get_ident() == thread:
+                connection.set_progress_handler(self._count, _EVERY)
 
-    def hook(connection: apsw.Connection) -> None:
-        if threading.get_ident() == thread:
-            connection.set_progress_handler(steps, _EVERY)
+        apsw.connection_hooks.append(hook)
+        try:
+            yield
+        finally:
+            apsw.connection_hooks.remove(hook)
 
-    apsw.connection_hooks.append(hook)
-    try:
-        yield
-    finally:
-        apsw.connection_hooks.remove(hook)
+    def _count(self) -> bool:
+        self._steps += _EVERY
+        limit = _STEPS + _STEPS_PER_BYTE * self._size
+        if self._steps > limit:
+            raise ValueError(f'a query needs more than {limit} steps of SQLite')
+        return False
 
 
 def _check_schema(connection: apsw.Connection, size: int) -> None:
@@ -324,8 +289,6 @@ def _stored_size(row: Iterable[Any]) -> int:
     return 2 + sum(len(cell) for cell in row if isinstance(cell, (str, bytes)))
 
 
-# ---------------------------------------------------------------------------------- rosbag2
-
 class _Folder(rosbag2_reader.DirectoryReader):
     """Reader of rosbag2 folders."""
 
@@ -348,7 +311,7 @@ class _Folder(rosbag2_reader.DirectoryReader):
             self.metadata = self.metadata._replace(compression_mode=None)
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
-                 stop: int | None = None) -> Messages:
+                 stop: int | None = None) -> _Messages:
         """Yield the messages, decompressed."""
         for connection, stamp, data in super().messages(connections, start, stop):
             yield connection, stamp, (decompressed(zstd.ZstdDecompressor, data)
@@ -386,10 +349,7 @@ def _checked_metadata(path: Path) -> set[str]:
     """
     Return the words in metadata.yaml, which `rosbags` parses recursively.
 
-    Raises
-    ------
-    ValueError
-        If the file is too large, also with its aliases replaced, or nested too deep.
+    A file that is too large, also with its aliases replaced, or nested too deep is a ValueError.
 
     """
     check_regular(path)
@@ -415,3 +375,76 @@ def _checked_metadata(path: Path) -> set[str]:
             raise ValueError(f'{path.name} is nested more than {_DEEPEST_METADATA} deep, or its '
                              f'aliases stand for more than {_LARGEST_EXPANDED} characters')
     return words
+
+
+def readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
+    """Return the path to read, in a copy if SQLite cannot read it as it is, and notes."""
+    if path.suffix == '.bag':
+        return path, []
+    if not path.is_dir():
+        return (_copies([path], stack)[0] if _needs_copy(path) else path), _recovered([path])
+    stored = sorted(each for each in path.iterdir() if each.suffix in ('.mcap', '.db3'))
+    for each in stored:
+        if each.exists():
+            check_regular(each)
+    if (path / 'metadata.yaml').exists():
+        notes = [*_not_listed(path, stored), *_recovered(stored)]
+        if not any(map(_needs_copy, stored)):
+            return path, notes
+        files = [*path.glob('*.yaml'), *path.glob('*.zstd'), *stored]
+        return _copies(files, stack)[0].parent, notes
+    if not stored:
+        raise InputError(f'{path} is a folder without a bag, expected a rosbag2 folder or a file',
+                         'choose a file in it')
+    if len(stored) != 1:
+        return path, []
+    found, notes = readable(stored[0], stack)
+    return found, [f'{path} has no metadata.yaml, as after a recorder was killed; '
+                   f'{stored[0].name} is read without it', *notes]
+
+
+def _not_listed(path: Path, stored: Sequence[Path]) -> list[str]:
+    """Return a note about files of the folder that its metadata do not list."""
+    check_regular(path / 'metadata.yaml')
+    text = (path / 'metadata.yaml').read_text(encoding='utf-8', errors='replace')
+    lost = [each.name for each in stored if each.name not in text]
+    if not 0 < len(lost) < len(stored):
+        return []
+    return [f'metadata.yaml of {path} does not list {listed("file", lost)}: the messages there '
+            'are not read; ros2 bag reindex lists all files']
+
+
+def _journals(path: Path) -> list[Path]:
+    """Return the journals of a db3 file that are not empty."""
+    found = [path.with_name(path.name + suffix) for suffix in _JOURNALS]
+    return [each for each in found if path.suffix == '.db3' and each.is_file()
+            and each.stat().st_size]
+
+
+def _needs_copy(path: Path) -> bool:
+    """Return whether a db3 file has journals, or a name that is not read as a name in a URI."""
+    return path.suffix == '.db3' and (bool(_journals(path)) or bool(_IN_URI & {*str(path)}))
+
+
+def _recovered(stored: Sequence[Path]) -> list[str]:
+    """Return a note about the journals of these files."""
+    names = [each.name for path in stored for each in _journals(path)]
+    return [f'the recorder was killed; its last messages are read from {", ".join(names)}'
+            ] if names else []
+
+
+def _copies(paths: Sequence[Path], stack: ExitStack) -> list[Path]:
+    """Return files in a temporary folder: databases joined with their journals, and links."""
+    folder = Path(stack.enter_context(TemporaryDirectory(prefix='accel_calib_')))
+    copies = []
+    for path in paths:
+        name = path.name if len(paths) > 1 else f'bag{path.suffix}'
+        copies.append(folder / name)
+        if not _journals(path):
+            copies[-1].symlink_to(path.absolute())
+            continue
+        for each in (path, *_journals(path)):
+            shutil.copyfile(each, folder / f'{name}{each.name.removeprefix(path.name)}')
+        with closing(sqlite3.connect(copies[-1])) as database:
+            database.execute('PRAGMA journal_mode = DELETE').fetchone()
+    return copies

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Columns of a log: which column of a header holds which of our columns.
+Columns of a text log: which column of a header holds which of our columns.
 
-What the user names goes first, then our own names, then the table of names
-(`accel_calib.logs.names`). A table without header is read by the number of its columns.
-Two accelerometers that the names cannot tell apart are an error, because a wrong choice would
-give a wrong calibration. Other columns are used only where they are plain.
+What the user names goes first, then our own names, then the maker's layout
+(`accel_calib.logs.formats`), then the table of names (`accel_calib.logs.names`). A table without
+header is read by the number of its columns. Two accelerometers that the names cannot tell apart
+are an error, because a wrong choice would give a wrong calibration. Other columns are used only
+where they are plain.
 
 """
 
@@ -15,12 +16,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
-from .dialect import is_number, Layout, shown
+import numpy as np
+
+from . import formats
+from .dialect import is_clock, is_number, Layout, shown
 from .names import BARE, is_unit, meaning, OURS, RATE, READING, unit_of, WORDS
+from .text import Cells
 from ..errors import InputError
-from ..table import COLUMNS
+from ..table import COLUMNS, Floats
+from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
@@ -33,32 +40,123 @@ MOST = 5000
 
 
 @dataclass(frozen=True)
+class LogOptions:
+    """
+    How to read a log. By default everything is recognised.
+
+    Parameters
+    ----------
+    columns : mapping of str to str
+        Columns of a text log under our names: a name in the header or a number from 1, such as
+        ``{'time': 'timestamp_ms', 'ax': 'accX'}``. An empty text leaves a column out.
+    format : str
+        Name of a maker's layout, from `accel_calib.logs.formats.NAMES`.
+    skip_bad : bool
+        Whether lines that cannot be read are skipped, rather than an error.
+    rate : float or None
+        Samples per second of a text log without times [Hz].
+    units : {'m/s2', 'g', 'native', ''}
+        Unit of the readings.
+    default_units : {'m/s2', 'g', 'native', ''}
+        Unit of readings whose unit the log does not state, instead of a recognised one.
+    gravity : float
+        Local gravity [m/s²].
+    topic : str
+        Imu topic of a bag, or message of a flight log.
+    sensor : str
+        frame_id of the messages of a bag, or number of the sensor of a flight log.
+    temperature_topic, supply_topic : str
+        Topics of temperature and supply voltage of a bag, ``TOPIC`` or ``TOPIC:FIELD``.
+
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    format: str = ''  # noqa: A003
+    skip_bad: bool = False
+    rate: float | None = None
+    units: UnitName | Literal[''] = ''
+    default_units: UnitName | Literal[''] = ''
+    gravity: float = STANDARD_GRAVITY
+    topic: str = ''
+    sensor: str = ''
+    temperature_topic: str = ''
+    supply_topic: str = ''
+
+
+@dataclass(frozen=True)
 class Source:
-    """A column of a file: its index, its name, and the text of the unit in the name."""
+    """A column of a file: its index, its name, and the text of its unit."""
 
     index: int
     name: str
     unit: str = ''
 
 
-def has_reading(header: Sequence[str]) -> bool:
-    """Return whether names are those of a log with an accelerometer."""
-    if set(READING) <= set(header):
-        return True
-    return bool(_triples('reading', header) or _bare(header))
-
-
-def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
+@dataclass(frozen=True)
+class Chosen:
     """
-    Return the columns of a log under our names.
+    The columns of a text log that are used.
 
     Parameters
     ----------
     layout : Layout
-        The table, with its header.
-    given : mapping of str to str
-        Columns that the user names, under our names: a name in the header or a number from 1. An
-        empty text leaves a column out.
+        The table.
+    sources : mapping of str to Source
+        Columns under our names.
+    maker : LogFormat or None
+        The maker's layout.
+    numeric, text : tuple of int
+        Columns of numbers and of text, as read.
+
+    """
+
+    layout: Layout
+    sources: Mapping[str, Source]
+    maker: formats.LogFormat | None
+    numeric: tuple[int, ...]
+    text: tuple[int, ...]
+
+    @property
+    def dates(self) -> tuple[int, ...]:
+        """Columns of text that are dates, or times of the day: that of the times, or none."""
+        which = [self.sources['time'].index] if 'time' in self.sources else []
+        return tuple(set(which) & set(self.text))
+
+    def numbers(self, cells: Cells, ours: str) -> Floats:
+        """Return the numbers of a column as in the file; divided, if its maker says so."""
+        values = cells.numbers[:, self.numeric.index(self.sources[ours].index)]
+        divisor = self.sources.get(f'{ours}/')
+        if divisor is None:
+            return values
+        with np.errstate(all='ignore'):  # a row divided by 0 is refused later, with its number
+            return values / cells.numbers[:, self.numeric.index(divisor.index)]
+
+    def three(self, cells: Cells, ours: Sequence[str]) -> Floats:
+        """Return the numbers of three columns, (n, 3)."""
+        return np.column_stack([self.numbers(cells, name) for name in ours])
+
+    def texts(self, cells: Cells, ours: str) -> list[str]:
+        """Return the texts of a column."""
+        return cells.texts[self.text.index(self.sources[ours].index)]
+
+    def names(self, ours: Sequence[str]) -> list[str]:
+        """Return the names of columns in the file."""
+        return [self.sources[name].name for name in ours]
+
+
+def is_log_header(cells: Sequence[str], options: LogOptions) -> bool:
+    """Return whether cells are the names of the columns of a log."""
+    theirs = [each.casefold() for each in options.columns.values()
+              if each and not each.isdecimal()]
+    if theirs:
+        return {each.casefold() for each in cells}.issuperset(theirs)
+    return (set(READING) <= set(cells) or bool(_triples('reading', cells) or _bare(cells))
+            or formats.recognise(cells[:MOST]) is not None)
+
+
+def chosen(layout: Layout, options: LogOptions) -> Chosen:
+    """
+    Return the columns of a log that are used.
 
     Raises
     ------
@@ -66,9 +164,44 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
         If there is no accelerometer, or there are several, or a given column is not there.
 
     """
+    header, maker = layout.header, None
+    if options.format:
+        maker = formats.named(options.format, header, str(layout.path))
+    elif not set(READING) <= set(header):
+        maker = formats.recognise(header[:MOST])
+    given = dict(options.columns)
+    if maker is None or set(READING) & given.keys():
+        return with_indices(layout, sources(layout, given))
+    formats.check_sensor(header, layout.path)
+    found = sources(layout, {**maker.present(header), **given})
+    for ours, theirs in maker.divisors.items():
+        found[f'{ours}/'] = column(layout, theirs)
+    if maker.instance:
+        found['instance'] = column(layout, maker.instance)
+    return with_indices(layout, found, maker)
+
+
+def with_indices(layout: Layout, sources: Mapping[str, Source],
+                 maker: formats.LogFormat | None = None) -> Chosen:
+    """Return the columns with the indices of those of numbers and of text."""
+    text = [sources['label'].index] if 'label' in sources else []
+    if 'time' in sources:
+        cells = _sample(layout, sources['time'])
+        if cells and all(map(is_clock, cells)):
+            text.append(sources['time'].index)
+    numeric = sorted({source.index for source in sources.values()} - set(text))
+    return Chosen(layout, sources, maker, tuple(numeric), tuple(text))
+
+
+def _sample(layout: Layout, source: Source) -> list[str]:
+    """Return the cells of a column in the first rows."""
+    return [row[source.index] for row in layout.sample if source.index < len(row)]
+
+
+def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
+    """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
     found = _given(layout, given)
-    left_out = [ours for ours, theirs in given.items() if not theirs]
     if not header:
         found = {**_by_order(layout, found), **found}
     elif set(READING) <= set(header) and not set(READING) & set(found):
@@ -78,28 +211,19 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     if header:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
-    found = {ours: source for ours, source in found.items()
+    plain = {ours: source for ours, source in found.items()
              if ours not in CONTEXT or ours in given or source.name == ours
-             or _has_numbers(layout, source)}
-    return {ours: source for ours, source in found.items() if ours not in left_out}
-
-
-def _has_numbers(layout: Layout, source: Source) -> bool:
-    """Return whether the first rows have numbers in a column."""
-    cells = [row[source.index] for row in layout.sample if source.index < len(row)]
-    return all(is_number(cell.replace(',', '.')) for cell in cells)
+             or all(is_number(cell.replace(',', '.')) for cell in _sample(layout, source))}
+    return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
 def _given(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     """Return the columns that the user names."""
-    found: dict[str, Source] = {}
-    for ours, theirs in given.items():
+    for ours in given:
         if ours not in OURS:
             raise InputError(f'--columns names {ours!r}, expected one of {", ".join(OURS)}',
                              'correct the name before the =')
-        if not theirs:
-            continue
-        found[ours] = column(layout, theirs)
+    found = {ours: column(layout, theirs) for ours, theirs in given.items() if theirs}
     partly = set(READING) & set(found)
     if partly and partly != set(READING):
         raise InputError(f'--columns names {", ".join(sorted(partly))}, expected ax, ay and az',
@@ -120,23 +244,22 @@ def column(layout: Layout, theirs: str) -> Source:
         raise InputError(f'{layout.path} has {words}, and {len(same) or "no"} '
                          f'{"columns" if same else "column"} {theirs!r}, expected one',
                          f'use a name of the header, or a number from 1 to {layout.width}')
-    name = header[same[0]] if same[0] < len(header) else ''
-    return _source(layout, same[0], meaning(name).unit)
+    return _source(layout, same[0])
 
 
-def _source(layout: Layout, index: int, unit: str = '') -> Source:
+def _source(layout: Layout, index: int) -> Source:
     """Return a column with its unit, which can stand in a row below the header."""
-    below = layout.units_row[index] if index < len(layout.units_row) else ''
-    below = below.strip('()[]')
+    unit = meaning(layout.header[index]).unit if index < len(layout.header) else ''
+    below = layout.units_row[index].strip('()[]') if index < len(layout.units_row) else ''
     return Source(index, layout.name(index), unit or (below if is_unit(below) else ''))
 
 
 def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     """Return the columns of a table without header, by their order."""
-    orders = {3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
-              7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
     if set(READING) <= set(found):
         return {}
+    orders = {3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
+              7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
     if layout.width not in orders:
         raise InputError(f'{layout.path} has no header line and {layout.width} columns, expected '
                          '3 (ax, ay, az), 4 (time first), 5 (temperature last), 7 (angular rate '
@@ -145,19 +268,21 @@ def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     return {name: Source(k, str(k + 1)) for k, name in enumerate(orders[layout.width])}
 
 
-def _own(layout: Layout) -> dict[str, Source]:
-    """Return the columns with our own names."""
+def check_once(layout: Layout) -> None:
+    """Check that none of our names is in a header twice."""
     counts = Counter(layout.header)
     for name in OURS:
         if counts[name] > 1:
             raise InputError(f'{layout.path} has {counts[name]} columns {name}, expected one',
                              'remove or rename the others')
+
+
+def _own(layout: Layout) -> dict[str, Source]:
+    """Return the columns with our own names."""
+    check_once(layout)
     index = {name: k for k, name in enumerate(layout.header)}
-    found: dict[str, Source] = {}
-    for column in COLUMNS.values():
-        if not column.made and index.keys() >= set(column.names):
-            found |= {name: _source(layout, index[name]) for name in column.names}
-    return found
+    return {name: _source(layout, index[name]) for own in COLUMNS.values()
+            if not own.made and index.keys() >= set(own.names) for name in own.names}
 
 
 def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
@@ -170,26 +295,20 @@ def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     plain = [triple for triple in with_gravity
              if 'linear' not in meaning(header[triple[0]]).group]
     groups = plain or with_gravity or groups or _bare(header)
-    if len(groups) > 1:
+    if len(groups) == 1:
+        return {name: _source(layout, k) for name, k in zip(READING, groups[0])}
+    if groups:
         names = ' and '.join(', '.join(header[k] for k in triple) for triple in groups[:3])
-        one = groups[0]
+        # A name that several columns have is replaced by the number.
+        choice = ','.join(f'{name}={header[k] if header.count(header[k]) == 1 else k + 1}'
+                          for name, k in zip(READING, groups[0]))
         raise InputError(f'{layout.path} has {len(groups)} accelerometers, {names}, expected one',
-                         'choose one with --columns "' + ','.join(
-                             f'{name}={_reference(header, k)}' for name, k in zip(READING, one))
-                         + '"')
-    if not groups:
-        missing = [name for name in READING if name not in header]
-        lacks = f', and lacks {", ".join(missing)}' if len(missing) < len(READING) else ''
-        raise InputError(f'{layout.path} has the columns {shown(header)}{lacks}, expected three '
-                         'of an accelerometer, such as ax, ay, az or accX, accY, accZ',
-                         'name them with --columns ax=NAME,ay=NAME,az=NAME')
-    return {name: _source(layout, k, meaning(header[k]).unit)
-            for name, k in zip(READING, groups[0])}
-
-
-def _reference(header: Sequence[str], k: int) -> str:
-    """Return a name of a column, or its number if others have that name, too."""
-    return header[k] if header.count(header[k]) == 1 else str(k + 1)
+                         f'choose one with --columns "{choice}"')
+    missing = [name for name in READING if name not in header]
+    lacks = f', and lacks {", ".join(missing)}' if len(missing) < len(READING) else ''
+    raise InputError(f'{layout.path} has the columns {shown(header)}{lacks}, expected three '
+                     'of an accelerometer, such as ax, ay, az or accX, accY, accZ',
+                     'name them with --columns ax=NAME,ay=NAME,az=NAME')
 
 
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
@@ -215,8 +334,8 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     axes: dict[int, list[int]] = {}
     for k, name in enumerate(header[:MOST]):
         known = meaning(name)
-        if not known.quantity and known.axis is not None and BARE.issuperset(known.group) and (
-                not known.unit):
+        if not (known.quantity or known.unit or known.axis is None
+                ) and BARE.issuperset(known.group):
             axes.setdefault(known.axis, []).append(k)
     count = min(len(axes.get(axis, ())) for axis in range(3))
     return [[axes[axis][k] for axis in range(3)] for k in range(count)]
@@ -231,16 +350,14 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
         by_quantity.setdefault(meaning(name).quantity, []).append(k)
     if 'time' not in found and by_quantity.get('time'):
         best = max(by_quantity['time'], key=lambda k: (_time_rank(header[k]), -k))
-        more['time'] = _source(layout, best, meaning(header[best]).unit)
+        more['time'] = _source(layout, best)
         more |= _fraction(layout, best)
     if RATE[0] not in found:
-        for triple in _rates(header, found):
-            more |= {name: _source(layout, k, meaning(header[k]).unit)
-                     for name, k in zip(RATE, triple)}
+        more |= {name: _source(layout, k) for name, k in zip(RATE, _rates(header, found))}
     for key in ('temperature', 'supply_voltage'):
         which = by_quantity.get(key, [])
         if key not in found and len(which) == 1:
-            more[key] = _source(layout, which[0], meaning(header[which[0]]).unit)
+            more[key] = _source(layout, which[0])
     return more
 
 
@@ -254,34 +371,30 @@ def _time_rank(name: str) -> tuple[bool, bool, bool]:
 def _fraction(layout: Layout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
-    if unit_of('time', known.unit) != ('s', 1.0):
-        return {}
-    for k, name in enumerate(layout.header[:MOST]):
-        other = meaning(name)
-        if (other.quantity, other.group) == ('time', known.group) and (
-                unit_of('time', other.unit) == ('ns', 1e-9)):
-            return {FRACTION: Source(k, layout.name(k), other.unit)}
+    if unit_of('time', known.unit) == ('s', 1.0):
+        for k, name in enumerate(layout.header[:MOST]):
+            other = meaning(name)
+            if (other.quantity, other.group) == ('time', known.group) and (
+                    unit_of('time', other.unit) == ('ns', 1e-9)):
+                return {FRACTION: _source(layout, k)}
     return {}
 
 
-def _rates(header: Sequence[str], found: Mapping[str, Source]) -> list[list[int]]:
+def _rates(header: Sequence[str], found: Mapping[str, Source]) -> list[int]:
     """Return the columns of the gyro that belongs to the accelerometer, if it is plain."""
-    groups = [(group, triple) for group, triple in _triples('rate', header).items()]
+    groups = list(_triples('rate', header).items())
     if len(groups) > 1:
         own = set(meaning(found[READING[0]].name).group) if READING[0] in found else set()
         shared = [len(own.intersection(group)) for group, _ in groups]
         groups = [each for each, count in zip(groups, shared)
                   if count == max(shared) and shared.count(count) == 1]
-    return [triple for _, triple in groups[:1]]
+    return groups[0][1] if groups else []
 
 
-def unused(layout: Layout, found: Mapping[str, Source]) -> tuple[str, ...]:
+def unused(layout: Layout, found: Mapping[str, Source]) -> list[str]:
     """Return notes about columns that look like a temperature and are not used."""
-    if 'temperature' in found:
-        return ()
-    names = [name for name in layout.header[:MOST]
-             if meaning(name).quantity == 'temperature']
-    if not names:
-        return ()
-    return (f'not used, though the names look like temperatures: {shown(names)}; choose one with '
-            f'--columns temperature={names[0]}',)
+    names = [name for name in layout.header[:MOST] if meaning(name).quantity == 'temperature']
+    if 'temperature' in found or not names:
+        return []
+    return [f'not used, though the names look like temperatures: {shown(names)}; choose one with '
+            f'--columns temperature={names[0]}']

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Dialect of a text table: where the table begins, and how its cells are parted.
+Dialect of a text table: where the table begins, how its cells are parted, what its dates are.
 
 `layout_of` decides from the first lines of a file, its head. It finds the header line, the
 delimiter, the decimal mark and the first line of numbers.
@@ -10,6 +10,9 @@ delimiter, the decimal mark and the first line of numbers.
 `csv.Sniffer` is not used: it needs many equal rows, and takes a letter, a decimal mark or a blank
 for the delimiter. The delimiter here is that of a header line with known names, or else the one
 whose cells are numbers in most lines. `csv` splits lines with quotes.
+
+Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes, and
+``31-Jan-2026`` and ``31.01.2026``. A date without a zone is taken as UTC.
 
 """
 
@@ -19,14 +22,18 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 import csv
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from functools import lru_cache
 import json
 import math
 from pathlib import Path
 import re
 from typing import Any
 
-from .clock import is_clock
+import numpy as np
+
 from ..errors import InputError
+from ..table import Floats
 from ..text import counted
 from ..units import UNIT_NAMES
 
@@ -53,7 +60,12 @@ _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _UNREADABLE_SHARE = 0.3
 _SHOWN_NAMES = 12
 _SHOWN_CHARACTERS = 40
-_ABOUT = ('units', 'sensor')
+ABOUT = ('units', 'sensor')
+
+_CLOCK = re.compile(
+    r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}\.\d{1,2}\.\d{4})[T ])?'
+    r'(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)? ?(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
+_DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y')
 
 IsHeader = Callable[[Sequence[str]], bool]
 
@@ -61,15 +73,10 @@ IsHeader = Callable[[Sequence[str]], bool]
 @dataclass(frozen=True)
 class Dialect:
     """
-    How the cells of a table are parted.
+    How the cells of a table are parted; an empty delimiter is any run of blanks.
 
-    Parameters
-    ----------
-    delimiter : str
-        Delimiter of the cells; empty for any run of blanks.
-    monitor, labelled : bool
-        Whether each line begins with the time of a serial monitor, and whether each number
-        follows its name.
+    `monitor`: each line begins with the time of a serial monitor. `labelled`: each number follows
+    its name.
 
     """
 
@@ -95,22 +102,12 @@ class Layout:
 
     Parameters
     ----------
-    path : Path
-        The file.
-    dialect : Dialect
-        How the cells are parted.
     decimal : {'.', ',', ''}
         Decimal mark; empty if the first rows have whole numbers only.
-    header : tuple of str
-        Names of the columns; empty if there is no header.
-    units_row : tuple of str
-        Cells of a row of units below the header; empty if there is none.
-    width : int
-        Number of cells in a row.
-    start : int
-        Number of lines before the first row.
-    encoding : str
-        Encoding of the text.
+    header, units_row : tuple of str
+        Names of the columns, and cells of a row of units below them; empty if there are none.
+    width, start : int
+        Number of cells in a row, and of lines before the first row.
     about : mapping
         Units and sensor from the comments.
     notes : tuple of str
@@ -135,16 +132,13 @@ class Layout:
     @property
     def words(self) -> list[str]:
         """Return what differs from a plain CSV table."""
-        found = []
-        if self.encoding not in ('utf-8', 'utf-8-sig'):
-            found.append(self.encoding.upper())
-        if self.dialect.delimiter != ',':
-            found.append(_DELIMITER_WORDS[self.dialect.delimiter])
-        if self.decimal == ',':
-            found.append('decimal comma')
-        if self.dialect.labelled:
-            found.append('names before the numbers')
-        return found if self.header else [*found, 'no header']
+        words = (
+            (self.encoding not in ('utf-8', 'utf-8-sig'), self.encoding.upper()),
+            (self.dialect.delimiter != ',', _DELIMITER_WORDS.get(self.dialect.delimiter, '')),
+            (self.decimal == ',', 'decimal comma'),
+            (self.dialect.labelled, 'names before the numbers'),
+            (not self.header, 'no header'))
+        return [word for differs, word in words if differs]
 
     def name(self, column: int) -> str:
         """Return the name of a column, or its number from 1."""
@@ -166,6 +160,67 @@ def split(line: str, delimiter: str) -> list[str]:
 def is_number(text: str) -> bool:
     """Return whether a cell is a finite number, with a decimal point."""
     return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
+
+
+def is_clock(text: str) -> bool:
+    """Return whether a text is a date with a time, or a time of the day."""
+    return _CLOCK.fullmatch(text) is not None
+
+
+def has_date(text: str) -> bool:
+    """Return whether a text is a date with a time."""
+    match = _CLOCK.fullmatch(text)
+    return match is not None and match[1] is not None
+
+
+def seconds_of(texts: Sequence[str], path: Path, rows: Sequence[int]) -> Floats:
+    """
+    Return the seconds since 1970 of dates, or since midnight of times of the day.
+
+    File and rows are for the InputError for a text that is no date or time.
+
+    """
+    seconds = [_seconds(text) for text in texts]
+    if None in seconds:
+        k = seconds.index(None)
+        raise InputError(f'{path}: row {rows[k]} has the time {texts[k][:40]!r}, expected one '
+                         'such as 2026-01-31T12:00:00.250', 'correct the row or remove it')
+    return np.array(seconds, dtype=float)
+
+
+def _seconds(text: str) -> float | None:
+    """Return a date in seconds, or None if it is none."""
+    match = _CLOCK.fullmatch(text)
+    if match is None:
+        return None
+    date, hour, minute, second, digits, zone = match.groups()
+    day = _day(date) if date else 0.0
+    if day is None or not (int(hour) < 24 and int(minute) < 60 and int(second or 0) <= 60):
+        return None
+    fraction = float(f'0.{digits}') if digits else 0.0
+    whole = day + int(hour) * 3600.0 + int(minute) * 60.0 + int(second or 0)
+    return whole - _offset(zone) + fraction
+
+
+@lru_cache(maxsize=64)
+def _day(date: str) -> float | None:
+    """Return the seconds from 1970 to a day, or None if there is no such day."""
+    for form in _DAYS:
+        try:
+            day = datetime.strptime(date.replace('/', '-'), form)
+        except ValueError:  # It has another form.
+            continue
+        return day.replace(tzinfo=timezone.utc).timestamp()
+    return None
+
+
+@lru_cache(maxsize=64)
+def _offset(zone: str | None) -> float:
+    """Return the offset of a time zone [s]."""
+    if zone in (None, 'Z', 'UTC'):
+        return 0.0
+    size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
+    return -size if zone[0] == '-' else size
 
 
 def is_comment(line: str) -> bool:
@@ -204,11 +259,6 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         Whether the first line must be the header; otherwise other lines may come before it.
     expected : str
         Example of a header line, for error messages.
-
-    Raises
-    ------
-    InputError
-        If there is no table of numbers.
 
     """
     _check_text(path, head, expected)
@@ -297,18 +347,17 @@ class _Finder:
         """Return the dialect in which most lines are rows of numbers, and their names, if any."""
         step = max(1, len(self.plain) // _TRIED_LINES)
         lines = [self.head[k] for k in self.plain[::-step]]
-        best: tuple[int, int, Dialect] | None = None
+        tried = []
         for labelled in (False, True):
             for delimiter in DELIMITERS:
                 dialect = Dialect(delimiter, self.monitor, labelled)
                 widths = Counter(filter(None, (_row_width(dialect.cells(line))
                                                for line in lines)))
                 width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
-                if count > (best[0] if best else 0):
-                    best = count, width, dialect
-        if best is None:
+                tried.append((count, width, dialect))
+        count, width, dialect = max(tried, key=lambda each: each[0])
+        if not count:
             return None
-        _, width, dialect = best
         first = next((k for k in self.plain if _row_width(dialect.cells(self.head[k])) == width),
                      self.plain[-1])
         return self._with_names(dialect, first, width)
@@ -394,7 +443,7 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
     about = {}
     for line in comments:
         name, colon, text = line[1:].partition(':')
-        if colon and name.strip() in _ABOUT:
+        if colon and name.strip() in ABOUT:
             try:
                 about[name.strip()] = json.loads(text)
             except ValueError:

@@ -2,16 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the readers of binary flight logs share: their result, and how they choose among sensors.
+Reader of PX4 flight logs (ULog, ``.ulg``), on `pyulog`, and what it shares with that of ArduPilot.
 
 A flight log holds several messages with accelerations, each of several sensors. `choose` takes the
 first message in order of preference whose samples are dense enough for the capture of poses.
+
+Four messages of PX4 have accelerations, all in x forward, y right, z down and in m/s²:
+
+====================  ==========================================================================
+message               content
+====================  ==========================================================================
+sensor_accel          reading of one sensor before PX4 corrects it, with its temperature
+sensor_combined       mean of the selected sensor, corrected by the stored CAL_ACC parameters
+vehicle_imu           change of velocity of one sensor over an interval, corrected likewise
+vehicle_acceleration  filtered and corrected reading of the selected sensor, without its bias
+====================  ==========================================================================
+
+The default profile of PX4 logs `sensor_accel` once a second. It is read if it is dense enough.
+[1] https://docs.px4.io/main/en/dev_log/ulog_file_format
+[2] https://docs.px4.io/main/en/msg_docs/
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 import errno
@@ -24,11 +39,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..table import columns_from, Floats, numbered, Recording
-from ..units import UnitName
+from ..table import COLUMNS, columns_from, Floats, numbered, Recording
+from ..text import counted
 
-AXES = ('ax', 'ay', 'az')
-RATES = ('gx', 'gy', 'gz')
+AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
 MICRO = 1e-6
 
 _STANDARD_ERROR = 2
@@ -38,63 +52,8 @@ DENSE_HZ = 5.0
 
 
 @dataclass(frozen=True)
-class FlightLog:
-    """
-    The samples of one sensor of a flight log.
-
-    Parameters
-    ----------
-    columns : mapping of str to array
-        n values by the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has
-        them ``gx,gy,gz`` [rad/s] and ``temperature`` [°C].
-    units : {'m/s2', 'g', 'native'}
-        Unit of the readings.
-    sensor : str
-        Message and number of the sensor, such as ``sensor_accel 0``.
-    read_as : str
-        What was read, one line.
-    notes : tuple of str
-        What was not used, and what to know of the readings.
-
-    """
-
-    columns: Mapping[str, Floats]
-    units: UnitName
-    sensor: str
-    read_as: str
-    notes: tuple[str, ...] = ()
-
-    def recording(self, source: str) -> Recording:
-        """
-        Return the samples as a recording.
-
-        Raises
-        ------
-        InputError
-            If a number is not finite.
-
-        """
-        columns = columns_from(self.columns, ('time', 'reading'), source)
-        return Recording(columns, numbered(columns), self.units, self.sensor)
-
-
-@dataclass(frozen=True)
 class Message:
-    """
-    The samples of one message of one sensor, as in the log.
-
-    Parameters
-    ----------
-    name : str
-        Name of the message.
-    instance : int
-        Number of the sensor.
-    fields : mapping of str to array
-        n values by the names of the log.
-    time : (n,) array
-        Time of the samples [s].
-
-    """
+    """The samples of one message of one sensor: fields by the names of the log, and time [s]."""
 
     name: str
     instance: int
@@ -111,17 +70,106 @@ class Message:
         return f'{self.name} {self.instance}'
 
 
-def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
-           source: str) -> Message:
+@dataclass(frozen=True)
+class FlightLog:
     """
-    Return the message to read.
+    The samples of one sensor of a flight log, in m/s².
 
     Parameters
     ----------
+    columns : mapping of str to array
+        n values by the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has
+        them ``gx,gy,gz`` [rad/s] and ``temperature`` [°C].
+    sensor : str
+        Message and number of the sensor, such as ``sensor_accel 0``.
+    read_as : str
+        What was read, one line.
+    notes : tuple of str
+        What was not used, and what to know of the readings.
+
+    """
+
+    columns: Mapping[str, Floats]
+    sensor: str
+    read_as: str
+    notes: tuple[str, ...] = ()
+
+    def recording(self, source: str) -> Recording:
+        """Return the samples as a recording; a number that is not finite is an InputError."""
+        columns = columns_from(self.columns, ('time', 'reading'), source)
+        return Recording(columns, numbered(columns), 'm/s2', self.sensor)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    The message to read, among those of a log that have samples.
+
+    Parameters
+    ----------
+    message : Message
+        The message.
     found : sequence of Message
-        The messages of the log, those without samples left out.
+        All messages of the log that matter.
     preferred : sequence of str
         Names of the messages that have accelerations, the best first.
+    name : str
+        Name of the sensor, if the user states one.
+
+    """
+
+    message: Message
+    found: Sequence[Message]
+    preferred: Sequence[str]
+    name: str
+
+    def log(self, kind: str, columns: Mapping[str, Floats], temperature: str,
+            notes: Iterable[str]) -> FlightLog:
+        """Return the log; `temperature` describes that column, if there is one."""
+        chosen = self.message
+        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, x forward, y right, z down'
+        if 'temperature' in columns:
+            read_as += f', {temperature}'
+        return FlightLog(columns, self.name or str(chosen), read_as, tuple(notes))
+
+    def others(self) -> list[str]:
+        """Return notes on the other sensors of the same message, and on other messages."""
+        chosen, notes = self.message, []
+        usable = [each for each in self.found if len(each.time)]
+        rest = [each for each in usable
+                if each.name == chosen.name and each.instance != chosen.instance]
+        other = [each for each in usable
+                 if each.name in self.preferred and each.name != chosen.name]
+        if rest:
+            notes.append(f'{chosen} is read; other sensors: {", ".join(map(str, rest))} '
+                         f'(--sensor {rest[0].instance})')
+        if other:
+            names = ', '.join(dict.fromkeys(f'{each.name} ({each.rate_hz:.3g} Hz)'
+                                            for each in other
+                                            if each.instance == other[0].instance))
+            notes.append(f'not used: {names} (--topic {other[0].name})')
+        return notes
+
+    def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
+              ) -> dict[str, Floats]:
+        """Return the angular rates of the first source with these fields that is as dense."""
+        for each in sources:
+            if each.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(each.fields):
+                rates = taken(each.fields, RATES, names)
+                if finite(*rates.values()):
+                    return {key: at(time, each, values) for key, values in rates.items()}
+        return {}
+
+
+def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
+           source: str) -> Choice:
+    """
+    Choose the message to read.
+
+    Parameters
+    ----------
+    found, preferred
+        As in `Choice`.
     topic : str
         Name of the message that the user names; empty: by preference.
     sensor : str
@@ -140,7 +188,8 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
     if not usable:
         raise InputError(f'{source} has none of the messages {", ".join(preferred)}, expected one '
                          'with accelerations', 'log the accelerometer, see docs/log_formats.md')
-    number = sensor if is_number(sensor, found) else ''
+    chooses = sensor.isdecimal() or sensor in map(str, found)
+    number = sensor if chooses else ''
     wanted = [each for each in usable if topic in ('', each.name)
               and number in ('', str(each.instance), str(each))]
     if not wanted:
@@ -150,29 +199,14 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
                          f'{usable[0].name} --sensor {usable[0].instance}')
     order = sorted(wanted, key=lambda each: (preferred.index(each.name), each.instance))
     dense = [each for each in order if each.rate_hz >= DENSE_HZ]
-    return dense[0] if dense else max(order, key=lambda each: each.rate_hz)
+    best = dense[0] if dense else max(order, key=lambda each: each.rate_hz)
+    return Choice(best, found, preferred, '' if chooses else sensor)
 
 
-def is_number(sensor: str, found: Sequence[Message]) -> bool:
-    """Return whether a text is the number of a sensor, alone or after the name of a message."""
-    return sensor.isdecimal() or sensor in map(str, found)
-
-
-def others(chosen: Message, found: Sequence[Message], preferred: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on the other sensors of the same message, if there are any."""
-    rest = [each for each in found
-            if each.name == chosen.name and each.instance != chosen.instance and len(each.time)]
-    other = [each for each in found if each.name in preferred and each.name != chosen.name
-             and len(each.time)]
-    notes = []
-    if rest:
-        notes.append(f'{chosen} is read; other sensors: {", ".join(map(str, rest))} '
-                     f'(--sensor {rest[0].instance})')
-    if other:
-        names = ', '.join(dict.fromkeys(f'{each.name} ({each.rate_hz:.3g} Hz)' for each in other
-                                        if each.instance == other[0].instance))
-        notes.append(f'not used: {names} (--topic {other[0].name})')
-    return tuple(notes)
+def taken(fields: Mapping[str, NDArray[Any]], keys: Sequence[str], names: Sequence[str]
+          ) -> dict[str, Floats]:
+    """Return the first fields as floats under our names."""
+    return {key: np.asarray(fields[name], float) for key, name in zip(keys, names)}
 
 
 def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
@@ -186,24 +220,21 @@ def finite(*columns: NDArray[Any]) -> bool:
     return all(len(each) > 0 and bool(np.all(np.isfinite(each))) for each in columns)
 
 
-def sound_rows(columns: Mapping[str, Floats]) -> NDArray[np.bool_]:
-    """Return a mask of the rows whose values are all finite numbers."""
-    return np.logical_and.reduce([np.isfinite(each) for each in columns.values()])
+def sound(message: Message, columns: Mapping[str, Floats], why: str,
+          valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
+    """Return the valid rows whose values are all finite, and a note on the others."""
+    valid = valid & np.logical_and.reduce([np.isfinite(each) for each in columns.values()])
+    dropped = int(np.sum(~valid))
+    notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
+    return {key: values[valid] for key, values in columns.items()}, notes
 
 
 @contextmanager
 def sound_log(path: Path, expected: str) -> Iterator[None]:
     """
-    Turn what a library raises for a damaged log into one error, and drop what it prints.
+    Turn what a library raises for a damaged log into one InputError, and drop what it prints.
 
-    Libraries of flight logs raise errors of any class, and print.
-
-    Raises
-    ------
-    InputError
-        If the log is damaged.
-    OSError
-        If the file cannot be read.
+    Libraries of flight logs raise errors of any class, and print. Errors of the system pass.
 
     """
     try:
@@ -239,3 +270,172 @@ def missing(library: str, what: str, err: ImportError) -> InputError:
     """Return the error for a library that is not installed."""
     return InputError(f'{library} is not installed, it reads {what} ({err})',
                       f'run pip install {library}')
+
+
+# --------------------------------------------------------------------------------------- PX4
+
+MAGIC = b'ULog\x01\x12\x35'
+_INVALID = 0x7fffffff
+"""Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
+
+_RELATIVE = 'accelerometer_timestamp_relative'
+_XYZ = ('x', 'y', 'z')
+
+
+def _numbered(name: str) -> tuple[str, ...]:
+    return tuple(f'{name}[{k}]' for k in range(3))
+
+
+_FIELDS: dict[str, tuple[str, ...]] = {
+    'sensor_accel': _XYZ,
+    'sensor_combined': (*_numbered('accelerometer_m_s2'), *_numbered('gyro_rad'), _RELATIVE),
+    'vehicle_imu': (*_numbered('delta_velocity'), *_numbered('delta_angle'),
+                    'delta_velocity_dt', 'delta_angle_dt'),
+    'vehicle_acceleration': _numbered('xyz')}
+"""Fields of the messages with accelerations, in order of preference: reading, rate, others."""
+
+PREFERRED = tuple(_FIELDS)
+_ALSO = ('sensor_gyro', 'sensor_selection')
+
+
+class _WholeReads(io.BufferedReader):
+    """
+    A file that moves on by as many bytes as were asked for, beyond its end, too.
+
+    `pyulog` goes back by the stated length of a damaged message. If fewer bytes were left, it
+    would go back too far and read the same bytes without end.
+
+    """
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes: at the end of the file fewer than `size`."""
+        data = super().read(size)
+        if size is not None and 0 < len(data) < size:
+            self.seek(size - len(data), io.SEEK_CUR)
+        return data
+
+
+def is_ulg(path: Path) -> bool:
+    """Return whether a file is a ULog, from its first bytes."""
+    if not path.is_file():
+        return False
+    with path.open('rb') as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
+def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
+    """
+    Read the accelerations of one sensor of a PX4 log.
+
+    Parameters
+    ----------
+    path : Path
+        The ``.ulg`` file.
+    topic : str
+        Name of the message; by default the first of `PREFERRED` that is dense enough.
+    sensor : str
+        Number of the sensor; by default the lowest. Another text is a name for the sensor.
+
+    Raises
+    ------
+    InputError
+        If pyulog is not installed, the file is damaged, or it has no such message.
+    OSError
+        If the file cannot be read.
+
+    """
+    found, notes = _messages(path)
+    known = [each for each in found
+             if each.name in _FIELDS and set(_FIELDS[each.name]) <= set(each.fields)]
+    choice = choose(known, PREFERRED, topic, sensor, str(path))
+    chosen = choice.message
+    columns, invalid = _samples(chosen)
+    time = columns['time']
+    if not len(time):
+        raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
+                         'name another message with --topic')
+    if chosen.name == PREFERRED[0]:
+        gyros = (each for each in found
+                 if (each.name, each.instance) == ('sensor_gyro', chosen.instance))
+        columns |= choice.rates(time, gyros, _XYZ)
+        corrected = []
+    else:
+        corrected = [f'{chosen.name} is corrected by the stored CAL_ACC parameters; sensor_accel '
+                     'is not (add 4 or 64 to SDLOG_PROFILE to log it at 10 Hz)']
+    columns |= _temperature(chosen, time, found)
+    return choice.log('PX4 log', columns, 'temperature of the sensor',
+                      (*notes, *invalid, *choice.others(), *corrected))
+
+
+def _messages(path: Path) -> tuple[list[Message], list[str]]:
+    """Return the messages that matter, and notes on a log that is damaged in part."""
+    try:
+        from pyulog import ULog
+    except ImportError as err:
+        raise missing('pyulog', 'PX4 logs (.ulg)', err) from err
+    if not is_ulg(path):
+        raise InputError(f'{path} does not start as a ULog does, expected a PX4 log (.ulg)',
+                         'check that this is the intended file')
+    with _WholeReads(io.FileIO(path)) as file, sound_log(path, 'a PX4 log (.ulg)'):
+        log = ULog(file, [*PREFERRED, *_ALSO])
+        found = [Message(data.name, data.multi_id, data.data, _time(data.data))
+                 for data in log.data_list if len(data.data['timestamp'])]
+    notes = []
+    if log.file_corruption:
+        notes.append('the log is damaged in part; its sound part is read')
+    if log.dropouts:
+        lost = sum(each.duration for each in log.dropouts)
+        notes.append(f'PX4 reports {counted(len(log.dropouts), "dropout")} of the log, {lost} ms')
+    return found, notes
+
+
+def _time(fields: Mapping[str, NDArray[Any]]) -> Floats:
+    """Return the time of the samples [s]; timestamp_sample where it is set."""
+    stamps = fields['timestamp']
+    if 'timestamp_sample' in fields and np.all(fields['timestamp_sample'] > 0):
+        stamps = fields['timestamp_sample']
+    return stamps.astype(float) * MICRO
+
+
+def _samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
+    """Return time, readings and rates of the valid rows, and a note on the others."""
+    fields, time = message.fields, message.time
+    columns = taken(fields, (*AXES, *RATES), _FIELDS[message.name])
+    valid = np.ones(len(time), dtype=bool)
+    if _RELATIVE in fields:
+        relative = fields[_RELATIVE].astype(float)
+        time, valid = time + relative * MICRO, relative != _INVALID
+    for name, keys in (('delta_velocity_dt', AXES), ('delta_angle_dt', RATES)):
+        if name in fields:
+            seconds = fields[name] * MICRO
+            valid &= seconds > 0.0
+            for key in keys:
+                columns[key] = columns[key] / np.where(seconds > 0.0, seconds, 1.0)
+    return sound(message, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
+
+
+def _device(chosen: Message, found: Sequence[Message] = ()) -> int:
+    """Return the device id of the accelerometer of a message; 0 if it is not known."""
+    for name in ('device_id', 'accel_device_id'):
+        if name in chosen.fields:
+            return int(chosen.fields[name][-1])
+    for each in found:
+        if each.name == 'sensor_selection' and 'accel_device_id' in each.fields:
+            return int(each.fields['accel_device_id'][-1])
+    return 0
+
+
+def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
+    """Return the temperature that sensor_accel of the same device reports."""
+    sources = [each for each in found
+               if each.name == PREFERRED[0] and 'temperature' in each.fields]
+    device = _device(chosen, found)
+    same = [each for each in sources if device and _device(each) == device]
+    if chosen.name == PREFERRED[0]:
+        same = [each for each in sources if each.instance == chosen.instance]
+    elif not same and len(sources) == 1:
+        same = sources
+    if not same or not finite(same[0].fields['temperature']):
+        return {}
+    return {'temperature': at(time, same[0], same[0].fields['temperature'])}

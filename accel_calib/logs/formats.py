@@ -11,9 +11,9 @@ reader finds it from the readings at rest.
 
 **Frames.** A specific force is +1 g along the axis that points up. Phones (phyphox, Sensor Logger
 on Android, MATLAB Mobile) and Betaflight log this sign with z up. PX4 and ArduPilot log this sign
-with z down, so that a level vehicle reads -1 g on z. iOS itself (CoreMotion) has the opposite
-sign: a phone that lies with its screen up reads -1 g on z. No fit depends on the sign. A flat pose
-does, and `LogFormat.frame` names the frame for it.
+with z down, so that a level vehicle reads -1 g on z; ``--frame ros`` turns it. iOS itself
+(CoreMotion) has the opposite sign: a phone that lies with its screen up reads -1 g on z. No fit
+depends on the sign. A flat pose does, and `LogFormat.note` names the frame for it.
 
 """
 
@@ -25,12 +25,10 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
+from .names import RATE, READING
 from ..errors import InputError
 from ..units import UnitName
 
-AXES = ('x', 'y', 'z')
-READING = ('ax', 'ay', 'az')
-RATE = ('gx', 'gy', 'gz')
 MICRO = 1e-6
 MILLI = 1e-3
 DEGREE = 0.017453292519943295
@@ -45,8 +43,6 @@ class LogFormat:
     ----------
     name : str
         Name of the maker or tool, as ``--format`` has it.
-    source : str
-        Address of the maker's documentation of the layout.
     columns : mapping of str to str
         Name in the file of each of our columns: ``time``, ``ax`` to ``gz``, ``temperature``.
     scales : mapping of str to float
@@ -67,8 +63,6 @@ class LogFormat:
         Name in the file of the column by which one of our columns is divided, if any.
     instance : str
         Name of the column with the number of the sensor, if rows of several sensors alternate.
-    frame : {'ros', 'win8', ''}
-        The ``--frame`` for a flat pose, if a level device does not read +1 g on z.
     note : str
         What else a user should know.
     plain : bool
@@ -78,17 +72,15 @@ class LogFormat:
     """
 
     name: str
-    source: str
     columns: Mapping[str, str]
-    scales: Mapping[str, float]
-    units: UnitName | Literal['']
+    scales: Mapping[str, float] = field(default_factory=dict)
+    units: UnitName | Literal[''] = 'm/s2'
     marks: tuple[str, ...] = ()
     without_gravity: tuple[str, ...] = ()
     other_sensors: tuple[str, ...] = ()
     record: str = ''
     divisors: Mapping[str, str] = field(default_factory=dict)
     instance: str = ''
-    frame: Literal['ros', 'win8', ''] = ''
     note: str = ''
     plain: bool = True
 
@@ -115,116 +107,98 @@ def folded(name: str) -> str:
     return ' '.join(name.strip().strip('"\'').split()).casefold().replace('²', '^2')
 
 
-def _axes(pattern: str, keys: Sequence[str] = READING, names: Sequence[str] = AXES
+_LOWER, _UPPER, _BY_NUMBER = ('x', 'y', 'z'), ('X', 'Y', 'Z'), ('0', '1', '2')
+
+
+def _axes(pattern: str, keys: Sequence[str] = READING, names: Sequence[str] = _LOWER
           ) -> dict[str, str]:
     """Return a name for each axis; ``{}`` in the pattern stands for the axis."""
     return {key: pattern.replace('{}', name) for key, name in zip(keys, names)}
 
 
-_BY_NUMBER = ('0', '1', '2')
-
 # ---------------------------------------------------------------------------- phyphox
+# https://github.com/phyphox/phyphox-android
 # The data sets of the app's own experiments, and of those made with "Add simple experiment".
 # Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
 
-_PHYPHOX = 'https://github.com/phyphox/phyphox-android'
-_PHYPHOX_RECORD = "record 'Acceleration with g' (Raw sensors) in phyphox"
-_PHYPHOX_WITHOUT = (*_axes('Linear Acceleration {} (m/s^2)').values(), 'Linear Acceleration.csv',
-                    'Linear Accelerometer.csv', 'Acceleration without g.csv')
-
-_PHYPHOX_FORMATS = (
-    LogFormat('phyphox', _PHYPHOX,
-              {'time': 'Time (s)', **_axes('Acceleration {} (m/s^2)')}, {'time': 1.0}, 'm/s2',
-              (), _PHYPHOX_WITHOUT, record=_PHYPHOX_RECORD),
-    LogFormat('phyphox', _PHYPHOX,
-              {'time': 'Time (s)', **_axes('{} (m/s^2)')}, {'time': 1.0}, 'm/s2',
-              (), _PHYPHOX_WITHOUT, record=_PHYPHOX_RECORD),
-)
+_PHYPHOX_FORMATS = tuple(
+    LogFormat('phyphox', {'time': 'Time (s)', **_axes(pattern)}, {'time': 1.0},
+              without_gravity=(
+                  *_axes('Linear Acceleration {} (m/s^2)').values(), 'Linear Acceleration.csv',
+                  'Linear Accelerometer.csv', 'Acceleration without g.csv'),
+              record="record 'Acceleration with g' (Raw sensors) in phyphox")
+    for pattern in ('Acceleration {} (m/s^2)', '{} (m/s^2)'))
 
 # ---------------------------------------------------------------------- Sensor Logger
+# https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
 # One file per sensor with the same header; the name of the file is the name of the sensor.
 
-_LOGGER = 'https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md'
-
-_LOGGER_FORMATS = (
-    LogFormat('sensor-logger', _LOGGER,
-              {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '',
-              ('time',), ('Accelerometer.csv',),
-              ('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
-               'MagnetometerUncalibrated.csv'),
-              'use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor '
-              'Logger',
-              note='Readings in g are those of an iPhone, with the opposite sign: a flat pose '
-                   'needs --frame win8.'),
-)
+_LOGGER = LogFormat(
+    'sensor-logger', {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '', ('time',),
+    ('Accelerometer.csv',),
+    ('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
+     'MagnetometerUncalibrated.csv'),
+    'use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor Logger',
+    note='Readings in g are those of an iPhone, with the opposite sign: a flat pose needs '
+         '--frame win8.')
 
 # ---------------------------------------------------------------------- MATLAB Mobile
+# https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html
 # The timetable Acceleration, written by writetimetable; or sensorlog_accel_*.csv of a phone's
 # local log, where the time is in ms of Unix time.
 
-_MATLAB = 'https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html'
-
-_MATLAB_FORMATS = (
-    LogFormat('matlab', _MATLAB, {'time': 'Timestamp', **_axes('{}', names=('X', 'Y', 'Z'))}, {},
-              'm/s2', plain=False),
-    LogFormat('matlab', _MATLAB, {'time': 'Time', **_axes('{}', names=('X', 'Y', 'Z'))}, {},
-              'm/s2', plain=False),
-)
+_MATLAB_FORMATS = tuple(
+    LogFormat('matlab', {'time': time, **_axes('{}', names=_UPPER)}, plain=False)
+    for time in ('Timestamp', 'Time'))
 
 # ------------------------------------------------------------------------------- PX4
+# https://docs.px4.io/main/en/msg_docs/
 # One file for each topic, <log>_<topic>_<instance>.csv, written by ulog2csv of pyulog; the columns
-# are the fields of the message.
+# are the fields of the messages SensorAccel, SensorCombined, VehicleImu and VehicleAcceleration.
 
-_PX4 = 'https://docs.px4.io/main/en/msg_docs/'
 _FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g on z; --flat '
         'turns them to x forward, y left, z up.')
 
 _PX4_FORMATS = (
-    LogFormat('px4', _PX4 + 'SensorAccel',
-              {'time': 'timestamp', **_axes('{}'), 'temperature': 'temperature'},
-              {'time': MICRO}, 'm/s2', ('device_id', 'error_count'), frame='ros', note=_FRD),
-    LogFormat('px4', _PX4 + 'SensorCombined',
+    LogFormat('px4', {'time': 'timestamp', **_axes('{}'), 'temperature': 'temperature'},
+              {'time': MICRO}, marks=('device_id', 'error_count'), note=_FRD),
+    LogFormat('px4',
               {'time': 'timestamp', **_axes('accelerometer_m_s2[{}]', names=_BY_NUMBER),
                **_axes('gyro_rad[{}]', RATE, _BY_NUMBER)},
-              {'time': MICRO}, 'm/s2', frame='ros',
+              {'time': MICRO},
               note='Readings are corrected by the stored CAL_ACC parameters; those of '
                    f'sensor_accel are not. {_FRD}'),
-    LogFormat('px4', _PX4 + 'VehicleImu',
+    LogFormat('px4',
               {'time': 'timestamp', **_axes('delta_velocity[{}]', names=_BY_NUMBER),
                **_axes('delta_angle[{}]', RATE, _BY_NUMBER)},
-              {'time': MICRO, **dict.fromkeys((*READING, *RATE), 1.0 / MICRO)}, 'm/s2',
+              {'time': MICRO, **dict.fromkeys((*READING, *RATE), 1.0 / MICRO)},
               divisors={**dict.fromkeys(READING, 'delta_velocity_dt'),
-                        **dict.fromkeys(RATE, 'delta_angle_dt')}, frame='ros', note=_FRD),
-    LogFormat('px4', _PX4 + 'VehicleAcceleration',
-              {'time': 'timestamp', **_axes('xyz[{}]', names=_BY_NUMBER)},
-              {'time': MICRO}, 'm/s2', ('timestamp_sample',), frame='ros', note=_FRD),
-)
+                        **dict.fromkeys(RATE, 'delta_angle_dt')}, note=_FRD),
+    LogFormat('px4', {'time': 'timestamp', **_axes('xyz[{}]', names=_BY_NUMBER)},
+              {'time': MICRO}, marks=('timestamp_sample',), note=_FRD))
 
 # -------------------------------------------------------------------------- ArduPilot
+# https://ardupilot.org/copter/docs/logmessages.html
 # mavlogdump.py --format csv --types IMU (or ACC) writes the fields of the message after its own
 # timestamp.
 
-_ARDUPILOT = 'https://ardupilot.org/copter/docs/logmessages.html'
-_CORRECTED = f'Readings are corrected by the stored INS_ACC parameters. {_FRD}'
-_ACC = _axes('Acc{}', names=('X', 'Y', 'Z'))
+_ACC = _axes('Acc{}', names=_UPPER)
 
-_ARDUPILOT_FORMATS = (
-    LogFormat('ardupilot', _ARDUPILOT + '#imu',
-              {'time': 'TimeUS', **_ACC, **_axes('Gyr{}', RATE, ('X', 'Y', 'Z')),
-               'temperature': 'T'},
-              {'time': MICRO}, 'm/s2', ('GyrX',), instance='I', frame='ros', note=_CORRECTED),
-    LogFormat('ardupilot', _ARDUPILOT + '#acc', {'time': 'SampleUS', **_ACC}, {'time': MICRO},
-              'm/s2', ('TimeUS',), instance='I', frame='ros', note=_CORRECTED),
-    LogFormat('ardupilot', _ARDUPILOT, {'time': 'TimeUS', **_ACC}, {'time': MICRO}, 'm/s2',
-              instance='I', frame='ros', note=_CORRECTED),
-)
+_ARDUPILOT_FORMATS = tuple(
+    LogFormat('ardupilot', {'time': time, **_ACC, **more}, {'time': MICRO}, marks=marks,
+              instance='I',
+              note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
+    for time, more, marks in (
+        ('TimeUS', {**_axes('Gyr{}', RATE, _UPPER), 'temperature': 'T'}, ('GyrX',)),
+        ('SampleUS', {}, ('TimeUS',)),
+        ('TimeUS', {}, ())))
 
 # ------------------------------------------------------------------------- Betaflight
+# https://github.com/betaflight/blackbox-tools
 # blackbox_decode, whose options --unit-frame-time, --unit-acceleration and --unit-rotation add the
 # unit to the name, and the export of the Blackbox Explorer. Without units the readings are counts
 # (acc_1G of the log's header per g), and the unit of the gyro is not in the file.
 
-_BETAFLIGHT = 'https://github.com/betaflight/blackbox-tools'
 _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
 _BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
@@ -234,13 +208,14 @@ def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
     """Return the layout with these units in the names of its columns."""
     columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
     scales = {'time': _BLACKBOX_TIMES[time]}
-    turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER)
+    marks: tuple[str, ...] = ('loopIteration',)
     if rate:
+        turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER)
         columns |= turns
         scales |= dict.fromkeys(RATE, _BLACKBOX_RATES[rate])
+        marks = tuple(turns.values())
     note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
-    return LogFormat('betaflight', _BETAFLIGHT, columns, scales, _BLACKBOX_UNITS[unit],
-                     tuple(turns.values()) if rate else ('loopIteration',), note=note)
+    return LogFormat('betaflight', columns, scales, _BLACKBOX_UNITS[unit], marks, note=note)
 
 
 _BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_TIMES
@@ -250,13 +225,10 @@ _BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_
 # A sketch prints the names and units that its author chose, so that the table of names finds the
 # columns (none are listed here), and the readings at rest determine the unit.
 
-_ESP32_FORMATS = (
-    LogFormat('esp32', 'https://github.com/ElectronicCats/mpu6050', {}, {}, '', plain=False),
-)
+_ESP32 = LogFormat('esp32', {}, units='', plain=False)
 
-FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, *_LOGGER_FORMATS, *_MATLAB_FORMATS,
-                                  *_PX4_FORMATS, *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS,
-                                  *_ESP32_FORMATS)
+FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, _LOGGER, *_MATLAB_FORMATS, *_PX4_FORMATS,
+                                  *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS, _ESP32)
 
 NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
 """Names of the formats, as ``--format`` has them."""
@@ -270,21 +242,10 @@ def recognise(header: Sequence[str]) -> LogFormat | None:
 
 def named(name: str, header: Sequence[str], source: str) -> LogFormat:
     """
-    Return the layout of a maker that a header has.
+    Return the layout of a maker that a header has; `name` is one of `NAMES`.
 
-    Parameters
-    ----------
-    name : str
-        Name of the maker, one of `NAMES`.
-    header : sequence of str
-        Names in the file.
-    source : str
-        Name of the file in error messages.
-
-    Raises
-    ------
-    InputError
-        If the name is not known, or the header has none of the maker's layouts.
+    A name that is not known, or a header with none of the layouts, is an InputError; `source`
+    names the file there.
 
     """
     layouts = [each for each in FORMATS if each.name == name]
@@ -304,27 +265,15 @@ def named(name: str, header: Sequence[str], source: str) -> LogFormat:
 
 
 def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
-    """
-    Return the layout with most names, with the column of numbers of sensors only if it is there.
-
-    Logs of ArduPilot before version 4.1 have no such column.
-
-    """
+    """Return the layout with most names."""
     found = max(fitting, key=lambda each: len(each.needed))
+    # Logs of ArduPilot before version 4.1 have no column with the number of the sensor.
     there = folded(found.instance) in {folded(name) for name in header}
     return found if there else replace(found, instance='')
 
 
 def check_sensor(header: Sequence[str], path: Path) -> None:
-    """
-    Check that a file is not one of another sensor, if its maker gives all files the same columns.
-
-    Raises
-    ------
-    InputError
-        If the name of the file is that of another sensor.
-
-    """
+    """Check the name of a file, if its maker gives the files of all sensors the same columns."""
     layout = recognise(header)
     if layout and _is_named(path, layout.other_sensors):
         raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '

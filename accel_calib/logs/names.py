@@ -119,12 +119,10 @@ class Meaning:
 
     Parameters
     ----------
-    quantity : str
-        Key of `WORDS`, or empty.
+    quantity, unit : str
+        Key of `WORDS`, and text of the unit; empty if the name does not state it.
     axis : int or None
         Number of the axis, 0 to 2 (or 1 to 3 where a log counts so).
-    unit : str
-        Text of the unit, a key of `UNITS[quantity]`, or empty.
     group : tuple of str
         The other words.
     free : bool

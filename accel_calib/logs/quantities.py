@@ -8,28 +8,32 @@ Quantities of a text log: the conversion of its columns to our units.
 the file, the maker's layout or the name states, or else what the readings at rest and the rate of
 the samples show. Each assumption is in `Quantities.read_as`.
 
+**Time.** A unit that no name states is found from the rate: 1 to 10,000 samples per second are
+plausible. Where two units are, that with a rate nearer to 100 Hz is taken; stamps since 1970
+decide before. A counter of the clock can start again.
+
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import clock
 from .accelerometer import compact, unit_of_reading
-from .clock import has_date, seconds_of
-from .columns import FRACTION, unused
+from .columns import Chosen, FRACTION, LogOptions, unused
+from .dialect import has_date, seconds_of
 from .names import RATE, READING, unit_of, ZEROS
-from .records import are_samples, are_untimed_samples, LogOptions
-from .selection import Chosen
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats
 from ..units import Units, units_of
+
+TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'µs': 1e-6, 'ns': 1e-9}
 
 _MOST_BACK = 0.1
 """Share of steps back in time above which a column is no time."""
@@ -43,6 +47,132 @@ _LARGEST_RATE = 40.0
 
 _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
 _DEGREE = np.pi / 180.0
+
+_RATES_HZ = (1.0, 10_000.0)
+_USUAL_HZ = 100.0
+_EPOCH_S = (1e9, 4e9)
+"""Unix times from 2001 to 2096 [s]."""
+
+_DAY_S = 86_400.0
+_COUNTER = 2.0**32
+_NEAR_END = 0.01
+"""Share of the range of a counter, before and after it starts again, in which the stamps are."""
+
+_MANY_ROWS = 500
+_WINDOW = 8
+_AT_REST = 0.3
+_MOVES = 5.0
+_MOVING = 0.05
+"""Share of windows whose scatter is above `_MOVES` times that at rest, the quantile `_AT_REST`."""
+
+
+def unit_by_rate(stamps: Floats) -> tuple[str, float] | None:
+    """Return the unit in which stamps have a plausible rate, and that rate [Hz], or None."""
+    step = step_of(stamps)
+    if not step > 0.0:
+        return None
+    rates = {name: 1.0 / (step * unit) for name, unit in TIME_UNITS.items()}
+    plausible = [name for name, rate in rates.items() if _RATES_HZ[0] * 0.9 <= rate
+                 <= _RATES_HZ[1] * 1.1]
+    since_1970 = [name for name in plausible
+                  if _EPOCH_S[0] <= float(np.median(stamps)) * TIME_UNITS[name] <= _EPOCH_S[1]]
+    if not np.all(stamps == np.round(stamps)) and 's' in plausible:
+        plausible = ['s']
+    best = min(since_1970 or plausible, default=None,
+               key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
+    return None if best is None else (best, rates[best])
+
+
+def step_of(stamps: Floats) -> float:
+    """Return the usual step between stamps; some sensors repeat a stamp of whole ms."""
+    steps = np.diff(stamps)
+    if not len(steps):
+        return 0.0
+    middle = float(np.median(steps))
+    forward = steps[steps > 0.0]
+    if middle > 0.0 or not len(forward):
+        return middle
+    return float(forward.sum()) / len(steps)
+
+
+def is_dense(stamps: Floats, reading: Floats) -> bool:
+    """
+    Return whether rows that are far apart in seconds are the samples of a moving sensor.
+
+    A sensor that is logged each ten seconds is nearly always still. In a recording of turns and
+    rests the scatter within many short windows is much larger than that at rest. Of real
+    recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
+
+    """
+    if len(stamps) < _MANY_ROWS or step_of(stamps) < 1.0:
+        return False
+    windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+    scatter = np.linalg.norm(windows.std(axis=1), axis=1)
+    at_rest = float(np.quantile(scatter, _AT_REST))
+    return bool(np.mean(scatter > _MOVES * at_rest) > _MOVING)
+
+
+@dataclass
+class Counter:
+    """Continues the times of a counter that starts again at one of these periods [s]."""
+
+    periods: tuple[float, ...]
+    added: float = 0.0
+    last: float = math.nan
+    starts: int = 0
+
+    def continued(self, seconds: Floats) -> Floats:
+        """Return times that go on where the counter starts again."""
+        before = np.concatenate([[self.last], seconds[:-1]])
+        steps = np.zeros(len(seconds))
+        for period in self.periods:
+            again = ((before >= (1.0 - _NEAR_END) * period) & (before < 1.000001 * period)
+                     & (seconds <= _NEAR_END * period))
+            steps[again] = period
+            self.starts += int(np.count_nonzero(again))
+        total = self.added + np.cumsum(steps)
+        if len(seconds):
+            self.last, self.added = float(seconds[-1]), float(total[-1])
+        return seconds + total
+
+
+def counter_of(unit: str, *, of_day: bool = False) -> Counter:
+    """Return the counter for stamps in a unit: 2^32 µs or ms, or a day."""
+    if of_day:
+        return Counter((_DAY_S,))
+    return Counter({'µs': (_COUNTER * 1e-6,), 'ms': (_COUNTER * 1e-3,),
+                    's': (_COUNTER * 1e-6, _COUNTER * 1e-3)}.get(unit, ()))
+
+
+_SAMPLES_APART_S = 0.5
+"""Rows that are nearer in time are samples."""
+
+_MANY_SAMPLES = 5000
+"""More rows than these are samples."""
+
+_FEW_POSES = 200
+"""Fewer rows without times are poses."""
+
+_SAME = 0.1
+"""Successive samples at rest are nearer than this, relative to the spread of the readings."""
+
+
+def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
+    """Return whether rows are samples: with time, without count, and dense or many."""
+    if 'time' not in columns or 'count' in columns or len(columns['time']) < 2:
+        return False
+    apart = float(np.median(np.diff(columns['time'])))
+    return apart < _SAMPLES_APART_S or len(columns['time']) > _MANY_SAMPLES
+
+
+def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
+    """Return whether rows without times are samples: many, and mostly like the row before."""
+    readings = columns['reading']
+    if len(readings) < _FEW_POSES or {'time', 'count', 'orientation'} & set(columns):
+        return False
+    step = np.linalg.norm(np.diff(readings, axis=0), axis=1)
+    spread = np.linalg.norm(readings - np.median(readings, axis=0), axis=1)
+    return bool(np.median(step) < _SAME * np.median(spread))
 
 
 @dataclass
@@ -58,8 +188,6 @@ class Quantities:
         Unit of the readings.
     scales : mapping of str to (float, float)
         Factor to our unit, and our value at 0.
-    counter : Counter
-        Continues times of a counter that starts again.
     instance : float or None
         Number of the sensor whose rows are read, where rows of several alternate.
     said, notes : list of str
@@ -70,7 +198,7 @@ class Quantities:
     chosen: Chosen
     units: Units
     scales: dict[str, tuple[float, float]] = field(default_factory=dict)
-    counter: clock.Counter = field(default_factory=lambda: clock.Counter(()))
+    counter: Counter = field(default_factory=lambda: Counter(()))
     instance: float | None = None
     said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -134,25 +262,7 @@ def _of_instance(columns: Chosen, cells: Cells, instance: float) -> Cells:
 
 
 def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
-    """
-    Return the conversion of the columns.
-
-    Parameters
-    ----------
-    columns : Chosen
-        The columns.
-    first : Cells
-        The first block of the log.
-    options : LogOptions
-        What the user states.
-
-    Raises
-    ------
-    InputError
-        If the units that are stated contradict each other or the readings, or gravity is not in
-        the readings.
-
-    """
+    """Return the conversion of the columns, from the first block of a log; see above."""
     made = Quantities(columns, units_of('m/s2', options.gravity))
     if columns.maker is not None:
         made.said.append(f'{columns.maker.name} format')
@@ -196,7 +306,7 @@ def _decide_time(made: Quantities, first: Cells) -> None:
     source = made.chosen.sources['time']
     if made.chosen.dates:
         of_day = not has_date(made.chosen.texts(first, 'time')[0])
-        made.counter = clock.counter_of('', of_day=of_day)
+        made.counter = counter_of('', of_day=of_day)
         made.said.append(f'{source.name}: {"times of the day" if of_day else "dates"} -> s')
         return
     stamps = made.chosen.numbers(first, 'time')
@@ -206,9 +316,9 @@ def _decide_time(made: Quantities, first: Cells) -> None:
                          f'{source.name} does not increase, expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit, words = _unit_of_time(made, first, stamps)
-    made.counter = clock.counter_of(unit)
+    made.counter = counter_of(unit)
     if unit != 's':
-        made.scales['time'] = (clock.UNITS[unit], 0.0)
+        made.scales['time'] = (TIME_UNITS[unit], 0.0)
     if words:
         made.said.append(words)
 
@@ -218,7 +328,7 @@ def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, 
     source, layout = made.chosen.sources['time'], made.chosen.layout
     scale = made.chosen.maker and made.chosen.maker.scales.get('time')
     if scale:
-        unit = min(clock.UNITS, key=lambda name: abs(np.log(clock.UNITS[name] / scale)))
+        unit = min(TIME_UNITS, key=lambda name: abs(np.log(TIME_UNITS[name] / scale)))
         return unit, f'{source.name} in {unit}' if unit != 's' else ''
     stated = unit_of('time', source.unit)
     if stated:
@@ -226,7 +336,7 @@ def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, 
     if layout.header and source.name == 'time' and (layout.about or 'count' in made.chosen.sources
                                                     or not _by_rate(made, first, stamps)):
         return 's', ''
-    found = clock.unit_by_rate(stamps)
+    found = unit_by_rate(stamps)
     named = f'column {source.name}' if source.name.isdecimal() else source.name
     if found is None:
         return 's', f'{named} in s'
@@ -236,16 +346,14 @@ def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, 
 
 def _by_rate(made: Quantities, first: Cells, stamps: Floats) -> bool:
     """Return whether the unit of a column ``time`` is found from the rate; by default it is s."""
-    if [made.chosen.sources[name].name for name in READING] != list(READING):
-        return True
-    raw = np.column_stack([made.chosen.numbers(first, name) for name in READING])
-    return clock.is_dense(stamps, raw)
+    return (made.chosen.names(READING) != list(READING)
+            or is_dense(stamps, made.chosen.three(first, READING)))
 
 
 # ---------------------------------------------------------------------------------- reading
 
 def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
-    raw = np.column_stack([made.chosen.numbers(first, name) for name in READING])
+    raw = made.chosen.three(first, READING)
     columns = {'reading': raw, **{key: raw[:, 0] for key in ('count', 'orientation')
                                   if key in made.chosen.sources}}
     if 'time' in made.chosen.sources:
@@ -253,7 +361,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None
     else:
         samples = options.rate is not None or are_untimed_samples(columns)
     found = unit_of_reading(made.chosen, raw, options, samples=samples)
-    made.units = units_of(found.name, options.gravity)
+    made.units = found.units
     if found.factor != 1.0:
         made.scales.update(dict.fromkeys(READING, (found.factor, 0.0)))
     if found.assumed or made.said:
@@ -265,8 +373,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None
 def _drop(made: Quantities, keys: Sequence[str], note: str) -> None:
     """Leave columns out, and note why."""
     sources = {key: value for key, value in made.chosen.sources.items() if key not in keys}
-    made.chosen = Chosen(made.chosen.layout, sources, made.chosen.maker, made.chosen.numeric,
-                         made.chosen.text)
+    made.chosen = replace(made.chosen, sources=sources)
     made.notes.append(note)
 
 
@@ -274,14 +381,12 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
     columns = made.chosen
     if not columns.sources.keys() >= set(RATE):
         return
-    words = compact([columns.sources[name].name for name in RATE])
-    scale = columns.maker and columns.maker.scales.get('gx')
+    words = compact(columns.names(RATE))
     if columns.maker is not None and 'gx' in columns.maker.columns:
-        made.scales.update(dict.fromkeys(RATE, (scale or 1.0, 0.0)))
+        made.scales.update(dict.fromkeys(RATE, (columns.maker.scales.get('gx', 1.0), 0.0)))
         return
     stated = unit_of('rate', columns.sources['gx'].unit)
-    largest = float(np.quantile(np.abs(np.column_stack(
-        [columns.numbers(first, name) for name in RATE])), 0.999))
+    largest = float(np.quantile(np.abs(columns.three(first, RATE)), 0.999))
     own = columns.sources['gx'].name == 'gx' and largest < _LARGEST_RATE
     if stated is None and own and columns.layout.header:
         return
@@ -320,8 +425,10 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
 
 
 def _decide_supply(made: Quantities) -> None:
-    source = made.chosen.sources.get('supply_voltage')
-    stated = source and unit_of('supply_voltage', source.unit)
-    if source and stated and stated[1] != 1.0:
-        made.scales['supply_voltage'] = (stated[1], 0.0)
-        made.said.append(f'{source.name} in {stated[0]} -> V')
+    if 'supply_voltage' not in made.chosen.sources:
+        return
+    source = made.chosen.sources['supply_voltage']
+    unit, factor = unit_of('supply_voltage', source.unit) or ('V', 1.0)
+    if factor != 1.0:
+        made.scales['supply_voltage'] = (factor, 0.0)
+        made.said.append(f'{source.name} in {unit} -> V')

@@ -1,13 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Opening of logs of all kinds, and of tables with our own names."""
+"""Reading of logs of all kinds, and of lines that arrive from a serial port."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -16,35 +16,98 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .ardupilot import is_dataflash, read_dataflash
-from .bag import is_bag, open_samples, together
-from .columns import Source
-from .dialect import Layout
-from .flight import FlightLog
-from .names import OURS, READING
-from .px4 import is_ulg, read_ulg
-from .quantities import decided, Quantities
-from .records import are_samples, are_untimed_samples, Log, LogOptions, OpenLog
-from .selection import chosen, is_log_header, with_indices
+from .bag import Bag, first_frame_id, imu_topic, is_bag, open_bag
+from .bag_samples import context_of, imu_samples, together
+from .columns import chosen, is_log_header, LogOptions
+from .dialect import layout_of
+from .flight import FlightLog, is_ulg, read_ulg
+from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
 from ..disk import check_regular
 from ..errors import InputError
-from ..table import check_units, check_values, COLUMNS, Poses, present, Recording
-from ..units import UnitName, Units, units_of
+from ..table import check_units, check_values, Poses, Recording
+from ..units import Units, units_of
 
-_Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
-_SHOWN = 12
+Progress = Callable[[int, int], object]
+"""Function called with the number of samples done, and that of all samples."""
+
+Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
+"""Columns under the keys of `COLUMNS`, and row numbers."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """
+    A log.
+
+    Parameters
+    ----------
+    table : Poses or Recording
+        The rows, with time in s and angular rate in rad/s.
+    units : Units
+        Unit of the readings.
+    read_as : str
+        How the log was read, in one line; empty if nothing was assumed.
+    notes : tuple of str
+        What was left out.
+
+    """
+
+    table: Poses | Recording
+    units: Units
+    read_as: str = ''
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class OpenLog:
+    """
+    An open log that is read block by block; `open_log` makes it.
+
+    Parameters
+    ----------
+    blocks : iterator of Recording
+        The samples, in order. The size of a block does not depend on that of the log. An error is
+        raised when a table without times is read as samples.
+    samples : int
+        Number of samples; of a long text log, an estimate from the size of the file.
+    units : Units
+        Unit of the readings.
+    sensor : str
+        Name of the sensor; empty if the log does not state it.
+    read_as : str
+        How the log is read, in one line; empty if nothing is assumed.
+    poses : Poses or None
+        The poses, if the log is a pose table.
+    noted : function
+        Returns the notes so far.
+
+    """
+
+    blocks: Iterator[Recording]
+    samples: int
+    units: Units
+    sensor: str = ''
+    read_as: str = ''
+    poses: Poses | None = None
+    noted: Callable[[], Sequence[str]] = tuple
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what is left out; complete once all blocks are read."""
+        return tuple(self.noted())
+
+    def watched(self, progress: Progress) -> Iterator[Recording]:
+        """Yield the blocks, and call a function with the number of samples done and of all."""
+        done = 0
+        for block in self.blocks:
+            yield block
+            done += len(block)
+            progress(done, max(done, self.samples))
 
 
 def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
-    """
-    Read a log of any kind; parameters and errors as in `open_log`.
-
-    Returns
-    -------
-    Log
-        The poses of a pose table, or the samples of a recording.
-
-    """
+    """Read the poses or the samples of a log; parameters and errors as in `open_log`."""
     with open_log(path, options) as log:
         table = log.poses if log.poses is not None else together(list(log.blocks))
         return Log(table, log.units, log.read_as, log.notes)
@@ -80,13 +143,8 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
     if not path.is_dir():
         check_regular(path)
     if is_bag(path):
-        with open_samples(path, options.topic, options.sensor,
-                          temperature_topic=options.temperature_topic,
-                          supply_topic=options.supply_topic) as bag:
-            # Drivers exist that publish g, although Imu messages are in m/s².
-            units = units_of(options.units or 'm/s2', options.gravity)
-            yield OpenLog(_checked(path, bag.blocks, units), bag.samples, units, bag.sensor,
-                          noted=lambda: bag.notes)
+        with open_bag(path) as bag:
+            yield _bag(bag, options)
     elif is_ulg(path):
         yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
     elif is_dataflash(path):
@@ -96,60 +154,70 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
             yield _text(path, text, options)
 
 
-def _units(path: Path, name: UnitName, options: LogOptions) -> Units:
-    """Return the unit that a log states; refuse another one."""
-    if options.units and options.units != name:
-        raise InputError(f'{path} is in {name}, but --units is {options.units}',
-                         'remove --units')
-    return units_of(name, options.gravity)
-
-
-def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
-    """Yield the blocks, and check the unit of the first one."""
-    first = next(blocks, None)
-    if first is not None:
-        check_units(first, units, str(path))
-        yield first
-        yield from blocks
+def _bag(bag: Bag, options: LogOptions) -> OpenLog:
+    """Return an open bag as a log."""
+    topic = imu_topic(bag, options.topic)
+    sensor = options.sensor or first_frame_id(bag, topic)
+    context = context_of(bag, topic, sensor, options.temperature_topic, options.supply_topic)
+    notes = [*bag.notes, *context.notes]
+    blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
+                         notes=notes)
+    # Drivers exist that publish g, although Imu messages are in m/s².
+    units = units_of(options.units or 'm/s2', options.gravity)
+    return OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
+                   noted=lambda: notes)
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
     """Return a flight log that is read."""
     recording = log.recording(str(path))
-    units = _units(path, log.units, options)
+    units = units_of('m/s2', options.gravity)
+    if options.units not in ('', units.name):
+        raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
+                         'remove --units')
     return OpenLog(_checked(path, iter((recording,)), units), len(recording), units, log.sensor,
                    log.read_as, noted=lambda: log.notes)
+
+
+def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
+    """Yield the blocks, and check the unit of the first one."""
+    for first in blocks:
+        check_units(first, units, str(path))
+        yield first
+        yield from blocks
 
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     """Return an open text log."""
     columns = chosen(text.layout, options)
-    cells = text.blocks(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
+    text.choose(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
+    cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
-    blocks = _timed(path, _converted(path, chain((first,), cells), quantities), options.rate)
-    read_as = ', '.join(filter(None, (quantities.read_as, _rate_words(options.rate))))
-    sensor = str(text.layout.about.get('sensor', ''))
-
-    def noted() -> Sequence[str]:
-        return (*text.notes, *quantities.all_notes)
-
-    head, name = next(blocks), quantities.units.name
-    check_units(Poses(*head), quantities.units, str(path))
+    blocks = _timed(path, converted(path, chain((first,), cells), quantities), options.rate)
+    head = next(blocks)
+    units, sensor = quantities.units, str(text.layout.about.get('sensor', ''))
+    check_units(Poses(*head), units, str(path))
+    poses = None
+    samples: Iterator[Recording]
     if are_samples(head[0]):
-        recordings = (Recording(*block, name, sensor) for block in chain((head,), blocks))
-        return OpenLog(recordings, _samples(path, text, head), quantities.units, sensor,
-                       read_as, noted=noted)
-    poses = Poses(*_whole([head, *blocks]), name, sensor)
-    if are_untimed_samples(poses.columns):
-        raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples of a '
-                         'recording, expected a column time', 'state the samples per second with '
-                         '--rate HZ, or name the column with --columns time=NAME')
-    return OpenLog(_as_samples(path, poses), len(poses), quantities.units, sensor, read_as, poses,
-                   noted)
+        samples = (Recording(*block, units.name, sensor) for block in chain((head,), blocks))
+        count = _estimated(path, text, head)
+    else:
+        poses = Poses(*joined([head, *blocks]), units.name, sensor)
+        if are_untimed_samples(poses.columns):
+            raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
+                             'of a recording, expected a column time', 'state the samples per '
+                             'second with --rate HZ, or name the column with --columns time=NAME')
+        samples, count = _as_samples(path, poses), len(poses)
+    said = [quantities.read_as] if quantities.read_as else []
+    if options.rate is not None:
+        said.append(f'{options.rate:g} Hz (stated)')
+    return OpenLog(samples, count, units, sensor, ', '.join(said), poses,
+                   noted=lambda: (*text.notes, *quantities.all_notes))
 
 
-def _timed(path: Path, blocks: Iterator[_Block], rate_hz: float | None) -> Iterator[_Block]:
+def _timed(path: Path, blocks: Iterator[Block], rate_hz: float | None) -> Iterator[Block]:
     """Yield blocks, with the times of a stated rate if there is one."""
     for columns, row in blocks:
         if rate_hz is not None and 'time' in columns:
@@ -158,11 +226,7 @@ def _timed(path: Path, blocks: Iterator[_Block], rate_hz: float | None) -> Itera
         yield columns if rate_hz is None else {**columns, 'time': (row - 1) / rate_hz}, row
 
 
-def _rate_words(rate_hz: float | None) -> str:
-    return '' if rate_hz is None else f'{rate_hz:g} Hz (stated)'
-
-
-def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[_Block]:
+def converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
     """Yield blocks in our units."""
     for each in cells:
         columns, row = quantities.columns(each)
@@ -170,7 +234,7 @@ def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> It
         yield columns, row
 
 
-def _whole(blocks: Sequence[_Block]) -> _Block:
+def joined(blocks: Sequence[Block]) -> Block:
     """Return blocks as one."""
     if len(blocks) == 1:
         return blocks[0]
@@ -178,13 +242,13 @@ def _whole(blocks: Sequence[_Block]) -> _Block:
              for key in blocks[0][0]}, np.concatenate([row for _, row in blocks]))
 
 
-def _samples(path: Path, text: TextTable, head: _Block) -> int:
-    """Return the number of samples, from the size of the file and of the first block."""
+def _estimated(path: Path, text: TextTable, head: Block) -> int:
+    """Return the number of rows, from the size of the file and of the first block."""
+    count = len(head[1])
     if not text.more:
-        return len(head[1])
+        return count
     width = 2 if text.layout.encoding.startswith('utf-16') else 1
-    return max(len(head[1]), int(path.stat().st_size / width / max(text.characters, 1)
-                                 * len(head[1])))
+    return max(count, int(path.stat().st_size / width / max(text.characters, 1) * count))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
@@ -195,71 +259,83 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     yield Recording(poses.columns, poses.row, poses.units, poses.sensor)
 
 
-# -------------------------------------------------------------------------- our own tables
+# ----------------------------------------------------------------------------- serial ports
 
-@dataclass(frozen=True)
-class OwnTable:
+class LineReader:
     """
-    An open table with our own names and units; `open_own` makes it.
+    Samples of lines that are read as the lines of a text log are.
+
+    Dialect, columns and units are recognised from the first lines, the head. A line that cannot be
+    read is skipped, because a serial port can lose characters.
 
     Parameters
     ----------
-    blocks : iterator of (dict, array)
-        Columns under the keys of `COLUMNS`, and row numbers.
-    about : mapping
-        Units and sensor, if the table states them.
-    samples : int
-        Number of rows; of a long table, an estimate from the size of the file.
+    name : str
+        Name of the port, for messages.
+    head : sequence of str
+        The first complete lines.
+    seconds : float
+        Time in which they arrived, for lines without times [s].
+    options : LogOptions
+        How to read the lines; by default it is recognised.
 
-    """
-
-    blocks: Iterator[_Block]
-    about: dict[str, Any]
-    samples: int
-
-
-@contextmanager
-def open_own(path: Path, needed: Sequence[str]) -> Iterator[OwnTable]:
-    """
-    Open a table with our own names, in any dialect.
-
-    Parameters
+    Attributes
     ----------
-    path : Path
-        The file.
-    needed : sequence of str
-        Required keys of `COLUMNS`.
+    units : Units
+        Unit of the readings.
+    read_as : str
+        How the lines are read, in one line.
+    first : Recording or None
+        The samples of the head.
 
     Raises
     ------
     InputError
-        If the table is empty, lacks columns, or contains a value that is not a finite number;
-        also while it is read.
-    OSError
-        If the file cannot be read.
+        If the lines have no accelerometer, or contradict the options, or hold no gravity.
 
     """
-    check_regular(path)
-    expected = ','.join(name for key in needed for name in COLUMNS[key].names)
-    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
-                   expected=expected) as text:
-        index = {name: k for k, name in enumerate(text.layout.header)}
-        columns = with_indices(text.layout, {
-            name: Source(index[name], name)
-            for key in _own_keys(text.layout, needed) for name in COLUMNS[key].names})
-        quantities = Quantities(columns, units_of('g'))
-        blocks = _converted(path, text.blocks(columns.numeric, columns.text), quantities)
-        head = next(blocks)
-        yield OwnTable(chain((head,), blocks), dict(text.layout.about),
-                       _samples(path, text, head))
+
+    def __init__(self, name: str, head: Sequence[str], seconds: float, options: LogOptions
+                 ) -> None:
+        lines = _ended(head)
+        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options),
+                           'utf-8', strict=False, expected='t,ax,ay,az')
+        self._name = name
+        columns = chosen(layout, options)
+        self._table = TextTable(layout, iter(()), strict=False)
+        self._table.choose(columns.numeric, columns.text, columns.dates, skip_bad=True)
+        first = self._table.read(lines[layout.start:])
+        if not len(first.row):
+            raise InputError(f'{name} sends no row of numbers, expected one line for each sample',
+                             'check the format of the lines')
+        timed = 'time' in columns.sources
+        self._rate_hz = None if timed else options.rate or len(first.row) / seconds
+        self._quantities = decided(columns, first, replace(options, rate=self._rate_hz))
+        self.units = self._quantities.units
+        rate = '' if timed else (f'no times, {self._rate_hz:.4g} Hz '
+                                 f'({"stated" if options.rate else "measured"})')
+        self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
+        self.first = self._recording(first)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what is not used, and what was skipped so far."""
+        return (*self._table.notes, *self._quantities.all_notes)
+
+    def samples(self, lines: Sequence[str]) -> Recording | None:
+        """Return the samples of the next complete lines; None if there are none."""
+        return self._recording(self._table.read(_ended(lines)))
+
+    def _recording(self, cells: Cells) -> Recording | None:
+        if not len(cells.row):
+            return None
+        columns, row = self._quantities.columns(cells)
+        check_values(columns, self._name)
+        if self._rate_hz is not None:
+            columns['time'] = (row - 1) / self._rate_hz
+        return Recording(columns, row, self.units.name) if len(row) else None
 
 
-def _own_keys(layout: Layout, needed: Sequence[str]) -> list[str]:
-    """Return the keys of the columns of a table; refuse duplicate and incomplete columns."""
-    header = [name for name in layout.header if name in OURS]
-    for name in header[:2 * len(OURS)]:
-        if header.count(name) > 1:
-            raise InputError(f'{layout.path} has {header.count(name)} columns {name}, expected '
-                             'one', 'remove or rename the others')
-    others = [name for name in layout.header[:_SHOWN] if name not in OURS]
-    return present([*header, *others], needed, str(layout.path))
+def _ended(lines: Sequence[str]) -> list[str]:
+    """Return lines with their ends, as in a file."""
+    return [f'{line}\n' for line in lines]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The layout of serialized messages.
+The layout of serialized messages, one by one and as arrays.
 
 In both CDR (ROS 2) and the serialization of ROS 1, a message with a header starts with four 32-bit
 words: the encapsulation (CDR) or seq (ROS 1), two words of the stamp, and the length of frame_id.
@@ -10,12 +10,9 @@ The letters of frame_id follow, and then the doubles: 37 for an Imu, 2 for a Tem
 aligns the doubles to 8 bytes, counted from the end of the encapsulation, and its length of
 frame_id includes a NUL. ROS 1 has no alignment. Padding bytes can have any value.
 
-**Arrays.** Many serialized messages as arrays, in one buffer and without deserializing each
-message.
-
 The messages of a bag can differ in the length of frame_id and in the byte order. Both are
-therefore read from each message. ROS 1 messages are always
-little endian. CDR messages are little endian if the second byte of the encapsulation is 1.
+therefore read from each message. ROS 1 messages are always little endian. CDR messages are little
+endian if the second byte of the encapsulation is 1.
 
 """
 
@@ -62,14 +59,8 @@ class Layout:
     """
     Layout of the Imu messages with one frame_id, in little-endian CDR.
 
-    Parameters
-    ----------
-    name : bytes
-        Length and letters of frame_id, as in a message.
-    begin : int
-        Place of the first double.
-    size : int
-        Length of a message.
+    `name` is length and letters of frame_id as in a message, `begin` the place of the first
+    double, and `size` the length of a message.
 
     """
 
@@ -84,7 +75,7 @@ class Layout:
 
     @property
     def frame_id(self) -> str:
-        """Return the frame_id."""
+        """The frame_id as text."""
         return self.name[4:-1].decode(errors='replace')
 
     def place(self, field: slice) -> int:
@@ -176,7 +167,7 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     ros2 : bool
         Whether the messages are CDR; otherwise they have the serialization of ROS 1.
     before : int
-        Number of earlier messages of the topic.
+        Number of earlier messages of the topic, for error messages.
 
     Raises
     ------
@@ -203,7 +194,6 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
 
 
 def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> None:
-    """Check that all messages are sound; the error names the first one that is not."""
     if not np.all(sound):
         first = int(np.argmin(sound))
         raise InputError(f'{name}: message {before + first + 1} of {size[first]} bytes is '
@@ -272,11 +262,8 @@ def samples_of(messages: Messages) -> dict[str, Floats]:
     """
     Return Imu messages as columns of `accel_calib.table`.
 
-    Returns
-    -------
-    dict
-        ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s]. The rate is NaN for a
-        message without a rate.
+    They are ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s], which is NaN for a
+    message without a rate.
 
     """
     rate = doubles_at(messages, ANGULAR_VELOCITY)

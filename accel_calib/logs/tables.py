@@ -21,12 +21,19 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from . import open_own
-from ..disk import write_atomically
-from ..table import COLUMNS, numbered, Poses, Table
+from .columns import check_once, Source, with_indices
+from .dialect import ABOUT
+from .names import OURS, READING
+from .quantities import Quantities
+from .read import converted, joined
+from .text import open_text
+from ..disk import check_regular, write_atomically
+from ..table import COLUMNS, numbered, Poses, present, Table
+from ..units import units_of
 
 _DIGITS = '.12g'
-_ABOUT = ('units', 'sensor')
+_SHOWN = 12
+"""Number of other columns in an error message."""
 
 
 def read_poses(path: Path) -> Poses:
@@ -41,22 +48,24 @@ def read_poses(path: Path) -> Poses:
         If the file cannot be read.
 
     """
-    with open_own(path, ('reading',)) as table:
-        parts = list(table.blocks)
-        columns = {key: np.concatenate([each[key] for each, _ in parts]) for key in parts[0][0]}
-        return Poses(columns, numbered(columns), **table.about)
+    check_regular(path)
+    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
+                   expected=','.join(READING)) as text:
+        layout = text.layout
+        check_once(layout)
+        others = [name for name in layout.header[:_SHOWN] if name not in OURS]
+        keys = present([*(name for name in layout.header if name in OURS), *others],
+                       ('reading',), str(path))
+        columns = with_indices(layout, {name: Source(layout.header.index(name), name)
+                                        for key in keys for name in COLUMNS[key].names})
+        text.choose(columns.numeric, columns.text)
+        blocks = list(converted(path, text.blocks(), Quantities(columns, units_of('g'))))
+        table, _ = joined(blocks)
+        return Poses(table, numbered(table), **layout.about)
 
 
 def write_table(path: Path, table: Table) -> None:
-    """
-    Write poses or samples, with their columns, units and sensor.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. An earlier file is then unchanged.
-
-    """
+    """Write poses or samples; errors as in `write_blocks`."""
     write_blocks(path, (table,))
 
 
@@ -103,7 +112,7 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
 
 
 def _write_head(file: TextIO, table: Table) -> None:
-    for name in _ABOUT:
+    for name in ABOUT:
         if getattr(table, name):
             file.write(f'# {name}: {json.dumps(getattr(table, name), ensure_ascii=False)}\n')
 

@@ -24,8 +24,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .clock import is_clock
-from .dialect import is_comment, is_number, IsHeader, Layout, layout_of, short, split
+from .dialect import (
+    is_clock,
+    is_comment,
+    is_number,
+    IsHeader,
+    Layout,
+    layout_of,
+    short,
+    split,
+)
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
@@ -57,17 +65,7 @@ class Cells:
 @contextmanager
 def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
               expected: str = 'time,ax,ay,az') -> Iterator[TextTable]:
-    """
-    Open a text table, and find its dialect; parameters and errors as in `layout_of`.
-
-    Raises
-    ------
-    InputError
-        If there is no table of numbers.
-    OSError
-        If the file cannot be read.
-
-    """
+    """Open a text table, and find its dialect; parameters and errors as in `layout_of`."""
     with io.BufferedReader(io.FileIO(path), _PEEKED) as raw:
         encoding = _encoding(raw.peek())
         with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as file:
@@ -122,14 +120,7 @@ class TextTable:
     """
     An open text table, read once, block by block; `open_text` makes it.
 
-    Parameters
-    ----------
-    layout : Layout
-        Where the table begins, and how its cells are parted.
-    lines : iterator of str
-        The lines from the first row on.
-    strict : bool
-        Whether a last row that is cut is an error.
+    `lines` are those from the first row on. If `strict`, a last row that is cut is an error.
 
     """
 
@@ -140,9 +131,19 @@ class TextTable:
         self._bad = ''
         self._bad_count = 0
         self._cut = ''
-        self._dates: tuple[int, ...] = ()
         self.characters = 0
         self.more = False
+
+    def choose(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
+               *, skip_bad: bool = False) -> None:
+        """
+        Set which columns are read: of numbers, of text, and those of text that must be dates.
+
+        A row that cannot be read is skipped if `skip_bad`; otherwise it is an error.
+
+        """
+        self._numeric, self._text, self._dates = tuple(numeric), tuple(text), tuple(dates)
+        self._skip_bad = skip_bad
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -153,19 +154,9 @@ class TextTable:
                          f'{", the first" if self._bad_count > 1 else ""}: {self._bad}')
         return (*notes, self._cut) if self._cut else tuple(notes)
 
-    def blocks(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
-               *, skip_bad: bool = False) -> Iterator[Cells]:
+    def blocks(self) -> Iterator[Cells]:
         """
         Yield the rows, in blocks.
-
-        Parameters
-        ----------
-        numeric, text : sequence of int
-            Columns of numbers, and columns of text.
-        dates : sequence of int
-            Columns of text that have to be dates, or times of the day.
-        skip_bad : bool
-            Whether a row that cannot be read is skipped, rather than an error.
 
         Raises
         ------
@@ -179,7 +170,7 @@ class TextTable:
         while lines:
             following = list(islice(self._lines, ROWS))
             self.more = bool(following)
-            cells = self.read(lines, numeric, text, dates, skip_bad=skip_bad, last=not following)
+            cells = self.read(lines, last=not following)
             self.characters = sum(map(len, lines))
             found += len(cells.row)
             if len(cells.row):
@@ -189,41 +180,34 @@ class TextTable:
             raise InputError(f'{self.layout.path} has a header line but no rows, expected one row '
                              'for each pose or sample', 'add the rows')
 
-    def read(self, lines: Sequence[str], numeric: Sequence[int], text: Sequence[int] = (),
-             dates: Sequence[int] = (), *, skip_bad: bool = False, last: bool = False) -> Cells:
-        """
-        Return the rows of the next lines; parameters and errors as in `blocks`.
-
-        If they are the last lines, the last one can be cut; it is then left out.
-
-        """
-        self._dates = tuple(dates)
+    def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
+        """Return the rows of the next lines; a row that is cut at the last line is left out."""
         kept = [line for line in lines if line[0] != '#' and not line.isspace()]
-        joined = _joined_quotes(kept) if '"' in ''.join(kept) else kept
-        rows = np.arange(self._row + 1, self._row + len(joined) + 1)
-        where = (self._line, lines) if len(joined) == len(kept) else (-1, lines)
+        rows_of = _joined_quotes(kept) if '"' in ''.join(kept) else kept
+        number = np.arange(self._row + 1, self._row + len(rows_of) + 1)
+        where = (self._line, lines) if len(rows_of) == len(kept) else (-1, lines)
         self._line += len(lines)
-        self._row += len(joined)
-        if last and joined and self._row > 1 and not self.strict:
-            joined = self._without_cut(joined, numeric)
-            rows = rows[:len(joined)]
-        values = self._parsed(joined, numeric)
+        self._row += len(rows_of)
+        if last and rows_of and self._row > 1 and not self.strict:
+            rows_of = self._without_cut(rows_of)
+            number = number[:len(rows_of)]
+        values = self._parsed(rows_of)
         if values is None:
-            good = self._good(joined, numeric, rows, where, skip_bad=skip_bad)
-            joined, rows = [joined[k] for k in good], rows[good]
-            values = self._parsed(joined, numeric)
+            good = self._good(rows_of, number, where)
+            rows_of, number = [rows_of[k] for k in good], number[good]
+            values = self._parsed(rows_of)
         if values is None:
             raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
                              'check it for stray characters')
-        texts = [[self.layout.dialect.cells(line)[k] for line in joined] for k in text]
-        return Cells(values, texts, rows)
+        texts = [[self.layout.dialect.cells(line)[k] for line in rows_of] for k in self._text]
+        return Cells(values, texts, number)
 
-    def _parsed(self, lines: list[str], numeric: Sequence[int]) -> Floats | None:
+    def _parsed(self, lines: list[str]) -> Floats | None:
         """Return the numbers of rows, or None if a row has a fault."""
-        if not lines or not numeric:
-            sound = all(self._fault(line, numeric) is None for line in lines)
-            return np.zeros((len(lines), len(numeric))) if sound else None
-        plain = self._plain(lines, numeric)
+        if not lines or not self._numeric:
+            sound = all(self._fault(line) is None for line in lines)
+            return np.zeros((len(lines), len(self._numeric))) if sound else None
+        plain = self._plain(lines)
         cells = self.layout.dialect.cells
         if plain is None or any(not is_clock(cells(line)[k])
                                 for k in self._dates for line in lines):
@@ -236,14 +220,13 @@ class TextTable:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
 
-    def _plain(self, lines: list[str], numeric: Sequence[int]
-               ) -> tuple[list[str], str | None, Sequence[int]] | None:
+    def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
         """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
         dialect, width = self.layout.dialect, self.layout.width
         if dialect.monitor or dialect.labelled:
             lines = [dialect.plain(line) for line in lines]
         if '"' in ''.join(lines):
-            return self._unquoted(lines, numeric)
+            return self._unquoted(lines)
         delimiter = dialect.delimiter
         counts = (map(methodcaller('count', delimiter), lines) if delimiter else
                   (len(line.split()) - 1 for line in lines))
@@ -251,55 +234,55 @@ class TextTable:
             return None
         if delimiter != ',' and self.layout.decimal != '.':
             lines = [line.replace(',', '.') for line in lines]
-        return lines, delimiter or None, numeric
+        return lines, delimiter or None, self._numeric
 
-    def _unquoted(self, lines: list[str], numeric: Sequence[int]
-                  ) -> tuple[list[str], str, Sequence[int]] | None:
+    def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
         """Return lines without quotes, parted by tabs; or None if ragged."""
         delimiter, width = self.layout.dialect.delimiter, self.layout.width
         between = f'"{delimiter}"'
         stripped = [line.strip() for line in lines]
         if all(line.count(between) == width - 1 and line.count('"') == 2 * width
                and '\t' not in line and line[0] == line[-1] == '"' for line in stripped):
-            kept, columns = [line[1:-1].replace(between, '\t') for line in stripped], numeric
+            kept = [line[1:-1].replace(between, '\t') for line in stripped]
+            columns: Sequence[int] = self._numeric
         else:
             rows = [split(line, delimiter) for line in lines]
             if any(len(row) != width for row in rows):
                 return None
-            cells = [[row[k] for k in numeric] for row in rows]
+            cells = [[row[k] for k in self._numeric] for row in rows]
             if any('\t' in cell or '\n' in cell for row in cells for cell in row):
                 return None
-            kept, columns = ['\t'.join(row) for row in cells], list(range(len(numeric)))
+            kept = ['\t'.join(row) for row in cells]
+            columns = list(range(len(self._numeric)))
         if self.layout.decimal != '.':
             kept = [line.replace(',', '.') for line in kept]
         return kept, '\t', columns
 
-    def _without_cut(self, lines: list[str], numeric: Sequence[int]) -> list[str]:
+    def _without_cut(self, lines: list[str]) -> list[str]:
         """Return rows without a last one that is cut; note that it is left out."""
         line = lines[-1]
         cells = len(self.layout.dialect.cells(line))
-        fault = self._fault(line, numeric)
+        fault = self._fault(line)
         if fault is None or (line.endswith('\n') and cells >= self.layout.width):
             return lines
         words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
         self._cut = f'left out the last line, which {words}'
         return lines[:-1]
 
-    def _good(self, lines: Sequence[str], numeric: Sequence[int], rows: NDArray[np.int64],
-              where: tuple[int, Sequence[str]], *, skip_bad: bool) -> list[int]:
+    def _good(self, lines: Sequence[str], rows: NDArray[np.int64],
+              where: tuple[int, Sequence[str]]) -> list[int]:
         """Return the indices of the sound rows; a bad row is an error, or is skipped."""
         good = []
         for k, line in enumerate(lines):
-            fault = self._fault(line, numeric)
+            fault = self._fault(line)
             if fault is None:
                 good.append(k)
             elif is_comment(line.lstrip()):
                 continue
-            elif not skip_bad or not self._bad:
-                words = f'{_place(k, *where)}row {rows[k]}{fault}'
-                if not skip_bad:
-                    raise self._error(words)
-                self._bad = words
+            elif not self._skip_bad or not self._bad:
+                self._bad = f'{_place(k, *where)}row {rows[k]}{fault}'
+                if not self._skip_bad:
+                    raise self._error(self._bad)
             self._bad_count += fault is not None
         return good
 
@@ -309,14 +292,14 @@ class TextTable:
         return InputError(f'{self.layout.path}{mark} {words}', 'correct the row or remove it'
                           + ('' if self.strict else ', or add --skip-bad'))
 
-    def _fault(self, line: str, numeric: Sequence[int]) -> str | None:
+    def _fault(self, line: str) -> str | None:
         """Return what is wrong with a row, or None."""
         layout = self.layout
         cells = layout.dialect.cells(line)
         if len(cells) != layout.width:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
-        for k in numeric:
+        for k in self._numeric:
             if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
                         'number')

@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Temperature and supply voltage from the topics of a bag.
+The samples of a bag, with temperature and supply voltage from its other topics.
+
+Serialized messages are joined to blocks of arrays (`accel_calib.logs.serialized`), so the memory
+needed does not depend on the length of the bag.
 
 A topic of type sensor_msgs/Temperature is used without being asked for, if it is clear which. All
 other topics are used where the user names them: any message with a number that is a temperature or
@@ -18,15 +21,15 @@ the first messages of the Imu, converts this time to that of the stamps.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 import re
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .bag_reader import Bag, damage_as_input_error, Received
+from .bag import Bag, BLOCK, lost, NUMBERS, of_sensor, plausible_samples, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
 from ..table import Floats, Recording
@@ -34,11 +37,20 @@ from ..text import counted, listed
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
-    from rosbags.typesys.store import Typestore
 
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _TEMPERATURE_DOUBLES = 2
 """Number of doubles of a Temperature: temperature and variance."""
+
+_PRESSURE = 'sensor_msgs/msg/FluidPressure'
+_OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_voltage'}
+"""Columns of types whose definition names other quantities, too."""
+
+_ROWS = 65536
+"""Smallest number of samples in a block of a recording."""
+
+_HELD_BACK = 8
+"""Largest number of blocks that wait for a later temperature."""
 
 _AROUND = 10
 """Number of values that are kept before a block."""
@@ -49,36 +61,18 @@ _PEEKED = 100
 _SAME_CLOCK_S = 60.0
 """Largest difference of a stamp from the time of receipt; a larger one is another clock."""
 
-_NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
-            'uint64')
-_TIMES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
-_PRESSURE = 'sensor_msgs/msg/FluidPressure'
-_OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_voltage'}
-"""Columns of types whose definition names other quantities, too."""
-
 _NANO = 1e-9
 
 
 @dataclass(frozen=True)
 class Quantity:
     """
-    A quantity that is known beside the readings.
+    A quantity that is known beside the readings: its column, its name and its option.
 
-    Parameters
-    ----------
-    key : str
-        Column of `accel_calib.table.COLUMNS`.
-    words : str
-        Name in messages.
-    option : str
-        Option of the command line that names its topic.
-    fields : tuple of str
-        Names of fields that hold it, the best first.
-    parts : tuple of str
-        Parts of the name of a topic or of a field that is likely to hold it.
-    units : tuple of (str, float, float, float, float)
-        Name of a unit, its lowest and highest plausible value, and factor and summand that convert
-        it to the unit of the column; the unit of the column comes first.
+    `fields` are names of fields that hold it, the best first, and `parts` are parts of the name of
+    a topic or field that is likely to hold it. `units` are the name of a unit, its lowest and
+    highest plausible value, and factor and summand that convert it to the unit of the column; the
+    unit of the column comes first.
 
     """
 
@@ -130,23 +124,16 @@ class Track:
         return Track(self.time[first:], self.value[first:])
 
 
+_EMPTY = Track(np.zeros(0), np.zeros(0))
+
+
 @dataclass(frozen=True)
 class ContextTopic:
     """
-    A topic with a quantity; `context_topics` makes it.
+    A topic with a quantity in a field such as ``status.temperature``.
 
-    Parameters
-    ----------
-    bag : Bag
-        The open bag.
-    quantity : Quantity
-        The quantity.
-    topic, msgtype, field : str
-        Topic, type and field of the value, such as ``status.temperature``.
-    late : float or None
-        Time that is added to the time of receipt [s]; None if the stamps of the headers are used.
-    factor, summand : float
-        Conversion to the unit of the column.
+    `late` is added to the time of receipt [s]; None: the stamps of the headers are used. `factor`
+    and `summand` convert to the unit of the column.
 
     """
 
@@ -160,88 +147,32 @@ class ContextTopic:
     summand: float = 0.0
 
     @property
+    def what(self) -> str:
+        """Return topic and type for messages."""
+        return f'{self.topic} ({self.msgtype})'
+
+    @property
     def connections(self) -> list[Connection]:
         """Return the connections of the topic."""
         return self.bag.connections(self.topic, self.msgtype)
 
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:
-        """
-        Return the times [s] and values of messages.
-
-        Raises
-        ------
-        InputError
-            If a message is damaged.
-
-        """
-        received = np.array([stamp for _, stamp, _ in block]) * _NANO
+        """Return the times [s] and values of messages; a damaged message is an InputError."""
         if self.msgtype == TEMPERATURE:
             messages = self.bag.joined([raw for _, _, raw in block], self.topic, 0,
                                        _TEMPERATURE_DOUBLES)
-            stamps, found = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
+            stamps, values = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
         else:
-            with damage_as_input_error(self.bag.path):
-                stamps, found = _deserialized(self, block)
-        time = stamps if self.late is None else received + self.late
-        return time, found * self.factor + self.summand
+            fields = self.bag.fields(self.msgtype, self.field, block)
+            stamps = np.array([np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO
+                               for stamp, _ in fields])
+            values = np.array([value for _, value in fields], float)
+        time = stamps if self.late is None else _received(block) + self.late
+        return time, values * self.factor + self.summand
 
 
-def _deserialized(of: ContextTopic, block: Sequence[Received]) -> tuple[Floats, Floats]:
-    """Return stamps [s], NaN without a header, and values of messages of any type."""
-    store = _types(block[0][0], ros2=of.bag.ros2)
-    read = store.deserialize_cdr if of.bag.ros2 else store.deserialize_ros1
-    rows = []
-    for _, _, raw in block:
-        value: Any = read(raw, of.msgtype)
-        stamp = getattr(getattr(value, 'header', None), 'stamp', None)
-        for name in of.field.split('.'):
-            value = getattr(value, name)
-        rows.append((np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO, value))
-    found = np.array(rows, float)
-    return found[:, 0], found[:, 1]
-
-
-def _types(connection: Connection, *, ros2: bool) -> Typestore:
-    """Return the types of a connection: those that the bag defines, otherwise the usual ones."""
-    from rosbags.typesys import get_typestore, Stores
-
-    definition = connection.msgdef
-    if definition.data:
-        return _defined(definition.format.name, definition.data, connection.msgtype)
-    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-
-
-@cache
-def _defined(kind: str, text: str, msgtype: str) -> Typestore:
-    """Return the types in a definition; an IDL definition has a line before each type."""
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
-
-    store = get_typestore(Stores.EMPTY)
-    if kind == 'MSG':
-        store.register(get_types_from_msg(text, msgtype))
-        return store
-    types, parts = {}, text.split(80 * '=' + '\n')
-    for part in [each.partition('\n')[2] for each in parts[1:]] or parts:
-        types.update(get_types_from_idl(part))
-    store.register(types)
-    return store
-
-
-def _numbers_of(bag: Bag, connection: Connection) -> tuple[str, ...]:
-    """Return the paths of the single numbers of a message, without those of headers and times."""
-    from rosbags.interfaces import Nodetype
-
-    with damage_as_input_error(bag.path):
-        types = _types(connection, ros2=bag.ros2).fielddefs
-
-        def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
-            for name, (kind, about) in types[msgtype][1]:
-                if kind == Nodetype.BASE and str(about[0]) in _NUMBERS:
-                    yield '.'.join((*path, name))
-                elif kind == Nodetype.NAME and str(about) not in _TIMES:
-                    yield from below(str(about), (*path, name))
-
-        return tuple(below(connection.msgtype, ())) if connection.msgtype in types else ()
+def _received(block: Sequence[Received]) -> Floats:
+    return np.array([stamp for _, stamp, _ in block]) * _NANO
 
 
 @dataclass(frozen=True)
@@ -253,16 +184,16 @@ class ContextTopics:
 
     def tracks(self) -> dict[str, Track]:
         """Return all values of the bag by column; raise InputError if there are none."""
-        found = {}
+        tracks = {}
         for each in self.used:
-            track = Track(np.zeros(0), np.zeros(0))
+            track = _EMPTY
             for block in each.bag.blocks(each.connections):
                 track = track.plus(*each.values(block))
             if not len(track.time):
                 raise InputError(f'{each.bag.path}: {each.topic} has no finite number, expected '
                                  f'the {each.quantity.words}', 'name another topic')
-            found[each.quantity.key] = track
-        return found
+            tracks[each.quantity.key] = track
+        return tracks
 
 
 def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
@@ -307,22 +238,21 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
         others = sorted({f'{each.topic} ({each.msgtype})' for each in bag.reader.connections})
         raise InputError(f'{bag.path} has the topics {", ".join(others)}, expected {topic}',
                          f'choose one of them with {quantity.option}')
-    numbers = _numbers_of(bag, known[0])
     return ContextTopic(bag, quantity, topic, known[0].msgtype,
-                        _field(bag, quantity, known[0], numbers, field))
+                        _field(bag, quantity, known[0], field))
 
 
-def _field(bag: Bag, quantity: Quantity, connection: Connection, numbers: Sequence[str],
-           asked: str) -> str:
+def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> str:
     """Return the path of the field of a quantity."""
+    numbers = bag.numbers(connection)
     last = {path: path.rpartition('.')[2].lower() for path in numbers}
     choices = [[path for path in numbers if path == asked]] if asked else [
         *([path for path in numbers if last[path] == name] for name in quantity.fields),
         [path for path in numbers if any(part in last[path] for part in quantity.parts)],
-        numbers if len(numbers) == 1 else []]
-    found = next(filter(None, choices), [])
-    if len(found) == 1:
-        return found[0]
+        list(numbers) if len(numbers) == 1 else []]
+    fields = next(filter(None, choices), [])
+    if len(fields) == 1:
+        return fields[0]
     what = f'{connection.topic} ({connection.msgtype})'
     have = f'the numbers {", ".join(numbers)}' if numbers else 'no single number'
     raise InputError(
@@ -346,57 +276,54 @@ def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
 
 def _frame_id(bag: Bag, topic: str) -> str:
     """Return the frame_id of the first Temperature of a topic."""
-    block = next(bag.blocks(bag.connections(topic, TEMPERATURE), 1), [])
-    raws = [raw for _, _, raw in block]
+    raws = [raw for _, _, raw in bag.first(topic, TEMPERATURE)]
     return frame_ids(bag.joined(raws, topic, 0, _TEMPERATURE_DOUBLES))[0] if raws else ''
 
 
-def _with_clock_and_unit(found: ContextTopic, imu: str, *, named: bool
+def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
                          ) -> tuple[ContextTopic | None, list[str]]:
     """Return a topic with its clock and unit, as its first messages show them, and notes."""
-    block = next(found.bag.blocks(found.connections, _PEEKED), [])
-    time, values = found.values(block) if block else (np.zeros(0), np.zeros(0))
+    block = topic.bag.first(topic.topic, topic.msgtype, _PEEKED)
+    time, values = topic.values(block) if block else (np.zeros(0), np.zeros(0))
     known = values[np.isfinite(values)]
-    what = f'{found.topic} ({found.msgtype})'
     if not len(known) and len(block) < _PEEKED:
-        message = f'{counted(len(block), "message")} on {what} with no finite number'
+        message = f'{counted(len(block), "message")} on {topic.what} with no finite number'
         if named:
-            raise InputError(f'{found.bag.path} has {message}, expected the '
-                             f'{found.quantity.words}', 'name another topic')
-        return None, [f'there is no {found.quantity.words}: {message}']
+            raise InputError(f'{topic.bag.path} has {message}, expected the '
+                             f'{topic.quantity.words}', 'name another topic')
+        return None, [f'there is no {topic.quantity.words}: {message}']
     notes = []
-    late = _late(found.bag, imu)
-    received = np.array([stamp for _, stamp, _ in block]) * _NANO
-    if not np.median(np.abs(time - received - late)) <= _SAME_CLOCK_S:
-        found = replace(found, late=late)
-        notes.append(f'the messages on {what} have no stamp of the clock of the Imu: their times '
-                     'are those at which the bag received them')
-    if found.msgtype != TEMPERATURE and len(known):
-        name, factor, summand = _unit(found, float(np.median(known)))
-        found = replace(found, factor=factor, summand=summand)
-        notes += [f'the numbers on {what} are read as {name}'] if name else []
-    return found, notes
+    late = _late(topic.bag, imu)
+    if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
+        topic = replace(topic, late=late)
+        notes.append(f'the messages on {topic.what} have no stamp of the clock of the Imu: their '
+                     'times are those at which the bag received them')
+    if topic.msgtype != TEMPERATURE and len(known):
+        name, factor, summand = _unit(topic, float(np.median(known)))
+        topic = replace(topic, factor=factor, summand=summand)
+        notes += [f'the numbers on {topic.what} are read as {name}'] if name else []
+    return topic, notes
 
 
-def _unit(found: ContextTopic, typical: float) -> tuple[str, float, float]:
+def _unit(topic: ContextTopic, typical: float) -> tuple[str, float, float]:
     """Return the unit of a value, empty if it is that of the column, and its conversion."""
-    quantity = found.quantity
+    quantity = topic.quantity
     for k, (name, least, most, factor, summand) in enumerate(quantity.units):
         if least <= typical < most:
             return name if k else '', factor, summand
     (name, least, most, *_), *_ = quantity.units
-    raise InputError(f'{found.bag.path}: the values on {found.topic} ({found.msgtype}) are about '
-                     f'{typical:.4g}, expected a {quantity.words} from {least:g} to {most:g} '
-                     f'{name}', 'name another topic')
+    raise InputError(f'{topic.bag.path}: the values on {topic.what} are about {typical:.4g}, '
+                     f'expected a {quantity.words} from {least:g} to {most:g} {name}',
+                     'name another topic')
 
 
 def _late(bag: Bag, imu: str) -> float:
     """Return the median stamp of the first messages of an Imu after their receipt [s]."""
-    block = next(bag.blocks(bag.connections(imu), _PEEKED), [])
+    block = bag.first(imu, size=_PEEKED)
     if not block:
         return 0.0
     stamps = stamps_of(bag.joined([raw for _, _, raw in block], imu, 0))
-    return float(np.median(stamps - np.array([stamp for _, stamp, _ in block]) * _NANO))
+    return float(np.median(stamps - _received(block)))
 
 
 def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[str]:
@@ -425,7 +352,82 @@ def _looks_like(connection: Connection, quantity: Quantity) -> bool:
         return _OF_TYPE[connection.msgtype] == quantity.key
     parts = '|'.join(quantity.parts)
     if connection.msgtype.startswith('std_msgs/'):
-        single = connection.msgtype.rpartition('/')[2].lower() in _NUMBERS
+        single = connection.msgtype.rpartition('/')[2].lower() in NUMBERS
         return single and bool(re.search(parts, connection.topic.lower()))
     return bool(re.search(rf'^\s*(?:float|double|u?int)\d*\s+\w*(?:{parts})\w*\s*(?:[#;]|$)',
                           connection.msgdef.data, re.IGNORECASE | re.MULTILINE))
+
+
+# ----------------------------------------------------------------------------------- samples
+
+def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: ContextTopics,
+                notes: list[str]) -> Iterator[Recording]:
+    """
+    Yield the samples of an Imu topic in blocks; the first four parameters are as in `of_sensor`.
+
+    A note about lost messages is added to `notes` at the end. A message that is damaged, contains
+    NaN, or is from another sensor is an InputError.
+
+    """
+    tracks = {each.quantity.key: _EMPTY for each in context.used}
+    waiting: deque[Recording] = deque()
+    parts: list[Recording] = []
+    before = 0
+    for imus, others in _blocks(bag, topic, context.used):
+        for each, block in zip(context.used, others, strict=True):
+            if block:
+                tracks[each.quantity.key] = tracks[each.quantity.key].plus(*each.values(block))
+        if imus:
+            waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
+            before += len(imus)
+        parts += _ready(waiting, tracks)
+        if sum(map(len, parts)) >= _ROWS:
+            yield together(parts)
+            parts = []
+    parts += [_with_context(part, tracks) for part in waiting]
+    if parts:
+        yield together(parts)
+    notes += lost(bag, topic, before)
+
+
+def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
+    """Return the blocks whose context is known, and discard context that is too old for others."""
+    parts = []
+    while waiting and (len(waiting) > _HELD_BACK
+                       or all(track.covers(waiting[0]) for track in tracks.values())):
+        parts.append(_with_context(waiting.popleft(), tracks))
+    if waiting:
+        for key, track in tracks.items():
+            tracks[key] = track.since(waiting[0]['time'][0])
+    return parts
+
+
+def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
+            ) -> Iterator[tuple[list[bytes], list[list[Received]]]]:
+    """Yield blocks of serialized Imu messages and of the other topics, in one pass."""
+    own = [{id(connection) for connection in each.connections} for each in used]
+    imu = {id(connection) for connection in bag.connections(topic)}
+    wanted = [each for each in bag.reader.connections if id(each) in imu.union(*own)]
+    for block in bag.blocks(wanted, BLOCK):
+        yield ([raw for connection, _, raw in block if id(connection) in imu],
+               [[each for each in block if id(each[0]) in ids] for ids in own])
+
+
+def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
+             ) -> Recording:
+    messages = bag.joined(raws, topic, before)
+    which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
+    row = np.arange(before, before + len(raws)) + 1
+    samples = Recording(plausible_samples(bag, messages, before), row, 'm/s2', sensor)
+    return samples if np.all(which) else samples.take(which)
+
+
+def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
+    columns = {key: track.at(samples['time']) for key, track in tracks.items()}
+    return samples.with_columns(**columns) if columns else samples
+
+
+def together(parts: Sequence[Recording]) -> Recording:
+    """Concatenate one or more recordings."""
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
+    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
