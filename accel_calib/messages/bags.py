@@ -58,12 +58,6 @@ from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Report = Callable[[Outside], object]
-"""Function called with a quantity that left the range of the calibration."""
-
-Note = Callable[[str], object]
-"""Function called with a note about the topics of a bag, or about lost messages."""
-
 _PARTIAL = '.partial'
 _STALE_S = 86400.0
 """Age of an unfinished copy that no process writes any more [s]."""
@@ -74,11 +68,12 @@ _NO_HASH = 'RIHS01_' + 64 * '0'
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
                 progress: Progress = lambda done, count: None,
-                report: Report = lambda found: None, *, note: Note = lambda line: None,
+                report: Callable[[Outside], object] = lambda found: None, *,
+                note: Callable[[str], object] = lambda line: None,
                 temperature_topic: str = '', supply_topic: str = '', units: UnitName = 'm/s2',
                 gravity: float = STANDARD_GRAVITY) -> int:
     """
-    Write a corrected copy of a bag.
+    Write a corrected copy of a bag, and return the number of corrected Imu messages.
 
     Parameters
     ----------
@@ -91,25 +86,17 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
     topic : str
         Imu topic, for a bag with several Imu topics.
-    progress : callable
-        Function that is called after each block of messages.
-    report : callable
-        Function that is called at the end for each quantity of the context that left the range of
-        the calibration.
-    note : callable
-        Function that is called with each note about the topics and about lost messages.
+    progress, report, note : callable
+        Functions that are called after each block of messages; at the end for each quantity of the
+        context that left the range of the calibration; and with each note about topics and lost
+        messages.
     temperature_topic, supply_topic : str
-        As in `accel_calib.logs.bag_context.context_of`.
+        As in `accel_calib.logs.context_of`.
     units : {'m/s2', 'g', 'native'}
         Unit of the recorded accelerations. The corrected ones are in m/s², the unit of Imu
         messages.
     gravity : float
         Local gravity [m/s²].
-
-    Returns
-    -------
-    int
-        Number of corrected Imu messages.
 
     Raises
     ------
@@ -276,30 +263,30 @@ def _writer(bag: Bag, target: Path, suffix: str) -> Any:
 
 def _added(bag: Bag, writer: Any) -> dict[int, Any]:
     """Add the connections of a bag to a writer; return the new ones by the id of the old ones."""
+    about = _about_in_2 if bag.ros2 else _about_in_1
     made: dict[tuple[Any, ...], Any] = {}
     outputs = {}
     for each in bag.reader.connections:
         key = (each.topic, each.msgtype, each.msgdef.data, str(each.ext))
         if key not in made:
-            made[key] = (_added_to_2 if bag.ros2 else _added_to_1)(writer, each)
+            made[key] = writer.add_connection(each.topic, each.msgtype, **about(each))
         outputs[id(each)] = made[key]
     return outputs
 
 
-def _added_to_1(writer: Any, each: Any) -> Any:
-    return writer.add_connection(each.topic, each.msgtype, msgdef=each.msgdef.data,
-                                 md5sum=each.digest, callerid=each.ext.callerid,
-                                 latching=each.ext.latching)
+def _about_in_1(connection: Any) -> dict[str, Any]:
+    return {'msgdef': connection.msgdef.data, 'md5sum': connection.digest,
+            'callerid': connection.ext.callerid, 'latching': connection.ext.latching}
 
 
-def _added_to_2(writer: Any, each: Any) -> Any:
+def _about_in_2(connection: Any) -> dict[str, Any]:
     from rosbags.typesys import get_typestore, Stores
 
-    msgdef, digest, known = each.msgdef.data, each.digest, get_typestore(Stores.ROS2_JAZZY)
-    if each.msgtype in known.types:
-        msgdef = msgdef or known.generate_msgdef(each.msgtype, ros_version=2)[0]
-        digest = digest or known.hash_rihs01(each.msgtype)
-    return writer.add_connection(
-        each.topic, each.msgtype, msgdef=msgdef, rihs01=digest or _NO_HASH,
-        serialization_format=each.ext.serialization_format,
-        offered_qos_profiles=each.ext.offered_qos_profiles)
+    msgdef, digest, msgtype = connection.msgdef.data, connection.digest, connection.msgtype
+    known = get_typestore(Stores.ROS2_JAZZY)
+    if msgtype in known.types:
+        msgdef = msgdef or known.generate_msgdef(msgtype, ros_version=2)[0]
+        digest = digest or known.hash_rihs01(msgtype)
+    return {'msgdef': msgdef, 'rihs01': digest or _NO_HASH,
+            'serialization_format': connection.ext.serialization_format,
+            'offered_qos_profiles': connection.ext.offered_qos_profiles}

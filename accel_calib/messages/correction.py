@@ -35,7 +35,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
               stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
     """
-    Return the corrected doubles of Imu messages.
+    Return the corrected doubles of Imu messages, (n, 37).
 
     Parameters
     ----------
@@ -90,11 +90,6 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
     scale : float
         Factor on the corrected force.
 
-    Returns
-    -------
-    (n, 37) array
-        The corrected messages.
-
     """
     known = of_samples(context or {}, len(doubles), calibration.model, stream)
     rotation = calibration.model.rotation
@@ -103,15 +98,13 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
     result[:, ACCELERATION] = scale * force
     if calibration.is_levelled:
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
-        _transform(result, ANGULAR_VELOCITY_COVARIANCE, rotation.T)
         present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
         x, y, z, w = doubles[present, ORIENTATION].T
         result[present, ORIENTATION] = np.array(
             _product(x, y, z, w, *quaternion_of(rotation))).T
-        _transform(result, ORIENTATION_COVARIANCE, rotation.T)
-    else:
-        for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
-            _transform(result, part, np.eye(3))
+    turn = rotation.T if calibration.is_levelled else np.eye(3)
+    for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
+        _transform(result, part, turn)
     stated = _transform(result, ACCELERATION_COVARIANCE,
                         scale * rotation.T @ np.linalg.inv(calibration.gain))
     if np.any(stated):
@@ -123,16 +116,9 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
 
 def output_frame(calibration: Calibration, frame_id: str, chosen: str = '') -> str:
     """
-    Return the frame_id of corrected messages.
+    Return the frame_id of corrected messages, from that of the raw messages.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    frame_id : str
-        frame_id of the raw messages.
-    chosen : str
-        Name of the levelled frame; empty: ``<frame_id>_levelled``.
+    `chosen` is the name of the levelled frame; empty: ``<frame_id>_levelled``.
 
     """
     return (chosen or f'{frame_id}_levelled') if calibration.is_levelled else frame_id
@@ -175,6 +161,14 @@ _ABSENT = struct.pack('<d', -1.0)
 _UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)
 _PER_MESSAGE = {'time', 'rate'}
+
+
+class _Seen(NamedTuple):
+    """A covariance as given, whether its quantity is in the message, and the corrected one."""
+
+    given: bytes
+    present: bool
+    new: bytes
 
 
 class Rewriter:
@@ -223,39 +217,22 @@ class Rewriter:
         self._warm = math.nan
         self._largest = LARGEST_G * gravity
         self._given, self.layout = layout, layout_with(frame_id)
-        self._force, self._force_spread = (layout.place(ACCELERATION),
-                                           layout.place(ACCELERATION_COVARIANCE))
-        self._rate = layout.place(ANGULAR_VELOCITY)
-        self._rate_spread = layout.place(ANGULAR_VELOCITY_COVARIANCE)
+        self._force, self._force_spread, self._rate, self._rate_spread = map(layout.place, (
+            ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE))
         self._renamed = self.layout.name != layout.name
         self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
         self._fill_force = _UNKNOWN if noise is None else _diagonal(noise.force)
         self._fill_rate = _UNKNOWN if noise is None else _diagonal(noise.rate)
-        self._seen_force = self._seen_rate = self._seen_orientation = b''
-        self._new_rate = self._new_force = self._new_orientation = b''
+        self._seen_force = self._new_force = b''
         self._own: list[float] | None = None
-        self._has_orientation = self._has_rate = True
+        self._seen_rate = self._seen_orientation = _Seen(b'', True, b'')
 
     def __call__(self, data: bytes, temperature: float) -> bytes | None:
         """
-        Return the corrected message.
+        Return the corrected message with the layout ``self.layout``.
 
-        Parameters
-        ----------
-        data : bytes
-            A message with the layout.
-        temperature : float
-            Last temperature [°C]; NaN if there is none.
-
-        Returns
-        -------
-        bytes or None
-            The message with the layout ``self.layout``; None if the reading is not finite.
-
-        Raises
-        ------
-        InputError
-            If context is missing, or the corrected force is not plausible.
+        The temperature [°C] is NaN if there is none. A reading that is not finite gives None.
+        Missing context and a corrected force that is not plausible are an InputError.
 
         """
         given = _WHOLE.unpack_from(data, self._given.begin)
@@ -273,43 +250,33 @@ class Rewriter:
         covariance = data[self._force_spread:]
         if covariance != self._seen_force:
             self._see_force(covariance)
-        before = self._turned(data, given) if self._turns else self._unturned(data, given)
+        before = self._before(data, given)
         if self._own is None:
             return before + THREE.pack(a, b, c) + self._new_force
         return before + _FORCE.pack(a, b, c, *at.with_spread(force, self._own))
 
-    def _unturned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
-        """Return the message before the acceleration, in the frame of the sensor."""
-        x, y, z, t, orientation_spread, p, q, r, spread = given[:9]
-        if spread != self._seen_rate:
-            self._see_rate(spread)
-        if orientation_spread != self._seen_orientation:
-            self._see_orientation(orientation_spread)
-        u, v, w = self.bias
-        same = self._new_orientation == orientation_spread
-        if same and not (u or v or w) and self._new_rate == spread:
+    def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
+        """Return the message before the acceleration."""
+        x, y, z, w, orientation_spread, p, q, r, rate_spread = given[:9]
+        if rate_spread != self._seen_rate.given:
+            self._seen_rate = self._seen(rate_spread, self._fill_rate)
+        if orientation_spread != self._seen_orientation.given:
+            self._seen_orientation = self._seen(orientation_spread, _UNKNOWN)
+        _, has_rate, new_rate = self._seen_rate
+        _, has_orientation, new_orientation = self._seen_orientation
+        u, v, t = self.bias
+        if not (self._turns or u or v or t or new_rate != rate_spread
+                or new_orientation != orientation_spread):
             return self._header(data, self._force)
-        if self._has_rate:
-            p, q, r = p - u, q - v, r - w
-        return self._header(data, self._given.begin) + _FRONT.pack(
-            x, y, z, t, self._new_orientation, p, q, r, self._new_rate)
-
-    def _turned(self, data: bytes, given: tuple[Any, ...]) -> bytes:
-        """Return the message before the acceleration, in the levelled frame."""
-        x, y, z, w, orientation_spread, p, q, r, spread = given[:9]
-        if spread != self._seen_rate:
-            self._see_rate(spread)
-        if orientation_spread != self._seen_orientation:
-            self._see_orientation(orientation_spread)
-        if self._has_rate:
-            u, v, t = self.bias
+        if has_rate:
             p, q, r = p - u, q - v, r - t
-        if self._has_orientation:
-            x, y, z, w = _product(x, y, z, w, *self._quaternion)
-        d, e, f, g, h, i, j, k, m = self._turn
+        if self._turns:
+            if has_orientation:
+                x, y, z, w = _product(x, y, z, w, *self._quaternion)
+            d, e, f, g, h, i, j, k, m = self._turn
+            p, q, r = d * p + e * q + f * r, g * p + h * q + i * r, j * p + k * q + m * r
         return self._header(data, self._given.begin) + _FRONT.pack(
-            x, y, z, w, self._new_orientation, d * p + e * q + f * r, g * p + h * q + i * r,
-            j * p + k * q + m * r, self._new_rate)
+            x, y, z, w, new_orientation, p, q, r, new_rate)
 
     def _header(self, data: bytes, end: int) -> bytes:
         """Return the message up to a place, with the new frame_id."""
@@ -340,23 +307,13 @@ class Rewriter:
         self._own = _transformed(self._inverse, covariance, self._fill_force)
         self._new_force = covariance if covariance[:8] == _ABSENT else _UNKNOWN
 
-    def _see_rate(self, covariance: bytes) -> None:
-        """Cache the transformed covariance of the angular velocity."""
-        self._seen_rate = covariance
-        self._has_rate = covariance[:8] != _ABSENT
-        self._new_rate = self._in_new_axes(covariance, self._fill_rate)
-
-    def _see_orientation(self, covariance: bytes) -> None:
-        """Cache the transformed covariance of the orientation."""
-        self._seen_orientation = covariance
-        self._has_orientation = covariance[:8] != _ABSENT
-        self._new_orientation = self._in_new_axes(covariance, _UNKNOWN)
-
-    def _in_new_axes(self, covariance: bytes, fill: bytes) -> bytes:
+    def _seen(self, covariance: bytes, fill: bytes) -> _Seen:
+        """Return a covariance of rate or orientation with that in the new axes."""
+        present = covariance[:8] != _ABSENT
         turned = _transformed(np.reshape(self._turn, (3, 3)), covariance, fill)
         if turned is not None:
-            return NINE.pack(*turned)
-        return covariance if covariance[:8] == _ABSENT else _UNKNOWN
+            return _Seen(covariance, present, NINE.pack(*turned))
+        return _Seen(covariance, present, _UNKNOWN if present else covariance)
 
 
 def _implausible(force: Triple) -> InputError:

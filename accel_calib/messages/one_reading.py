@@ -76,17 +76,7 @@ _SLOW = 3
 
 
 class OneReading:
-    """
-    A calibration prepared for the correction of single readings.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    scale : float
-        Factor on the corrected force.
-
-    """
+    """A calibration prepared for the correction of single readings; `scale` is on the force."""
 
     def __init__(self, calibration: Calibration, scale: float = 1.0) -> None:
         model = calibration.model
@@ -120,33 +110,15 @@ class OneReading:
             else:
                 bends.append(_Bend(axis, size, *MONOMIALS[monomial]))
 
-    def held(self, known: Known) -> Known:
-        """Return the context, limited to the ranges of the calibration."""
-        ranges = self._calibration.ranges
-        if not ranges:
-            return known
-        return {**known, **{key: min(max(known[key], low), high)
-                            for key, (low, high) in ranges.items() if key in known}}
-
     def at(self, known: Known) -> AtReading:
-        """
-        Return the calibration with its context fixed.
-
-        Parameters
-        ----------
-        known : mapping
-            Context that the effects need.
-
-        Raises
-        ------
-        InputError
-            If a quantity is missing.
-
-        """
+        """Return the calibration at a context; a quantity that is missing is an InputError."""
         if not self._varying:
             return self._without_context
         check_context(self._calibration.model, known)
-        known = self.held(known)
+        ranges = self._calibration.ranges
+        if ranges:  # effects are not extrapolated
+            known = {**known, **{key: min(max(known[key], low), high)
+                                 for key, (low, high) in ranges.items() if key in known}}
         affine, bends = list(self._fixed), list(self._bends)
         for effect, shape, terms in self._varying:
             self._add(terms, _factor(effect, known, shape), affine, bends)
@@ -215,11 +187,8 @@ class AtReading:
     """
     A calibration with its context fixed; `OneReading.at` returns it.
 
-    Attributes
-    ----------
-    correct : callable
-        Reading x, y, z -> specific force in the levelled frame, times the scale. It raises
-        InputError if the effects cannot be corrected.
+    `correct` is the function reading x, y, z -> specific force in the levelled frame, times the
+    scale. It raises InputError if the effects cannot be corrected.
 
     """
 
@@ -293,12 +262,7 @@ class AtReading:
         """
         Return the covariance of a corrected force, with the uncertainty of the calibration.
 
-        Parameters
-        ----------
-        force : 3 floats
-            Corrected force, as `correct` returns it.
-        own : 9 floats
-            Covariance of the corrected force from the noise of the reading, row by row.
+        `own` is the covariance of the force from the noise of the reading, row by row.
 
         """
         if self._bends:
