@@ -28,7 +28,7 @@ from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
 from accel_calib.calibrate.mounting import mounting, with_heading, with_heading_of
 from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
-from accel_calib.capture.window import rounding_left
+from accel_calib.capture import rounding_left
 from accel_calib.cli.commands import COMMANDS
 from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
 from accel_calib.cli.frame import Output

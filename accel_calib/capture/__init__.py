@@ -6,15 +6,16 @@ From samples to still poses. The node and recordings use the same rule.
 
 `detector` is the entry point; it joins still chunks to dwells. `chunks` sums the samples over
 short intervals of header time, and `rule` decides whether the sensor is still in each chunk, from
-the arithmetic in `window` and `trend`. `dwell` accumulates a dwell and accepts or rejects it.
-`poses` makes the pose table.
+the arithmetic in `trend`. `dwell` accumulates a dwell and accepts or rejects it. `poses` makes the
+pose table.
 
 """
 
+from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
 from .detector import StillDetector
 from .dwell import Dwell
 from .poses import capture, Captured, poses_from, samples_of, select
-from .settings import CaptureSettings, REPEATED, Repeated, settings_from
+from .rule import rounding_left
 
 __all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated', 'StillDetector',
-           'capture', 'poses_from', 'samples_of', 'select', 'settings_from']
+           'capture', 'poses_from', 'rounding_left', 'samples_of', 'select', 'settings_from']

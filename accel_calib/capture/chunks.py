@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-From samples to chunks: sums over short intervals of header time.
+From samples to chunks: sums over short intervals of header time; and the settings of the capture.
 
 All later steps work on chunks of a fifth of the still window. The cost per sample is thus a few
 additions for any window length, and a recording of any length becomes a short table. Windows and
@@ -13,8 +13,6 @@ The sample period is estimated from the first samples of a segment and then kept
 and a recording are divided at the same places. A segment is a part of the stream without an
 interruption of the stamps. After an interruption the period is estimated again.
 
-**Sums.** Sums over the samples of chunks, one record per chunk. Records of several chunks add up.
-
 **Limits.** A sensor that reaches the end of its range repeats its largest or smallest reading. The
 samples that repeat the extreme of their axis so far are therefore counted. A new extreme is not
 counted, because noise also reaches new extremes.
@@ -24,15 +22,111 @@ counted, because noise also reaches new extremes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+import math
+from typing import Any, get_args, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .settings import CaptureSettings
+from ..errors import InputError
 from ..table import Floats
+from ..units import Units
+
+Repeated = Literal['keep', 'merge', 'refuse']
+REPEATED: tuple[str, ...] = get_args(Repeated)
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """
+    Settings of the stillness detector and of the poses made from its dwells.
+
+    Parameters
+    ----------
+    still_window : float
+        Length of the sliding window [s]. At low sample rates it is extended to ten samples.
+    still_std_max : float
+        Largest standard deviation of the samples of a still sensor, by axis; in g if the unit of
+        the readings is known, otherwise in native units. 0: adapt to the noise of the sensor.
+    still_gyro_max : float
+        Largest magnitude of the mean angular rate [rad/s]. 0: not checked, because gyros have
+        biases and may be in counts.
+    still_norm_tolerance : float
+        Largest difference of |mean| from 1 g [g]; not used for native units. The default is wide
+        because the sensor is not calibrated yet.
+    min_dwell : float
+        Shortest dwell that becomes a pose [s], without its edges. At low sample rates it is
+        extended to sixteen samples.
+    max_dwell : float
+        A longer dwell is split into poses of this length [s] with the same ``orientation``, for
+        example if the temperature changes during a dwell. Infinite: one pose per dwell.
+    min_pose_angle : float
+        Poses of different dwells within this angle count as repeated [rad].
+    repeated : {'keep', 'merge', 'refuse'}
+        Keep a repeated pose, average it with the earlier pose, or leave it out. By default it is
+        kept: the fit weights poses by their noise, and only repeated orientations show effects of
+        temperature and time.
+
+    """
+
+    still_window: float = 0.5
+    still_std_max: float = 0.0
+    still_gyro_max: float = 0.0
+    still_norm_tolerance: float = 0.3
+    min_dwell: float = 1.0
+    max_dwell: float = math.inf
+    min_pose_angle: float = 0.1
+    repeated: Repeated = 'keep'
+
+    def __post_init__(self) -> None:
+        self._check('still_window', 0.0 < self.still_window < math.inf, 'a positive number [s]')
+        self._check('min_dwell', 0.0 < self.min_dwell < math.inf, 'a positive number [s]')
+        self._check('max_dwell', self.max_dwell >= 2.0 * self.min_dwell,
+                    'at least twice min_dwell [s]')
+        self._check('min_pose_angle', 0.0 <= self.min_pose_angle <= math.pi, '0 to π [rad]')
+        self._check('repeated', self.repeated in REPEATED, f'one of {REPEATED}')
+        self._check('still_norm_tolerance', self.still_norm_tolerance > 0.0, 'positive [g]')
+        for name in ('still_std_max', 'still_gyro_max'):
+            self._check(name, 0.0 <= getattr(self, name) < math.inf, 'zero or positive')
+
+    def _check(self, name: str, good: bool, expected: str) -> None:
+        if not good:
+            raise ValueError(f'{name} is {getattr(self, name)!r}, expected {expected}')
+
+
+def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
+    """
+    Return settings with these values, and the defaults for all others.
+
+    Parameters
+    ----------
+    given : mapping of str to object
+        Values by the names of `CaptureSettings`; ``still_std_max`` is in the unit of the readings.
+    units : Units
+        Unit of the readings.
+
+    Raises
+    ------
+    InputError
+        If a name is not known, or a value is out of range.
+
+    """
+    names = [each.name for each in fields(CaptureSettings)]
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise InputError(f'{unknown[0]} is not a setting of the capture',
+                         f'use one of {", ".join(names)}')
+    known = dict(given)
+    if 'still_std_max' in known:
+        known['still_std_max'] = float(units.to_g(np.asarray(known['still_std_max'])))
+    try:
+        return CaptureSettings(**known)
+    except ValueError as err:
+        raise InputError(str(err), 'change that setting') from err
+
 
 Indices = NDArray[np.intp]
 
@@ -80,21 +174,17 @@ def summed(records: Records, size: int) -> Records:
 
 def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Records:
     """
-    Return the sums over the samples from each start to the next.
+    Return the sums over the samples from each start to the next, (m,) records of SUMS.
 
     Parameters
     ----------
     samples : (k, n) array
-        Time and reading (k = 4), with rate (7), with context (WIDTH).
+        Time and reading (k = 4), with rate (7), with context (WIDTH). Sums of a missing rate are
+        NaN.
     starts : (m,) array of int
         Index of the first sample of each chunk.
     epoch, origin : float, (6,) array
         Subtracted from time, and from reading and rate.
-
-    Returns
-    -------
-    (m,) array of SUMS
-        The sums; those of a missing rate are NaN, and ``at_limit`` is 0.
 
     """
     sums = blank(SUMS, len(starts))
@@ -116,12 +206,7 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> R
 
 
 def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
-    """
-    Return the (m,) smallest nonzero steps within chunks, infinite unless they are below `least`.
-
-    Only a new smallest step is of interest.
-
-    """
+    """Return the (m,) smallest nonzero steps within chunks, infinite unless below `least`."""
     step = np.abs(values[:, 1:] - values[:, :-1])
     if np.count_nonzero(step < least) == np.count_nonzero(step == 0.0):
         return np.full(len(starts), np.inf)
@@ -137,38 +222,19 @@ class Extremes:
     """The largest and the smallest reading of each axis so far."""
 
     def __init__(self) -> None:
-        self._highest = np.full(3, -np.inf)
-        self._lowest = np.full(3, np.inf)
+        self._highest = np.full(6, -np.inf)
 
     def repeated(self, reading: Floats, starts: Indices) -> Floats:
-        """
-        Return how many samples of each chunk repeat an extreme, and update the extremes.
-
-        Parameters
-        ----------
-        reading : (3, n) array
-            The next readings.
-        starts : (m,) array of int
-            Index of the first sample of each chunk.
-
-        Returns
-        -------
-        (m, 3) array
-            Number of samples, by axis.
-
-        """
+        """Return the (m, 3) samples of each chunk that repeat an extreme; update the extremes."""
         found = np.zeros((len(starts), 3))
         if not len(starts):
             return found
-        highest, lowest = reading.max(axis=1), reading.min(axis=1)
-        for axis, values in enumerate(reading):
-            # Most blocks reach no extreme; they need no more than the maximum and the minimum.
-            if highest[axis] >= self._highest[axis]:
-                found[:, axis] += _repeats(values, starts, self._highest[axis])
-            if lowest[axis] <= self._lowest[axis]:
-                found[:, axis] += _repeats(-values, starts, -self._lowest[axis])
+        highest = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
+        # Most blocks reach no extreme; they need no more than the maximum and the minimum.
+        for k in np.flatnonzero(highest >= self._highest):
+            values = reading[k] if k < 3 else -reading[k - 3]
+            found[:, k % 3] += _repeats(values, starts, self._highest[k])
         np.maximum(self._highest, highest, out=self._highest)
-        np.minimum(self._lowest, lowest, out=self._lowest)
         return found
 
 
@@ -181,9 +247,9 @@ def _repeats(values: Floats, starts: Indices, before: float) -> Floats:
     return np.asarray(equal - (highest > so_far[:-1]))
 
 
-_LEARN = 16          # intervals from which the period is estimated
-_SAMPLES = 2         # smallest number of samples in a chunk
-_MISSING_SECONDS = 0.5   # a longer interval, also longer than _MISSING_PERIODS, is an interruption
+_LEARN = 16  # intervals from which the period is estimated
+_SAMPLES = 2  # smallest number of samples in a chunk
+_MISSING_SECONDS = 0.5  # a longer interval, also longer than _MISSING_PERIODS, is an interruption
 _MISSING_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # a step back by less, or by less than _BACK_PERIODS, is jitter
 _BACK_PERIODS = 2.0
@@ -194,17 +260,11 @@ _PENDING_MAX = 200_000  # largest number of samples in a chunk; with more, the c
 
 class Interruption(NamedTuple):
     """
-    An interruption of the stamps. It ends a dwell.
+    An interruption of the stamps [s], which ends a dwell.
 
-    Parameters
-    ----------
-    time : float
-        Last stamp before the interruption [s].
-    kind : {'gap', 'jump_back', 'stopped'}
-        Samples are missing; time jumped back (a bag played again, simulated time reset); or the
-        stamps did not change while samples arrived.
-    seconds : float
-        Next stamp minus last stamp [s], negative for a jump back.
+    Samples are missing (gap), time jumped back (a bag played again, simulated time reset), or the
+    stamps did not change while samples arrived (stopped). `seconds` is the next stamp minus the
+    last one.
 
     """
 
@@ -220,21 +280,17 @@ class Chunks:
 
     Parameters
     ----------
-    sums : (m,) array of `sums.SUMS`
+    sums : (m,) array of `SUMS`
         Time relative to `epoch`, readings and rates relative to `origin`.
     begin, end : (m,) array
         First and last stamp [s].
     step : (2, m) array
         Smallest nonzero step between successive readings, and rates; infinite if no step is
         smaller than before.
-    epoch : float
-        Start of the segment [s].
-    origin : (6,) array
-        First reading and rate of the stream.
-    length : float
-        Length of a chunk [s].
-    period : float
-        Sample period [s].
+    epoch, origin : float, (6,) array
+        Start of the segment [s]; first reading and rate of the stream.
+    length, period : float
+        Length of a chunk, and sample period [s].
     fresh : bool
         Whether these are the first chunks of a segment.
 
@@ -253,23 +309,14 @@ class Chunks:
 
 def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
     """Yield the chunks with those of the same segment joined."""
-    parts: list[Chunks] = []
-    for each in found:
-        if each.fresh and parts:
-            yield _one(parts)
-            parts = []
-        parts.append(each)
-    if parts:
-        yield _one(parts)
-
-
-def _one(parts: Sequence[Chunks]) -> Chunks:
-    if len(parts) == 1:
-        return parts[0]
-    return replace(parts[0], sums=chained(*(each.sums for each in parts)),
-                   begin=np.concatenate([each.begin for each in parts]),
-                   end=np.concatenate([each.end for each in parts]),
-                   step=np.concatenate([each.step for each in parts], axis=1))
+    starts = [k for k, each in enumerate(found) if each.fresh or k == 0]
+    for start, stop in pairwise([*starts, len(found)]):
+        parts = found[start:stop]
+        yield parts[0] if len(parts) == 1 else replace(
+            parts[0], sums=chained(*(each.sums for each in parts)),
+            begin=np.concatenate([each.begin for each in parts]),
+            end=np.concatenate([each.end for each in parts]),
+            step=np.concatenate([each.step for each in parts], axis=1))
 
 
 class Chunker:
@@ -285,19 +332,14 @@ class Chunker:
         self._length = 0.0
         self._epoch = 0.0
         self._latest = 0.0
-        self._fresh = True
+        self.fresh = True  # the present segment has no chunk yet
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
 
     def feed(self, samples: Floats, last: bool = False) -> list[Chunks]:
         """
-        Return the chunks that these samples complete.
+        Return the chunks that samples complete: time [s], reading, rate and context as rows.
 
-        Parameters
-        ----------
-        samples : (k, n) array
-            Time [s] and reading (k = 4), with rate (7), with context (9).
-        last : bool
-            Whether no more samples follow. The period is then estimated from few samples, too.
+        `last`: no more samples follow, so the period is estimated from few samples, too.
 
         """
         pending = _joined(self._pending, samples)
@@ -310,26 +352,20 @@ class Chunker:
             chunks, rest = self._split(pending[:, :cut], in_order)
             if len(chunks.begin):
                 done.append(chunks)
-                self._fresh = False
+                self.fresh = False
             if cut == pending.shape[1]:
                 pending = rest
                 break
             pending = pending[:, cut:]
-            self._period = -1.0
-            self._fresh = True
+            self.restart()
         self._pending = self._bounded(pending)
         return done
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the present segment has no chunk yet."""
-        return self._fresh
 
     def restart(self) -> None:
         """Start a new segment with the next sample."""
         self._pending = _NONE
         self._period = -1.0
-        self._fresh = True
+        self.fresh = True
 
     def _learned(self, time: Floats, last: bool) -> bool:
         if self._period >= 0.0:
@@ -381,7 +417,7 @@ class Chunker:
         sums = sums_of(samples, starts, self._epoch, self._origin)
         sums['at_limit'] = self._extremes.repeated(samples[1:4], starts)
         return Chunks(sums, samples[0, starts], samples[0, ends], self._steps(samples, starts),
-                      self._epoch, self._origin, self._length, self._period, self._fresh)
+                      self._epoch, self._origin, self._length, self._period, self.fresh)
 
     def _steps(self, samples: Floats, starts: Indices) -> Floats:
         step = np.full((2, len(starts)), np.inf)
@@ -395,8 +431,7 @@ class Chunker:
         if pending.shape[1] <= _PENDING_MAX or self._period < 0.0:
             return pending
         self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
-        self._period = -1.0
-        self._fresh = True
+        self.restart()
         return _NONE
 
 

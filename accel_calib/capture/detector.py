@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The stillness detector of one sensor: it converts samples to dwells.
-
-**Tracker.** From still chunks to dwells.
+The stillness detector of one sensor: it joins still chunks to dwells.
 
 The window of a chunk is tested at once, and again after `HORIZON` more chunks, when the noise is
 better known. Only then does the chunk join the dwell. A dwell that began before the noise was
@@ -30,10 +28,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import chained, Chunker, CHUNKS_PER_WINDOW, Interruption, Records, together, WIDTH
+from .chunks import (
+    CaptureSettings,
+    chained,
+    Chunker,
+    CHUNKS_PER_WINDOW,
+    Interruption,
+    Records,
+    together,
+    WIDTH,
+)
 from .dwell import DWELL, Dwell, FIGURES, figures, judged, OngoingDwell
 from .rule import HORIZON, Judged, Rule
-from .settings import CaptureSettings
 from ..table import Floats
 from ..units import Units
 
@@ -238,32 +244,23 @@ class StillDetector:
 
     def push(self, samples: Floats) -> list[Dwell]:
         """
-        Add samples.
+        Add samples, and return the dwells that ended and are still.
 
         Parameters
         ----------
         samples : (n, 9) array
-            Columns time, reading (3), rate (3), temperature and supply voltage. Times and
-            readings must be finite; NaN marks other missing values.
-
-        Returns
-        -------
-        list of Dwell
-            The dwells that ended, and are still according to the noise known now.
+            Columns time, reading (3), rate (3), temperature and supply voltage. Times and readings
+            must be finite; NaN marks other missing values.
 
         """
         return self._last(self.add([_columns(samples)]))
 
     def add(self, blocks: Iterable[Floats]) -> int:
         """
-        Add samples as (k, n) arrays, with the columns of `push` as rows.
+        Add samples as (k, n) arrays, and return how many dwells ended.
 
-        Rows without values can be omitted at the end: k is 4, 7 or 9.
-
-        Returns
-        -------
-        int
-            Number of dwells that ended; `dwells` returns the still ones.
+        The rows are the columns of `push`. Rows without values can be omitted at the end: k is 4,
+        7 or 9. `dwells` returns the still ones.
 
         """
         return self._keep(self._feed(blocks, last=False))
@@ -299,10 +296,10 @@ class StillDetector:
     @property
     def threshold(self) -> float:
         """
-        Return the standard deviation below which a window is still now.
+        Return the standard deviation below which a window is still now, the largest over the axes.
 
-        The value is the largest over the axes, in the unit of the readings. It is infinite before
-        the first samples of a sensor in native units.
+        It is in the unit of the readings, and infinite before the first samples of a sensor in
+        native units.
 
         """
         mean = np.nan_to_num(self._mean)[:, np.newaxis]

@@ -10,7 +10,7 @@ the force (see below). A short dwell is not enough to estimate the excess, which
 of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
 excess. Samples that are rounded to steps cause an error of the mean. Averaging does not remove
 this error if the noise of the samples is less than a step. Its variance follows from the mean
-variance of the samples of each axis over all dwells (see `window`). One dwell without any variance
+variance of the samples of each axis over all dwells (see `rule`). One dwell without any variance
 is added to this mean, because a few dwells that alternate between two steps look like more noise.
 
 The white noise of the angular rate is the mean variance of the windows. The standard deviation
@@ -26,16 +26,12 @@ A dwell is rejected in three cases:
 
 The noise may become known after the dwell ended, so each query tests the dwells again.
 
-**Averages.** Figures of finished dwells, one record per dwell.
-
 The noise of a mean is computed along the mean reading if that is known to be the vertical. A
 sensor that settles tilts slightly, which changes its reading across the vertical. Its mean is
 correct for its mean attitude, and the fit uses only the noise along the force.
 
-**Ongoing dwell.** The sums of an ongoing dwell.
-
-The chunks of a dwell are combined into at most `2 · CELLS` cells. The number of chunks per cell is
-a power of two, so a dwell of days needs no more memory than a dwell of a minute.
+The chunks of an ongoing dwell are combined into at most `2 · CELLS` cells. The number of chunks
+per cell is a power of two, so a dwell of days needs no more memory than a dwell of a minute.
 
 """
 
@@ -76,19 +72,9 @@ FIGURES = np.dtype([
 
 def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
     """
-    Return the figures of dwells.
+    Return the figures of finished dwells, one record per dwell.
 
-    Parameters
-    ----------
-    dwells : sequence of OngoingDwell
-        The finished dwells.
-    known_units : bool
-        Whether the unit is known, so that the mean reading is nearly vertical.
-
-    Returns
-    -------
-    (k,) array of FIGURES
-        One record per dwell.
+    With known units the mean reading is nearly vertical.
 
     """
     found = np.empty(len(dwells), FIGURES)
@@ -196,10 +182,8 @@ class Dwell:
 
     Parameters
     ----------
-    start, end : float
-        First and last stamp of the averaged samples [s].
-    time : float
-        Mean of the stamps [s].
+    start, end, time : float
+        First, last and mean stamp of the averaged samples [s].
     mean, std : (3,) array
         Mean and standard deviation of the samples [unit of the readings].
     count : float
@@ -232,16 +216,9 @@ class Dwell:
 
 def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
     """
-    Return each dwell, or None if it is not still according to the noise known now.
+    Return each dwell from `first` on, or None if it is not still according to the noise known now.
 
-    Parameters
-    ----------
-    table : (k,) array of `average.FIGURES`
-        The dwells. Excess and bias of the gyro are estimated from all of them.
-    rule : Rule
-        The rule, with the noise known now.
-    first : int
-        Index of the first dwell to return.
+    Excess and bias of the gyro are estimated from all dwells of the table of `FIGURES`.
 
     """
     slopes = trend_of(table)
@@ -333,21 +310,8 @@ class OngoingDwell:
     """
     The accumulated chunks of a dwell.
 
-    Parameters
-    ----------
-    chunks : Chunks
-        Source of epoch, origin and length.
-    orientation : int
-        Number of the dwell.
-
-    Attributes
-    ----------
-    begin, end : float
-        First and last stamp [s].
-    cells : (n,) array of DWELL
-        Sums over `size` chunks each.
-    beside_slope : bool
-        Whether the reading has a slope directly before or after the dwell.
+    `begin` and `end` are the first and last stamp [s], `cells` the sums over `size` chunks each,
+    and `beside_slope` tells whether the reading has a slope directly before or after the dwell.
 
     """
 

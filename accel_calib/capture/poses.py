@@ -25,10 +25,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import CONTEXT, Interruption, WIDTH
+from .chunks import CaptureSettings, CONTEXT, Interruption, WIDTH
 from .detector import StillDetector
 from .dwell import Dwell
-from .settings import CaptureSettings
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import UnitName, Units
@@ -46,16 +45,14 @@ class Captured:
     ----------
     poses : Poses
         The poses.
-    samples : int
-        Number of samples in the poses.
+    samples, recorded : int
+        Number of samples in the poses, and in the recording.
     threshold : float
         Standard deviation below which a window is still, at the end [unit of the readings].
     seconds : float
         Duration of the recording without interruptions [s].
     interruptions : tuple of Interruption
         Interruptions of the stamps.
-    recorded : int
-        Number of samples in the recording.
 
     """
 
@@ -70,7 +67,7 @@ class Captured:
 def capture(recording: Recording | Iterable[Recording], units: Units,
             settings: CaptureSettings = CaptureSettings()) -> Captured:
     """
-    Find the still poses of a recording.
+    Find the still poses of a recording, in order of time.
 
     Parameters
     ----------
@@ -81,11 +78,6 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         Unit of the readings.
     settings : CaptureSettings
         Settings of the detector and of the poses.
-
-    Returns
-    -------
-    Captured
-        The poses, in order of time.
 
     Raises
     ------
@@ -119,10 +111,7 @@ def samples_of(recording: Recording, start: int, stop: int) -> Floats:
     """
     Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
 
-    Raises
-    ------
-    InputError
-        If a time or a reading is not finite.
+    A time or a reading that is not finite is an InputError.
 
     """
     which = slice(start, stop)
@@ -160,8 +149,7 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     Return the pose table of these dwells.
 
     The table has the columns of context that all dwells have; ``rate_std`` likewise. It has the
-    column ``orientation`` if ``max_dwell`` is finite, and the column
-    ``doubtful`` if a dwell is doubtful.
+    column ``orientation`` if ``max_dwell`` is finite, and ``doubtful`` if a dwell is doubtful.
 
     """
     columns: dict[str, NDArray[Any]] = {

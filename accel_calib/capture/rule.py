@@ -27,10 +27,23 @@ sensor moves. Its minimum so far is therefore used. It is at least the variance 
 causes: a quantised reading that alternates between two steps of height q has a variance of up to
 q²/4, and q is the smallest step so far. For data without noise, the noise is at least a millionth
 of the reading. The samples of an axis at the limit of the sensor scatter less than its noise, so
-nothing is learned from such an axis (see `window.clipped`).
+nothing is learned from such an axis (see `clipped`).
 
 Before the noise is known, the unit of the readings sets a limit: a sensor with a standard
 deviation above `STD_CAP_G` is not still.
+
+**Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
+of q. The error of the mean of many samples depends on μ. Over all μ its variance is
+
+    e² = q² Σ_k exp(-4π² k² σ²/q²) / (2π² k²)                                 (1)
+
+and the mean variance v of the rounded samples is σ² + q²/12 - e² [1]_. So v determines σ and e².
+For σ < 0.2 q the samples take two values at most, and v = q σ/√π. For a larger σ the first term of
+(1) is enough, and e² is found by iteration.
+
+References
+----------
+.. [1] B. Widrow, I. Kollár, Quantization Noise, Cambridge 2008, chapter 4.
 
 """
 
@@ -43,19 +56,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import blank, chained, Chunks, SUMS
-from .settings import CaptureSettings
-from .trend import oscillation, Trend
-from .window import (
-    at_least,
-    at_least_any,
-    clipped,
-    columns_of,
-    rounding,
-    Stretch,
-    stretch,
-    windows,
-)
+from .chunks import blank, CaptureSettings, chained, Chunks, SUMS
+from .trend import columns_of, oscillation, Stretch, stretch, Trend, windows
 from ..table import Floats
 from ..units import Units
 
@@ -110,6 +112,17 @@ WEAK_STRENGTH = 8.0
 """The same for a stretch next to a significant slope, which may continue there: p ≈ 0.05."""
 
 
+RELATIVE = 1e-6
+"""Smallest ratio of standard deviation to reading, for data without noise."""
+
+STD_FLOOR_G = 3.3e-4
+"""Smallest noise of a sensor [g]; smaller shaking is harmless."""
+
+AT_LIMIT = 0.1
+"""Share of samples at a limit above which a variance is not that of the noise; it is then smaller
+by a sixth or more."""
+
+
 class Judged(NamedTuple):
     """
     Chunks with the verdict on the window that ends with each chunk.
@@ -117,11 +130,10 @@ class Judged(NamedTuple):
     Parameters
     ----------
     chunks : Chunks
-        The chunks.
-    level : (6, m) array
-        Variance of reading and rate within the window; NaN if not known.
-    limit : (6, m) array
-        Largest variance for a still window.
+        The m chunks.
+    level, limit : (6, m) array
+        Variance of reading and rate within the window, NaN if not known; and its largest value for
+        a still window.
     still : (m,) array of bool
         The verdict.
     trending : (m,) array of int
@@ -158,12 +170,7 @@ class Rule:
         return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
 
     def noise_of(self, mean: Floats) -> Floats:
-        """
-        Return the variance of the noise of the sensor as known now, for (6, n) means.
-
-        It is infinite before any sample.
-
-        """
+        """Return the variance of the noise of the sensor as known now, for (6, n) means."""
         axes = len(mean)
         noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
         return at_least_any(noise, np.asarray(self.scale))
@@ -187,7 +194,12 @@ class Rule:
             Variance of the rounding error of the mean; averaging does not remove it.
 
         """
-        return rounding(float(self._step[0]), mean, level)
+        step = float(self._step[0])
+        step = step if math.isfinite(step) else 0.0
+        tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
+        resolution = np.maximum(step / math.sqrt(12.0), tiny)
+        left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
+        return resolution, np.maximum(left[:, np.newaxis], 1e-2 * tiny**2)
 
     @property
     def rate_resolution(self) -> float:
@@ -243,10 +255,8 @@ class Rule:
             Reading of 1 g.
         variance : (3, ...) array
             Variance of the samples.
-        strength : float or array
-            Strength above which the slope is significant.
-        drift_g : float
-            Largest drift [g/s].
+        strength, drift_g : float or array
+            Strength above which the slope is significant, and largest drift [g/s].
 
         """
         drift = drift_g * scale
@@ -315,3 +325,72 @@ def _six(values: Floats, fill: float) -> Floats:
     if len(values) == 6:
         return values
     return np.concatenate([values, np.full_like(values, fill)])
+
+
+def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
+    """
+    Return (axes, n) variances raised to the smallest ones that resolution and mean allow.
+
+    `step` are the (2, n) smallest steps so far, and `mean` the (axes, n) mean readings and rates.
+
+    """
+    groups = len(floor) // 3
+    known = np.where(np.isfinite(step[:groups]), step[:groups], 0.0)
+    least = np.fmax(0.25 * known**2, _tiny(mean))
+    return np.asarray(np.fmax(floor, np.repeat(least, 3, axis=0)))
+
+
+def _tiny(mean: Floats) -> Floats:
+    """Return the (groups, n) smallest variances, for data without noise."""
+    square = (mean * mean).reshape((-1, 3, *mean.shape[1:]))
+    return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
+
+
+def clipped(average: Floats, at_limit: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
+    """
+    Return which axes end at a limit while another axis varies by more than rounding.
+
+    Parameters
+    ----------
+    average : (axes, n) array
+        Variances.
+    at_limit : (3, n) array
+        Share of samples that repeat the extreme of their axis so far.
+    step, mean : (2, n) array, (axes, n) array
+        Smallest steps so far; mean readings and rates.
+
+    """
+    reading = mean[:3]
+    tiny = _tiny(reading)
+    least = at_least(np.zeros_like(reading), step, reading)
+    ends = (average[:3] <= tiny) | (at_limit > AT_LIMIT)
+    return np.asarray(ends & np.any(average[:3] > 2.0 * least, axis=0))
+
+
+def at_least_any(noise: Floats, scale: Floats) -> Floats:
+    """Return (axes, n) variances, with those of the reading raised to `STD_FLOOR_G`."""
+    found = noise.copy()
+    found[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
+    return found
+
+
+_TWO_VALUES = 0.1128
+"""Variance of rounded samples [steps²] below which they alternate between two values."""
+
+_SOLVED = 30
+"""Steps of the iteration for larger variances; each divides the error by 2.4 or more."""
+
+
+def rounding_left(variance: Floats) -> Floats:
+    """
+    Return the variance that rounding leaves in the mean of many samples [steps²].
+
+    It is 1/12 without noise, and 0 if the noise of the samples is a step or more. `variance` is
+    that of the rounded samples, as an average over many true values [steps²].
+
+    """
+    small = np.pi * variance**2 + 1.0 / 12.0 - variance
+    left = np.zeros_like(variance)
+    for _ in range(_SOLVED):
+        left = np.exp(-4.0 * np.pi**2 * (variance - 1.0 / 12.0 + left)) / (2.0 * np.pi**2)
+    return np.where(variance < _TWO_VALUES, small, left)

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Slopes, oscillations and the noise of means, over sliding windows of a series.
+Slopes, oscillations and the noise of means, over sliding windows of a series of chunks.
 
-**Sliding sums.** Sums, maxima and slopes over sliding windows. The cost grows with the logarithm
-of the length.
-
-A window of length L is composed of windows of length 1, 2, 4, …. The result of a window therefore
-depends only on the values in the window, not on earlier values or on the division into blocks.
+**Sliding sums.** A window of length L is composed of windows of length 1, 2, 4, …, so the cost
+grows with the logarithm of L. The result of a window depends only on the values in the window, not
+on earlier values or on the division into blocks.
 
 **Slope.** With k = 0 … L-1 and t = k - (L-1)/2, the least squares slope is Σ t x / Σ t², computed
 from Σ x and Σ k x. The power of the residuals r and the product of neighbours are computed without
@@ -19,16 +17,13 @@ slope:
     Σ r r' = Σ x x' - m (2 Σ x - x_0 - x_L-1) + (L-1) m²
              - b (2 T - (t_L-1 + 1)(x_L-1 - x_0)) + b² Σ t t'
 
-**Noise of a mean.** Noise of the mean of correlated samples, and significance of slopes.
-
-Both use the means of K consecutive cells of equal length (chunks, or joined chunks).
-
-**Slope.** Least squares over the cells: slope = Σ t x / Σ t², with t centred. For independent
-samples, a cell mean has the variance w = (variance of the samples) / (samples per cell), and the
-slope has the variance w / Σ t². For correlated samples this is multiplied by a factor estimated
-from the residuals r: their power over w, times (1 + ρ)/(1 - ρ) for a correlation ρ between
-neighbours (the sum of the correlations of an AR(1) process [1]_). Power and ρ are pooled over the
-axes, because K cells of one axis are too few. They are at least those of white noise.
+**Significance.** The values are means of K consecutive cells of equal length (chunks, or joined
+chunks). For independent samples, a cell mean has the variance w = (variance of the samples) /
+(samples per cell), and the slope has the variance w / Σ t². For correlated samples this is
+multiplied by a factor estimated from the residuals r: their power over w, times (1 + ρ)/(1 - ρ)
+for a correlation ρ between neighbours (the sum of the correlations of an AR(1) process [1]_).
+Power and ρ are pooled over the axes, because K cells of one axis are too few. They are at least
+those of white noise.
 
 **Oscillation.** A frequency f explains the share Σ p² / Σ r² of the residuals r of the line. Here
 p is the least squares fit of a cos(2πft) + b sin(2πft), with a and b for each axis. The largest
@@ -53,12 +48,14 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .chunks import CHUNKS_PER_WINDOW, Records
 from ..table import Floats
 
 _FEWEST_PERIODS = 2.0
@@ -75,16 +72,9 @@ class Line(NamedTuple):
     """
     Least squares lines through windows, in units of one step.
 
-    Parameters
-    ----------
-    slope : (..., n) array
-        Slope per step.
-    square, neighbours : (..., n) array
-        Sums of the squared residuals, and of the products of neighbouring residuals.
-    time_square : float or array
-        Σ t².
-    length : int or array
-        Length of the windows.
+    `slope` is (..., n). `square` and `neighbours` are the sums of the squared residuals, and of
+    the products of neighbouring residuals. `time_square` is Σ t², and `length` that of the
+    windows.
 
     """
 
@@ -133,12 +123,8 @@ def lines_through(centred: Floats, sizes: Floats) -> Line:
     """
     Return one line through each series.
 
-    Parameters
-    ----------
-    centred : (axes, k, K) array
-        Values of each series minus their mean, and 0 after the end of a series.
-    sizes : (k,) array
-        Lengths of the series.
+    `centred` are (axes, k, K) values minus their mean, and 0 after the end of a series; `sizes`
+    are the (k,) lengths of the series.
 
     """
     index = np.arange(centred.shape[2])
@@ -193,16 +179,11 @@ def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
     Parameters
     ----------
     values : (axes, n) array
-        Values of the axes.
+        Values of the axes; the (m,) shares, 0 to 1, are over all axes together.
     length : int
         Length of the windows.
     index : (m,) array of int
         First value of each window.
-
-    Returns
-    -------
-    (m,) array
-        The shares, 0 to 1, over all axes together.
 
     """
     line, waves = _waves(length)
@@ -256,16 +237,10 @@ class Trend(NamedTuple):
 
 def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     """
-    Return slopes with their significance.
+    Return the slopes of (3, ...) lines through cells with their significance.
 
-    Parameters
-    ----------
-    line : Line
-        Lines through cells, (3, ...).
-    spacing : float or array
-        Time between cells [s].
-    white : (3, ...) array
-        Variance of a cell mean for independent samples.
+    `spacing` is the time between cells [s], and `white` the (3, ...) variance of a cell mean for
+    independent samples.
 
     """
     size = line.length
@@ -289,21 +264,16 @@ def over_axes(values: Floats) -> Floats:
 
 def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
-    Return the excess of each series: the variance of its mean over that of white noise.
+    Return the (k,) excess of series: the variance of the mean over that of white noise.
 
     Parameters
     ----------
     centred : (3, k, K) array
         Means of consecutive cells minus their common mean, and 0 after the end of a series.
     sizes : (k,) array
-        Lengths of the series.
+        Lengths of the series; the excess is 1 for fewer than 4 cells.
     white : (3, k) array
         Variance of a cell mean for independent samples; axes with 0 are ignored.
-
-    Returns
-    -------
-    (k,) array
-        The excess; 1 for a series of fewer than 4 cells.
 
     """
     axes = white > 0.0
@@ -331,3 +301,99 @@ def _long_run(covariance: Floats, sizes: Floats) -> Floats:
     found = 2.0 * np.sum(np.where(kept, pairs, 0.0), axis=1) - covariance[:, 0]
     lost = (4.0 * kept.sum(axis=1) - 1.0) / sizes
     return np.asarray(np.maximum(found, 0.0) / np.maximum(1.0 - lost, 0.25))
+
+
+_DIGITS = 1e-14
+"""Rounding error of differences of sums, relative to the squared reading."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Sums of n chunks as contiguous arrays, (axes, n) of reading and rate; see `chunks.SUMS`."""
+
+    count: Floats
+    first: Floats
+    second: Floats
+    at_limit: Floats
+
+
+def columns_of(sums: Records, axes: int) -> Columns:
+    """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
+    first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
+    return Columns(sums['count'].copy(), first, second, np.ascontiguousarray(sums['at_limit'].T))
+
+
+def windows(sums: Columns) -> tuple[Floats, Floats]:
+    """Return mean and variance of the windows that end with each chunk, (axes, n)."""
+    count = sliding_sum(sums.count, CHUNKS_PER_WINDOW)
+    first = sliding_sum(sums.first, CHUNKS_PER_WINDOW)
+    level = sliding_sum(sums.second, CHUNKS_PER_WINDOW)
+    mean = first / count
+    level -= first * mean
+    np.maximum(level, 0.0, out=level)
+    level /= count - 1.0
+    return mean, level
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """
+    Figures of the last chunks up to each of m chunks.
+
+    Parameters
+    ----------
+    trend : Trend
+        Slopes of the reading, (3, m).
+    excess : (groups, m) array
+        Excess of the noise of the mean, for reading and rate.
+    variance, highest : (axes, m) array, (3, m) array
+        Mean variance of the windows, and the largest one of the reading.
+    samples : (m,) array
+        Number of samples.
+    at_limit : (3, m) array
+        Share of samples that repeat the extreme of their axis so far.
+    means : (3, m + length - 1) array
+        Means of the chunks of the reading.
+    scatter, white : (m,) array
+        Mean square of the residuals of the means of the reading, sum over the axes; and the same
+        for independent samples.
+
+    """
+
+    trend: Trend
+    excess: Floats
+    variance: Floats
+    highest: Floats
+    samples: Floats
+    at_limit: Floats
+    means: Floats
+    scatter: Floats
+    white: Floats
+
+
+def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+    """Return the figures over `length` chunks that end at each of the last `size` chunks."""
+    start = len(sums.count) - size - length + 1
+    counts, first = sums.count[start:], sums.first[:, start:]
+    inner = length - CHUNKS_PER_WINDOW + 1
+    level = level[:, level.shape[1] - size - inner + 1:]
+    variance = sliding_sum(level, inner) / inner
+    count = sliding_sum(counts, length)
+    cells = first / counts
+    white = variance * (length / count)
+    square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
+    white += _DIGITS * square.repeat(3, axis=0)
+    line = lines(cells, length)
+    scatter = over_axes(line.square) / length
+    line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
+                         neighbours=_grouped(line.neighbours))
+    found = strength_of(line, spacing, _grouped(white))
+    reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
+    at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
+    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
+                   cells[:3], scatter, over_axes(white))
+
+
+def _grouped(values: Floats) -> Floats:
+    """Reshape (axes, n) to (3, groups, n)."""
+    return values.reshape(-1, 3, values.shape[-1]).swapaxes(0, 1)

@@ -14,7 +14,7 @@ left out of the fit.
 **Grid.** Samples on a grid of step q, with less noise than the step, are constant or alternate
 between two multiples of q. Means of constant samples are multiples of q. A mean between two
 multiples has samples with a larger variance. Both show q. Averaging does not remove the error of
-such a mean. Its variance follows from that of the samples (see `accel_calib.capture.window`). The
+such a mean. Its variance follows from that of the samples (see `accel_calib.capture.rule`). The
 capture includes it in the noise of its poses; in other tables it is missing, and is added.
 
 """
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from .state import beginning, State
 from ..calibrate import with_history
-from ..capture.window import rounding_left
+from ..capture import rounding_left
 from ..effects import Model
 from ..estimate import judge, NotConvergedError
 from ..table import Floats, Poses
