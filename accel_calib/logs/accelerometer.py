@@ -159,18 +159,9 @@ _THOUSANDS = 1000.0
 @dataclass(frozen=True)
 class ReadingUnit:
     """
-    Unit of the readings.
+    Unit of the readings, the factor from the unit of the file, and how the readings are read.
 
-    Parameters
-    ----------
-    units : Units
-        The unit.
-    factor : float
-        Factor from the unit of the file.
-    words : tuple of str
-        How the readings are read.
-    assumed : bool
-        Whether that is more than our own names and a stated unit.
+    `assumed`: that is more than our own names and a stated unit.
 
     """
 
@@ -187,12 +178,10 @@ def unit_of_reading(columns: Chosen, raw: Floats, options: LogOptions, *, sample
 
     Parameters
     ----------
-    columns : Chosen
-        The columns.
+    columns, options
+        The columns, and what the user states.
     raw : (n, 3) array
         The first readings, in the unit of the file.
-    options : LogOptions
-        What the user states.
     samples : bool
         Whether rows are samples; otherwise each row is a pose at rest.
 

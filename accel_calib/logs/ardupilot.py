@@ -91,14 +91,8 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of an ArduPilot log.
 
-    Parameters
-    ----------
-    path : Path
-        The ``.bin`` or ``.log`` file.
-    topic : {'', 'IMU', 'ACC'}
-        Name of the message; by default IMU if it is dense enough, otherwise ACC.
-    sensor : str
-        Number of the sensor; by default the lowest. Another text is a name for the sensor.
+    By default the message is IMU if it is dense enough, otherwise ACC, and the sensor the lowest
+    number. Another text for the sensor is a name.
 
     Raises
     ------
@@ -120,7 +114,7 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     columns, dropped = sound(
         chosen, {'time': chosen.time, **taken(chosen.fields, AXES, _READING)},
         'the reading is not a number')
-    sources = (each for each in (chosen, *found) if each.instance == chosen.instance)
+    sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
     columns |= choice.rates(columns['time'], sources, _RATES)
     columns |= _temperature(chosen, columns['time'], found)
     return choice.log('ArduPilot log', columns, 'temperature T',
@@ -155,12 +149,12 @@ def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
 
 def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
     """Return the temperature that IMU of the same sensor reports."""
-    for each in found:
-        name = next((key for key in ('T', 'Temp') if key in each.fields), '')
-        if (each.name, each.instance) == ('IMU', chosen.instance) and name:
-            values = each.fields[name]
+    for message in found:
+        name = next((key for key in ('T', 'Temp') if key in message.fields), '')
+        if (message.name, message.instance) == ('IMU', chosen.instance) and name:
+            values = message.fields[name]
             if finite(values) and np.any(values):
-                return {'temperature': at(time, each, values)}
+                return {'temperature': at(time, message, values)}
     return {}
 
 

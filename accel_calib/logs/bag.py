@@ -71,16 +71,8 @@ class Bag:
     """
     An open bag; `open_bag` makes it.
 
-    Parameters
-    ----------
-    path : Path
-        File or folder.
-    reader : Reader
-        The reader of `rosbags`.
-    ros2 : bool
-        Whether it is a rosbag2; otherwise it is a ROS 1 bag.
-    notes : tuple of str
-        Parts of the bag that are not read or were recovered.
+    `reader` is that of `rosbags`, for a rosbag2 or a ROS 1 bag. Notes state which parts of the bag
+    are not read or were recovered.
 
     """
 
@@ -228,11 +220,12 @@ def _check(reader: Any) -> None:
     files = getattr(getattr(reader, 'storage', None), 'files', [])
     if not isinstance(files, list):  # `rosbags` clears this list when it closes the bag
         raise ValueError(f'files in metadata.yaml is {files!r}')
-    for each in reader.connections:
-        if not (isinstance(each.topic, str) and isinstance(each.msgtype, str)):
-            raise ValueError(f'a topic has the name {each.topic!r} and the type {each.msgtype!r}')
-        if not isinstance(each.msgcount, int) or each.msgcount < 0:
-            raise ValueError(f'topic {each.topic} has {each.msgcount!r} messages')
+    for connection in reader.connections:
+        topic, msgtype, count = connection.topic, connection.msgtype, connection.msgcount
+        if not (isinstance(topic, str) and isinstance(msgtype, str)):
+            raise ValueError(f'a topic has the name {topic!r} and the type {msgtype!r}')
+        if not isinstance(count, int) or count < 0:
+            raise ValueError(f'topic {topic} has {count!r} messages')
 
 
 def _next_block(messages: Iterator[Received], size: int) -> list[Received]:
@@ -253,8 +246,8 @@ def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
     """Check the types of messages, which SQLite returns as stored."""
     for kinds, position, what in (((int,), 1, 'time of receipt'),
                                   ((bytes, memoryview, bytearray), 2, 'content')):
-        if not {type(each[position]) for each in block} <= {*kinds}:
-            bad = next(each for each in block if type(each[position]) not in kinds)
+        if not {type(message[position]) for message in block} <= {*kinds}:
+            bad = next(message for message in block if type(message[position]) not in kinds)
             raise ValueError(f'a message on {bad[0].topic} has the {what} '
                              f'{str(bad[position])[:20]!r}')
 
@@ -279,7 +272,7 @@ def _defined(kind: str, text: str, msgtype: str) -> Typestore:
         store.register(get_types_from_msg(text, msgtype))
         return store
     types, parts = {}, text.split(80 * '=' + '\n')
-    for part in [each.partition('\n')[2] for each in parts[1:]] or parts:
+    for part in [part.partition('\n')[2] for part in parts[1:]] or parts:
         types.update(get_types_from_idl(part))
     store.register(types)
     return store
@@ -291,10 +284,7 @@ def imu_topic(bag: Bag, topic: str = '') -> str:
     """
     Return the Imu topic of an open bag, or check the given topic.
 
-    Raises
-    ------
-    InputError
-        If there is no such topic, or there are several and none is given.
+    If there is no such topic, or there are several and none is given, that is an InputError.
 
     """
     topics = bag.topics(IMU)
@@ -323,20 +313,10 @@ def first_frame_id(bag: Bag, topic: str) -> str:
 def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str, *,
               chosen: bool) -> NDArray[np.bool_]:
     """
-    Return a mask of the messages of a sensor.
+    Return a mask of the messages of a sensor, by its frame_id.
 
-    Parameters
-    ----------
-    bag, topic
-        Source of the messages.
-    messages : Messages
-        A block of messages of the topic.
-    before : int
-        Number of earlier messages.
-    sensor : str
-        frame_id of the sensor.
-    chosen : bool
-        Whether the user chose the sensor; otherwise messages of another sensor are an InputError.
+    `before` is the number of earlier messages of the topic. If the user did not choose the sensor,
+    messages of another one are an InputError.
 
     """
     names = frame_ids(messages)

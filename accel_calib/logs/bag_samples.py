@@ -185,14 +185,14 @@ class ContextTopics:
     def tracks(self) -> dict[str, Track]:
         """Return all values of the bag by column; raise InputError if there are none."""
         tracks = {}
-        for each in self.used:
+        for topic in self.used:
             track = _EMPTY
-            for block in each.bag.blocks(each.connections):
-                track = track.plus(*each.values(block))
+            for block in topic.bag.blocks(topic.connections):
+                track = track.plus(*topic.values(block))
             if not len(track.time):
-                raise InputError(f'{each.bag.path}: {each.topic} has no finite number, expected '
-                                 f'the {each.quantity.words}', 'name another topic')
-            tracks[each.quantity.key] = track
+                raise InputError(f'{topic.bag.path}: {topic.topic} has no finite number, expected '
+                                 f'the {topic.quantity.words}', 'name another topic')
+            tracks[topic.quantity.key] = track
         return tracks
 
 
@@ -233,9 +233,9 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
 def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
     """Return the topic and field that the user names."""
     topic, _, field = asked.partition(':')
-    known = [each for each in bag.reader.connections if each.topic == topic]
+    known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
-        others = sorted({f'{each.topic} ({each.msgtype})' for each in bag.reader.connections})
+        others = sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections})
         raise InputError(f'{bag.path} has the topics {", ".join(others)}, expected {topic}',
                          f'choose one of them with {quantity.option}')
     return ContextTopic(bag, quantity, topic, known[0].msgtype,
@@ -263,7 +263,7 @@ def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> 
 def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
     """Return the topic of type Temperature that belongs to the Imu, or None."""
     known = [topic for topic in bag.topics(TEMPERATURE)
-             if any(each.msgcount for each in bag.connections(topic, TEMPERATURE))]
+             if any(connection.msgcount for connection in bag.connections(topic, TEMPERATURE))]
     space = imu.rpartition('/')[0]
     for wanted in (lambda topic: True,
                    lambda topic: sensor and _frame_id(bag, topic) == sensor,
@@ -328,8 +328,8 @@ def _late(bag: Bag, imu: str) -> float:
 
 def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[str]:
     """Return a note about topics that look like a quantity and are not used."""
-    topics = dict(sorted({each.topic: each.msgtype for each in bag.reader.connections
-                          if each.msgcount and _looks_like(each, quantity)}.items()))
+    topics = dict(sorted({c.topic: c.msgtype for c in bag.reader.connections
+                          if c.msgcount and _looks_like(c, quantity)}.items()))
     if used is not None:
         topics.pop(used.topic, None)
     named = [f'{topic} ({msgtype})' for topic, msgtype in topics.items()]
@@ -369,14 +369,15 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     NaN, or is from another sensor is an InputError.
 
     """
-    tracks = {each.quantity.key: _EMPTY for each in context.used}
+    tracks = {source.quantity.key: _EMPTY for source in context.used}
     waiting: deque[Recording] = deque()
     parts: list[Recording] = []
     before = 0
     for imus, others in _blocks(bag, topic, context.used):
-        for each, block in zip(context.used, others, strict=True):
+        for source, block in zip(context.used, others, strict=True):
             if block:
-                tracks[each.quantity.key] = tracks[each.quantity.key].plus(*each.values(block))
+                key = source.quantity.key
+                tracks[key] = tracks[key].plus(*source.values(block))
         if imus:
             waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
             before += len(imus)
@@ -405,12 +406,12 @@ def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recordin
 def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
             ) -> Iterator[tuple[list[bytes], list[list[Received]]]]:
     """Yield blocks of serialized Imu messages and of the other topics, in one pass."""
-    own = [{id(connection) for connection in each.connections} for each in used]
+    own = [{id(connection) for connection in source.connections} for source in used]
     imu = {id(connection) for connection in bag.connections(topic)}
-    wanted = [each for each in bag.reader.connections if id(each) in imu.union(*own)]
+    wanted = [c for c in bag.reader.connections if id(c) in imu.union(*own)]
     for block in bag.blocks(wanted, BLOCK):
         yield ([raw for connection, _, raw in block if id(connection) in imu],
-               [[each for each in block if id(each[0]) in ids] for ids in own])
+               [[message for message in block if id(message[0]) in ids] for ids in own])
 
 
 def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool

@@ -95,18 +95,9 @@ class Source:
 @dataclass(frozen=True)
 class Chosen:
     """
-    The columns of a text log that are used.
+    The columns of a text log that are used, under our names, and the maker's layout, if any.
 
-    Parameters
-    ----------
-    layout : Layout
-        The table.
-    sources : mapping of str to Source
-        Columns under our names.
-    maker : LogFormat or None
-        The maker's layout.
-    numeric, text : tuple of int
-        Columns of numbers and of text, as read.
+    `numeric` and `text` are the indices of columns of numbers and of text, as read.
 
     """
 
@@ -146,10 +137,10 @@ class Chosen:
 
 def is_log_header(cells: Sequence[str], options: LogOptions) -> bool:
     """Return whether cells are the names of the columns of a log."""
-    theirs = [each.casefold() for each in options.columns.values()
-              if each and not each.isdecimal()]
+    theirs = [name.casefold() for name in options.columns.values()
+              if name and not name.isdecimal()]
     if theirs:
-        return {each.casefold() for each in cells}.issuperset(theirs)
+        return {cell.casefold() for cell in cells}.issuperset(theirs)
     return (set(READING) <= set(cells) or bool(_triples('reading', cells) or _bare(cells))
             or formats.recognise(cells[:MOST]) is not None)
 
@@ -158,10 +149,8 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     """
     Return the columns of a log that are used.
 
-    Raises
-    ------
-    InputError
-        If there is no accelerometer, or there are several, or a given column is not there.
+    If there is no accelerometer, or there are several, or a given column is not there, that is an
+    InputError.
 
     """
     header, maker = layout.header, None
@@ -386,7 +375,7 @@ def _rates(header: Sequence[str], found: Mapping[str, Source]) -> list[int]:
     if len(groups) > 1:
         own = set(meaning(found[READING[0]].name).group) if READING[0] in found else set()
         shared = [len(own.intersection(group)) for group, _ in groups]
-        groups = [each for each, count in zip(groups, shared)
+        groups = [group for group, count in zip(groups, shared)
                   if count == max(shared) and shared.count(count) == 1]
     return groups[0][1] if groups else []
 

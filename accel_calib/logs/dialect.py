@@ -199,7 +199,7 @@ def _seconds(text: str) -> float | None:
         return None
     fraction = float(f'0.{digits}') if digits else 0.0
     whole = day + int(hour) * 3600.0 + int(minute) * 60.0 + int(second or 0)
-    return whole - _offset(zone) + fraction
+    return whole - _offset(zone) + fraction  # all in s
 
 
 @lru_cache(maxsize=64)
@@ -216,7 +216,6 @@ def _day(date: str) -> float | None:
 
 @lru_cache(maxsize=64)
 def _offset(zone: str | None) -> float:
-    """Return the offset of a time zone [s]."""
     if zone in (None, 'Z', 'UTC'):
         return 0.0
     size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
@@ -243,18 +242,16 @@ def shown(names: Sequence[str]) -> str:
 def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str, *,
               strict: bool, expected: str) -> Layout:
     """
-    Return where a table begins, and how its cells are parted.
+    Return where a table begins, and how its cells are parted; an InputError if there is no table.
 
     Parameters
     ----------
-    path : Path
-        The file.
+    path, encoding
+        The file, and its encoding.
     head : sequence of str
         The first lines.
     is_header : function
         Returns whether cells are the names of the columns of a log.
-    encoding : str
-        Encoding of the text.
     strict : bool
         Whether the first line must be the header; otherwise other lines may come before it.
     expected : str
@@ -433,9 +430,8 @@ def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
     """Return a note about the lines that are no part of the table."""
     if not lines:
         return ()
-    words = short(lines[0])
-    return (f'skipped {counted(len(lines), "line")} before the table'
-            + (f': {words!r}' if len(lines) == 1 else f', the first is {words!r}'),)
+    mark = ':' if len(lines) == 1 else ', the first is'
+    return (f'skipped {counted(len(lines), "line")} before the table{mark} {short(lines[0])!r}',)
 
 
 def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .formats import PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import COLUMNS, columns_from, Floats, numbered, Recording
 from ..text import counted
@@ -75,17 +76,9 @@ class FlightLog:
     """
     The samples of one sensor of a flight log, in m/s².
 
-    Parameters
-    ----------
-    columns : mapping of str to array
-        n values by the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has
-        them ``gx,gy,gz`` [rad/s] and ``temperature`` [°C].
-    sensor : str
-        Message and number of the sensor, such as ``sensor_accel 0``.
-    read_as : str
-        What was read, one line.
-    notes : tuple of str
-        What was not used, and what to know of the readings.
+    Columns have the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has them
+    ``gx,gy,gz`` [rad/s] and ``temperature`` [°C]. The sensor is message and number, such as
+    ``sensor_accel 0``. Notes state what was not used, and what to know of the readings.
 
     """
 
@@ -103,18 +96,10 @@ class FlightLog:
 @dataclass(frozen=True)
 class Choice:
     """
-    The message to read, among those of a log that have samples.
+    The message to read, and all messages of the log that matter.
 
-    Parameters
-    ----------
-    message : Message
-        The message.
-    found : sequence of Message
-        All messages of the log that matter.
-    preferred : sequence of str
-        Names of the messages that have accelerations, the best first.
-    name : str
-        Name of the sensor, if the user states one.
+    `preferred` are the names of those with accelerations, the best first; `name` is that of the
+    sensor, if the user states one.
 
     """
 
@@ -135,36 +120,36 @@ class Choice:
     def others(self) -> list[str]:
         """Return notes on the other sensors of the same message, and on other messages."""
         chosen, notes = self.message, []
-        usable = [each for each in self.found if len(each.time)]
-        rest = [each for each in usable
-                if each.name == chosen.name and each.instance != chosen.instance]
-        other = [each for each in usable
-                 if each.name in self.preferred and each.name != chosen.name]
+        usable = [message for message in self.found if len(message.time)]
+        rest = [message for message in usable
+                if message.name == chosen.name and message.instance != chosen.instance]
+        other = [message for message in usable
+                 if message.name in self.preferred and message.name != chosen.name]
         if rest:
             notes.append(f'{chosen} is read; other sensors: {", ".join(map(str, rest))} '
                          f'(--sensor {rest[0].instance})')
         if other:
-            names = ', '.join(dict.fromkeys(f'{each.name} ({each.rate_hz:.3g} Hz)'
-                                            for each in other
-                                            if each.instance == other[0].instance))
+            names = ', '.join(dict.fromkeys(f'{message.name} ({message.rate_hz:.3g} Hz)'
+                                            for message in other
+                                            if message.instance == other[0].instance))
             notes.append(f'not used: {names} (--topic {other[0].name})')
         return notes
 
     def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
               ) -> dict[str, Floats]:
         """Return the angular rates of the first source with these fields that is as dense."""
-        for each in sources:
-            if each.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(each.fields):
-                rates = taken(each.fields, RATES, names)
+        for message in sources:
+            if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields):
+                rates = taken(message.fields, RATES, names)
                 if finite(*rates.values()):
-                    return {key: at(time, each, values) for key, values in rates.items()}
+                    return {key: at(time, message, values) for key, values in rates.items()}
         return {}
 
 
 def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
            source: str) -> Choice:
     """
-    Choose the message to read.
+    Choose the message to read; an InputError if there is no such message.
 
     Parameters
     ----------
@@ -178,28 +163,23 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
     source : str
         Name of the log in error messages.
 
-    Raises
-    ------
-    InputError
-        If there is no such message.
-
     """
-    usable = [each for each in found if each.name in preferred and len(each.time)]
+    usable = [message for message in found if message.name in preferred and len(message.time)]
     if not usable:
         raise InputError(f'{source} has none of the messages {", ".join(preferred)}, expected one '
                          'with accelerations', 'log the accelerometer, see docs/log_formats.md')
     chooses = sensor.isdecimal() or sensor in map(str, found)
     number = sensor if chooses else ''
-    wanted = [each for each in usable if topic in ('', each.name)
-              and number in ('', str(each.instance), str(each))]
+    wanted = [message for message in usable if topic in ('', message.name)
+              and number in ('', str(message.instance), str(message))]
     if not wanted:
         raise InputError(f'{source} has {", ".join(map(str, usable))}, expected '
                          f'{" ".join(filter(None, (topic or "a message", number)))}',
                          'name one of these, for example --topic '
                          f'{usable[0].name} --sensor {usable[0].instance}')
-    order = sorted(wanted, key=lambda each: (preferred.index(each.name), each.instance))
-    dense = [each for each in order if each.rate_hz >= DENSE_HZ]
-    best = dense[0] if dense else max(order, key=lambda each: each.rate_hz)
+    order = sorted(wanted, key=lambda message: (preferred.index(message.name), message.instance))
+    dense = [message for message in order if message.rate_hz >= DENSE_HZ]
+    best = dense[0] if dense else max(order, key=lambda message: message.rate_hz)
     return Choice(best, found, preferred, '' if chooses else sensor)
 
 
@@ -217,13 +197,13 @@ def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
 
 def finite(*columns: NDArray[Any]) -> bool:
     """Return whether there are values and all are finite numbers."""
-    return all(len(each) > 0 and bool(np.all(np.isfinite(each))) for each in columns)
+    return all(len(values) > 0 and bool(np.all(np.isfinite(values))) for values in columns)
 
 
 def sound(message: Message, columns: Mapping[str, Floats], why: str,
           valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
     """Return the valid rows whose values are all finite, and a note on the others."""
-    valid = valid & np.logical_and.reduce([np.isfinite(each) for each in columns.values()])
+    valid = valid & np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
     dropped = int(np.sum(~valid))
     notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
     return {key: values[valid] for key, values in columns.items()}, notes
@@ -280,21 +260,9 @@ _INVALID = 0x7fffffff
 
 _RELATIVE = 'accelerometer_timestamp_relative'
 _XYZ = ('x', 'y', 'z')
-
-
-def _numbered(name: str) -> tuple[str, ...]:
-    return tuple(f'{name}[{k}]' for k in range(3))
-
-
-_FIELDS: dict[str, tuple[str, ...]] = {
-    'sensor_accel': _XYZ,
-    'sensor_combined': (*_numbered('accelerometer_m_s2'), *_numbered('gyro_rad'), _RELATIVE),
-    'vehicle_imu': (*_numbered('delta_velocity'), *_numbered('delta_angle'),
-                    'delta_velocity_dt', 'delta_angle_dt'),
-    'vehicle_acceleration': _numbered('xyz')}
-"""Fields of the messages with accelerations, in order of preference: reading, rate, others."""
-
-PREFERRED = tuple(_FIELDS)
+PREFERRED = tuple(PX4_FIELDS)
+_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
+_NEEDED = {name: {*fields, *_MORE.get(name, ())} for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
 
 
@@ -328,14 +296,8 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of a PX4 log.
 
-    Parameters
-    ----------
-    path : Path
-        The ``.ulg`` file.
-    topic : str
-        Name of the message; by default the first of `PREFERRED` that is dense enough.
-    sensor : str
-        Number of the sensor; by default the lowest. Another text is a name for the sensor.
+    By default the message is the first of `PREFERRED` that is dense enough, and the sensor the
+    lowest number. Another text for the sensor is a name.
 
     Raises
     ------
@@ -346,8 +308,8 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
 
     """
     found, notes = _messages(path)
-    known = [each for each in found
-             if each.name in _FIELDS and set(_FIELDS[each.name]) <= set(each.fields)]
+    known = [message for message in found
+             if message.name in _NEEDED and _NEEDED[message.name] <= set(message.fields)]
     choice = choose(known, PREFERRED, topic, sensor, str(path))
     chosen = choice.message
     columns, invalid = _samples(chosen)
@@ -356,8 +318,8 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
                          'name another message with --topic')
     if chosen.name == PREFERRED[0]:
-        gyros = (each for each in found
-                 if (each.name, each.instance) == ('sensor_gyro', chosen.instance))
+        gyros = (message for message in found
+                 if (message.name, message.instance) == ('sensor_gyro', chosen.instance))
         columns |= choice.rates(time, gyros, _XYZ)
         corrected = []
     else:
@@ -385,7 +347,7 @@ def _messages(path: Path) -> tuple[list[Message], list[str]]:
     if log.file_corruption:
         notes.append('the log is damaged in part; its sound part is read')
     if log.dropouts:
-        lost = sum(each.duration for each in log.dropouts)
+        lost = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f'PX4 reports {counted(len(log.dropouts), "dropout")} of the log, {lost} ms')
     return found, notes
 
@@ -401,12 +363,12 @@ def _time(fields: Mapping[str, NDArray[Any]]) -> Floats:
 def _samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
     """Return time, readings and rates of the valid rows, and a note on the others."""
     fields, time = message.fields, message.time
-    columns = taken(fields, (*AXES, *RATES), _FIELDS[message.name])
+    columns = taken(fields, (*AXES, *RATES), PX4_FIELDS[message.name])
     valid = np.ones(len(time), dtype=bool)
     if _RELATIVE in fields:
         relative = fields[_RELATIVE].astype(float)
         time, valid = time + relative * MICRO, relative != _INVALID
-    for name, keys in (('delta_velocity_dt', AXES), ('delta_angle_dt', RATES)):
+    for name, keys in PX4_SPANS.items():
         if name in fields:
             seconds = fields[name] * MICRO
             valid &= seconds > 0.0
@@ -420,20 +382,20 @@ def _device(chosen: Message, found: Sequence[Message] = ()) -> int:
     for name in ('device_id', 'accel_device_id'):
         if name in chosen.fields:
             return int(chosen.fields[name][-1])
-    for each in found:
-        if each.name == 'sensor_selection' and 'accel_device_id' in each.fields:
-            return int(each.fields['accel_device_id'][-1])
+    for message in found:
+        if message.name == 'sensor_selection' and 'accel_device_id' in message.fields:
+            return int(message.fields['accel_device_id'][-1])
     return 0
 
 
 def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
     """Return the temperature that sensor_accel of the same device reports."""
-    sources = [each for each in found
-               if each.name == PREFERRED[0] and 'temperature' in each.fields]
+    sources = [message for message in found
+               if message.name == PREFERRED[0] and 'temperature' in message.fields]
     device = _device(chosen, found)
-    same = [each for each in sources if device and _device(each) == device]
+    same = [message for message in sources if device and _device(message) == device]
     if chosen.name == PREFERRED[0]:
-        same = [each for each in sources if each.instance == chosen.instance]
+        same = [message for message in sources if message.instance == chosen.instance]
     elif not same and len(sources) == 1:
         same = sources
     if not same or not finite(same[0].fields['temperature']):

@@ -159,23 +159,39 @@ _MATLAB_FORMATS = tuple(
 _FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g on z; --flat '
         'turns them to x forward, y left, z up.')
 
+
+def _numbered(name: str) -> tuple[str, ...]:
+    return tuple(f'{name}[{k}]' for k in range(3))
+
+
+PX4_FIELDS: dict[str, tuple[str, ...]] = {
+    'sensor_accel': _LOWER,
+    'sensor_combined': (*_numbered('accelerometer_m_s2'), *_numbered('gyro_rad')),
+    'vehicle_imu': (*_numbered('delta_velocity'), *_numbered('delta_angle')),
+    'vehicle_acceleration': _numbered('xyz')}
+"""Fields of the messages with accelerations, in order of preference: of the reading and rate."""
+
+PX4_SPANS = {'delta_velocity_dt': READING, 'delta_angle_dt': RATE}
+"""Interval [µs] in which a change of velocity or angle was measured."""
+
+
+def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
+         **others: str) -> LogFormat:
+    """Return the layout of a message; `changes` are divided by their intervals."""
+    divisors = {key: name for name, keys in PX4_SPANS.items() for key in keys if changes}
+    return LogFormat(
+        'px4', {'time': 'timestamp', **dict(zip((*READING, *RATE), PX4_FIELDS[message])),
+                **others},
+        {'time': MICRO, **dict.fromkeys(divisors, 1.0 / MICRO)}, marks=marks, divisors=divisors,
+        note=note)
+
+
 _PX4_FORMATS = (
-    LogFormat('px4', {'time': 'timestamp', **_axes('{}'), 'temperature': 'temperature'},
-              {'time': MICRO}, marks=('device_id', 'error_count'), note=_FRD),
-    LogFormat('px4',
-              {'time': 'timestamp', **_axes('accelerometer_m_s2[{}]', names=_BY_NUMBER),
-               **_axes('gyro_rad[{}]', RATE, _BY_NUMBER)},
-              {'time': MICRO},
-              note='Readings are corrected by the stored CAL_ACC parameters; those of '
-                   f'sensor_accel are not. {_FRD}'),
-    LogFormat('px4',
-              {'time': 'timestamp', **_axes('delta_velocity[{}]', names=_BY_NUMBER),
-               **_axes('delta_angle[{}]', RATE, _BY_NUMBER)},
-              {'time': MICRO, **dict.fromkeys((*READING, *RATE), 1.0 / MICRO)},
-              divisors={**dict.fromkeys(READING, 'delta_velocity_dt'),
-                        **dict.fromkeys(RATE, 'delta_angle_dt')}, note=_FRD),
-    LogFormat('px4', {'time': 'timestamp', **_axes('xyz[{}]', names=_BY_NUMBER)},
-              {'time': MICRO}, marks=('timestamp_sample',), note=_FRD))
+    _px4('sensor_accel', ('device_id', 'error_count'), temperature='temperature'),
+    _px4('sensor_combined', note='Readings are corrected by the stored CAL_ACC parameters; those '
+                                 f'of sensor_accel are not. {_FRD}'),
+    _px4('vehicle_imu', changes=True),
+    _px4('vehicle_acceleration', ('timestamp_sample',)))
 
 # -------------------------------------------------------------------------- ArduPilot
 # https://ardupilot.org/copter/docs/logmessages.html

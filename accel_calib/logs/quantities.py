@@ -237,12 +237,14 @@ class Quantities:
                                                 for name in column.names])
         return columns, cells.row
 
+    def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:
+        """Set the factor of columns to our unit, and our value at 0."""
+        self.scales.update(dict.fromkeys(keys, (factor, zero)))
+
     def _scaled(self, cells: Cells, ours: str) -> Floats:
         values = self.chosen.numbers(cells, ours)
-        if ours not in self.scales:
-            return values
-        factor, zero = self.scales[ours]
-        return values * factor + zero
+        factor, zero = self.scales.get(ours, (1.0, 0.0))
+        return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
 
     def _seconds(self, cells: Cells) -> Floats:
         if self.chosen.dates:
@@ -317,8 +319,7 @@ def _decide_time(made: Quantities, first: Cells) -> None:
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit, words = _unit_of_time(made, first, stamps)
     made.counter = counter_of(unit)
-    if unit != 's':
-        made.scales['time'] = (TIME_UNITS[unit], 0.0)
+    made.scale(['time'], TIME_UNITS[unit])
     if words:
         made.said.append(words)
 
@@ -362,8 +363,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None
         samples = options.rate is not None or are_untimed_samples(columns)
     found = unit_of_reading(made.chosen, raw, options, samples=samples)
     made.units = found.units
-    if found.factor != 1.0:
-        made.scales.update(dict.fromkeys(READING, (found.factor, 0.0)))
+    made.scale(READING, found.factor)
     if found.assumed or made.said:
         made.said += found.words
 
@@ -383,7 +383,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
         return
     words = compact(columns.names(RATE))
     if columns.maker is not None and 'gx' in columns.maker.columns:
-        made.scales.update(dict.fromkeys(RATE, (columns.maker.scales.get('gx', 1.0), 0.0)))
+        made.scale(RATE, columns.maker.scales.get('gx', 1.0))
         return
     stated = unit_of('rate', columns.sources['gx'].unit)
     largest = float(np.quantile(np.abs(columns.three(first, RATE)), 0.999))
@@ -395,8 +395,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
               'their unit in the names, such as gyroX_dps')
         return
     unit, factor = stated or (('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', _DEGREE))
-    if factor != 1.0:
-        made.scales.update(dict.fromkeys(RATE, (factor, 0.0)))
+    made.scale(RATE, factor)
     made.said.append(f'{words} in {unit}' + ('' if unit == 'rad/s' else ' -> rad/s')
                      + ('' if stated else ' (assumed)'))
 
@@ -410,7 +409,7 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
     if stated is not None:
         unit, factor = stated
         if unit != '°C':
-            made.scales['temperature'] = (factor, ZEROS[unit])
+            made.scale(['temperature'], factor, ZEROS[unit])
             made.said.append(f'{source.name} in {unit} -> °C')
         return
     if columns.maker is not None or (source.name == 'temperature' and columns.layout.header):
@@ -430,5 +429,5 @@ def _decide_supply(made: Quantities) -> None:
     source = made.chosen.sources['supply_voltage']
     unit, factor = unit_of('supply_voltage', source.unit) or ('V', 1.0)
     if factor != 1.0:
-        made.scales['supply_voltage'] = (factor, 0.0)
+        made.scale(['supply_voltage'], factor)
         made.said.append(f'{source.name} in {unit} -> V')

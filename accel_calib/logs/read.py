@@ -38,18 +38,10 @@ Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
 @dataclass(frozen=True)
 class Log:
     """
-    A log.
+    A log: its rows, with time in s and angular rate in rad/s, and the unit of the readings.
 
-    Parameters
-    ----------
-    table : Poses or Recording
-        The rows, with time in s and angular rate in rad/s.
-    units : Units
-        Unit of the readings.
-    read_as : str
-        How the log was read, in one line; empty if nothing was assumed.
-    notes : tuple of str
-        What was left out.
+    `read_as` is how it was read, in one line, empty if nothing was assumed; notes state what was
+    left out.
 
     """
 
@@ -73,10 +65,8 @@ class OpenLog:
         Number of samples; of a long text log, an estimate from the size of the file.
     units : Units
         Unit of the readings.
-    sensor : str
-        Name of the sensor; empty if the log does not state it.
-    read_as : str
-        How the log is read, in one line; empty if nothing is assumed.
+    sensor, read_as : str
+        Name of the sensor, empty if not stated; how the log is read, empty if nothing is assumed.
     poses : Poses or None
         The poses, if the log is a pose table.
     noted : function
@@ -228,8 +218,8 @@ def _timed(path: Path, blocks: Iterator[Block], rate_hz: float | None) -> Iterat
 
 def converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
     """Yield blocks in our units."""
-    for each in cells:
-        columns, row = quantities.columns(each)
+    for block in cells:
+        columns, row = quantities.columns(block)
         check_values(columns, str(path))
         yield columns, row
 
@@ -273,20 +263,11 @@ class LineReader:
     name : str
         Name of the port, for messages.
     head : sequence of str
-        The first complete lines.
+        The first complete lines; `first` are their samples.
     seconds : float
         Time in which they arrived, for lines without times [s].
     options : LogOptions
         How to read the lines; by default it is recognised.
-
-    Attributes
-    ----------
-    units : Units
-        Unit of the readings.
-    read_as : str
-        How the lines are read, in one line.
-    first : Recording or None
-        The samples of the head.
 
     Raises
     ------

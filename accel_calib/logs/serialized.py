@@ -120,12 +120,10 @@ class Messages:
     ----------
     data : (m,) array of bytes
         The buffer.
-    start, stop : (n,) array
-        Place of the beginning and of the end of each message.
+    start, stop, begin : (n,) array
+        Places of the beginning, the end and the first double of each message.
     head : (n, 4) array of uint32
         First four words of each message.
-    begin : (n,) array
-        Place of the first double of each message.
     swapped : (n,) array of bool
         Whether the message is big endian.
     ros2 : bool

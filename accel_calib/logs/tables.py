@@ -71,25 +71,15 @@ def write_table(path: Path, table: Table) -> None:
 
 def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
     """
-    Write poses or samples block by block; the memory needed is that of one block.
+    Write poses or samples block by block, and return the number of rows.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    blocks : iterable of Table
-        One or more tables with the same columns, units and sensor.
-
-    Returns
-    -------
-    int
-        Number of rows.
+    The memory needed is that of one block. The tables have the same columns, units and sensor.
 
     Raises
     ------
     OSError
-        If the file cannot be written. An earlier file is then unchanged, as after an error of
-        the iterable.
+        If the file cannot be written. An earlier file is then unchanged, as after an error of the
+        iterable.
 
     """
     rows = 0
