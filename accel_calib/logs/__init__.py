@@ -10,18 +10,8 @@ the fields in serialized messages, and `tables` writes our own tables.
 
 """
 
-from .bag import (
-    Bag,
-    damage_as_input_error,
-    first_frame_id,
-    imu_topic,
-    is_bag,
-    lost,
-    of_sensor,
-    open_bag,
-    plausible_samples,
-)
-from .bag_samples import context_of, ContextTopics, QUANTITIES
+from .bag import Bag, damage_as_input_error, is_bag, open_bag
+from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
 from .formats import NAMES
 from .quantities import are_samples
@@ -54,10 +44,9 @@ from .tables import read_poses, write_blocks, write_table
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
-           'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'QUANTITIES', 'STAMP', 'STAMP_AT',
-           'THREE', 'Bag', 'ContextTopics', 'Layout', 'LineReader', 'Log', 'LogOptions',
-           'Messages', 'OpenLog', 'Progress', 'are_samples', 'context_of',
-           'damage_as_input_error', 'doubles_at', 'first_frame_id', 'imu_topic', 'is_bag',
-           'joined', 'layout_of', 'layout_with', 'lost', 'of_sensor', 'open_bag', 'open_log',
-           'plausible_samples', 'put_doubles', 'read_log', 'read_poses',
-           'read_recording', 'renamed', 'samples_of', 'write_blocks', 'write_table']
+           'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'STAMP', 'STAMP_AT', 'THREE', 'Bag',
+           'ContextTopics', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages', 'OpenLog',
+           'Progress', 'are_samples', 'context_of', 'damage_as_input_error', 'doubles_at',
+           'is_bag', 'joined', 'layout_of', 'layout_with', 'open_bag', 'open_log', 'put_doubles',
+           'read_log', 'read_poses', 'read_recording', 'renamed', 'samples_of', 'write_blocks',
+           'write_table']

@@ -158,6 +158,73 @@ class Bag:
             known = connection.msgtype in types
             return tuple(below(connection.msgtype, ())) if known else ()
 
+    # -------------------------------------------------------------------------- Imu messages
+
+    def imu_topic(self, topic: str = '') -> str:
+        """Return the Imu topic, or check the given one; it must be one that the bag has."""
+        topics = self.topics(IMU)
+        if not topics:
+            others = ', '.join(sorted(f'{c.topic} ({c.msgtype})'
+                                      for c in self.reader.connections))
+            raise InputError(f'{self.path} has {others or "no topics"}, expected a topic of type '
+                             f'{IMU}', 'record the Imu topic')
+        if topic and topic not in topics:
+            raise InputError(f'{self.path} has the Imu topics {", ".join(topics)}, expected '
+                             f'{topic}', 'choose one of them with --topic')
+        if not topic and len(topics) > 1:
+            raise InputError(f'{self.path} has {len(topics)} Imu topics, expected one: '
+                             f'{", ".join(topics)}', 'choose one of them with --topic')
+        return topic or topics[0]
+
+    def first_frame_id(self, topic: str) -> str:
+        """Return the frame_id of the first message of an Imu topic; there must be one."""
+        block = self.first(topic)
+        if not block:
+            raise InputError(f'{self.path} has no message on {topic}, expected Imu messages',
+                             'record while the sensor publishes')
+        return frame_ids(self.joined([block[0][2]], topic, 0))[0]
+
+    def imus(self, raws: Sequence[bytes], topic: str, before: int, sensor: str, *,
+             chosen: bool = False) -> tuple[Messages, dict[str, Floats], NDArray[np.bool_]]:
+        """
+        Return Imu messages as arrays and as columns of a recording, and which are of a sensor.
+
+        `before` is the number of earlier messages. Messages of another sensor are an InputError
+        unless the user chose the sensor. So are an acceleration that is not finite, and a number
+        beyond any sensor.
+
+        """
+        messages = self.joined(raws, topic, before)
+        names = frame_ids(messages)
+        same = np.array([name == sensor for name in names])
+        if not chosen and not np.all(same):
+            first = int(np.argmin(same))
+            raise InputError(f'{self.path}, {topic}: message {before + first + 1} is from the '
+                             f'sensor {names[first]!r}, expected {sensor!r} as before',
+                             'capture and refine choose one with --sensor; apply needs a topic '
+                             'for each sensor')
+        columns = samples_of(messages)
+        self._check_plausible(columns['reading'], 'acceleration', before)
+        self._check_plausible(np.nan_to_num(columns['rate']), 'angular velocity', before)
+        return messages, columns, np.broadcast_to(same, len(messages))
+
+    def _check_plausible(self, values: Floats, what: str, before: int) -> None:
+        sound = np.all(np.abs(values) < LARGEST, axis=1)
+        if not np.all(sound):
+            first = int(np.argmin(sound))
+            found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
+                     f'has the {what} {np.max(np.abs(values[first])):.3g}')
+            raise InputError(f'{self.path}: Imu message {before + first + 1} {found}, expected '
+                             f'finite numbers below {LARGEST:g}',
+                             'fix the driver, or record again')
+
+    def lost(self, topic: str, found: int) -> list[str]:
+        """Return a note if fewer messages of a topic were found than the bag states."""
+        stated = self.count(topic)
+        return [f'{stated - found} of {stated} messages on {topic} are lost: the index of '
+                f'{self.path} states them, but they are not in the bag'
+                ] if found < stated else []
+
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
@@ -276,83 +343,3 @@ def _defined(kind: str, text: str, msgtype: str) -> Typestore:
         types.update(get_types_from_idl(part))
     store.register(types)
     return store
-
-
-# ------------------------------------------------------------------------------ Imu messages
-
-def imu_topic(bag: Bag, topic: str = '') -> str:
-    """
-    Return the Imu topic of an open bag, or check the given topic.
-
-    If there is no such topic, or there are several and none is given, that is an InputError.
-
-    """
-    topics = bag.topics(IMU)
-    if not topics:
-        others = ', '.join(sorted(f'{c.topic} ({c.msgtype})' for c in bag.reader.connections))
-        raise InputError(f'{bag.path} has {others or "no topics"}, expected a topic of type {IMU}',
-                         'record the Imu topic')
-    if topic and topic not in topics:
-        raise InputError(f'{bag.path} has the Imu topics {", ".join(topics)}, expected {topic}',
-                         'choose one of them with --topic')
-    if not topic and len(topics) > 1:
-        raise InputError(f'{bag.path} has {len(topics)} Imu topics, expected one: '
-                         f'{", ".join(topics)}', 'choose one of them with --topic')
-    return topic or topics[0]
-
-
-def first_frame_id(bag: Bag, topic: str) -> str:
-    """Return the frame_id of the first message of an Imu topic; no message is an InputError."""
-    block = bag.first(topic)
-    if not block:
-        raise InputError(f'{bag.path} has no message on {topic}, expected Imu messages',
-                         'record while the sensor publishes')
-    return frame_ids(bag.joined([block[0][2]], topic, 0))[0]
-
-
-def of_sensor(bag: Bag, topic: str, messages: Messages, before: int, sensor: str, *,
-              chosen: bool) -> NDArray[np.bool_]:
-    """
-    Return a mask of the messages of a sensor, by its frame_id.
-
-    `before` is the number of earlier messages of the topic. If the user did not choose the sensor,
-    messages of another one are an InputError.
-
-    """
-    names = frame_ids(messages)
-    same = np.array([name == sensor for name in names])
-    if not chosen and not np.all(same):
-        first = int(np.argmin(same))
-        raise InputError(f'{bag.path}, {topic}: message {before + first + 1} is from the sensor '
-                         f'{names[first]!r}, expected {sensor!r} as before',
-                         'capture and refine choose one with --sensor; apply needs a topic for '
-                         'each sensor')
-    return np.broadcast_to(same, len(messages))
-
-
-def lost(bag: Bag, topic: str, found: int) -> list[str]:
-    """Return a note if fewer messages of a topic were found than the bag states."""
-    stated = bag.count(topic)
-    return [f'{stated - found} of {stated} messages on {topic} are lost: the index of {bag.path} '
-            'states them, but they are not in the bag'] if found < stated else []
-
-
-def plausible_samples(bag: Bag, messages: Messages, before: int) -> dict[str, Floats]:
-    """
-    Return Imu messages as columns of `accel_calib.table`; `before` counts the earlier messages.
-
-    An acceleration that is not finite, or a number beyond any sensor, is an InputError.
-
-    """
-    columns = samples_of(messages)
-    for values, what in ((columns['reading'], 'acceleration'),
-                         (np.nan_to_num(columns['rate']), 'angular velocity')):
-        sound = np.all(np.abs(values) < LARGEST, axis=1)
-        if not np.all(sound):
-            first = int(np.argmin(sound))
-            found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
-                     f'has the {what} {np.max(np.abs(values[first])):.3g}')
-            raise InputError(f'{bag.path}: Imu message {before + first + 1} {found}, expected '
-                             f'finite numbers below {LARGEST:g}',
-                             'fix the driver, or record again')
-    return columns

@@ -22,14 +22,14 @@ the first messages of the Imu, converts this time to that of the stamps.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import re
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .bag import Bag, BLOCK, lost, NUMBERS, of_sensor, plausible_samples, Received
+from .bag import Bag, BLOCK, NUMBERS, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
 from ..table import Floats, Recording
@@ -181,6 +181,20 @@ class ContextTopics:
 
     used: tuple[ContextTopic, ...]
     notes: tuple[str, ...]
+
+    def needed(self, bag: Bag, needs: Collection[str]) -> ContextTopics:
+        """Return the topics that a calibration needs, without notes if it needs none."""
+        used = {source.quantity.key: source for source in self.used}
+        needed = [quantity for quantity in QUANTITIES if quantity.key in needs]
+        for quantity in needed:
+            if quantity.key not in used:
+                notes = ''.join(f'; {line}' for line in self.notes)
+                raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
+                                 f'{notes}, but the calibration depends on the {quantity.words}',
+                                 f'name the topic with {quantity.option}, or use a calibration '
+                                 'without it')
+        return ContextTopics(tuple(source for source in self.used if source.quantity in needed),
+                             self.notes if needed else ())
 
     def tracks(self) -> dict[str, Track]:
         """Return all values of the bag by column; raise InputError if there are none."""
@@ -363,7 +377,7 @@ def _looks_like(connection: Connection, quantity: Quantity) -> bool:
 def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: ContextTopics,
                 notes: list[str]) -> Iterator[Recording]:
     """
-    Yield the samples of an Imu topic in blocks; the first four parameters are as in `of_sensor`.
+    Yield the samples of an Imu topic in blocks; the first four parameters are as in `Bag.imus`.
 
     A note about lost messages is added to `notes` at the end. A message that is damaged, contains
     NaN, or is from another sensor is an InputError.
@@ -388,7 +402,7 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     parts += [_with_context(part, tracks) for part in waiting]
     if parts:
         yield together(parts)
-    notes += lost(bag, topic, before)
+    notes += bag.lost(topic, before)
 
 
 def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
@@ -416,10 +430,8 @@ def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
 
 def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
              ) -> Recording:
-    messages = bag.joined(raws, topic, before)
-    which = of_sensor(bag, topic, messages, before, sensor, chosen=chosen)
-    row = np.arange(before, before + len(raws)) + 1
-    samples = Recording(plausible_samples(bag, messages, before), row, 'm/s2', sensor)
+    _, columns, which = bag.imus(raws, topic, before, sensor, chosen=chosen)
+    samples = Recording(columns, np.arange(before, before + len(raws)) + 1, 'm/s2', sensor)
     return samples if np.all(which) else samples.take(which)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .ardupilot import is_dataflash, read_dataflash
-from .bag import Bag, first_frame_id, imu_topic, is_bag, open_bag
+from .bag import Bag, is_bag, open_bag
 from .bag_samples import context_of, imu_samples, together
 from .columns import chosen, is_log_header, LogOptions
 from .dialect import layout_of
@@ -146,8 +146,8 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
 
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     """Return an open bag as a log."""
-    topic = imu_topic(bag, options.topic)
-    sensor = options.sensor or first_frame_id(bag, topic)
+    topic = bag.imu_topic(options.topic)
+    sensor = options.sensor or bag.first_frame_id(topic)
     context = context_of(bag, topic, sensor, options.temperature_topic, options.supply_topic)
     notes = [*bag.notes, *context.notes]
     blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,

@@ -39,17 +39,11 @@ from ..logs import (
     ContextTopics,
     damage_as_input_error,
     doubles_at,
-    first_frame_id,
     IMU_DOUBLES,
-    imu_topic,
-    lost,
     Messages,
-    of_sensor,
     open_bag,
-    plausible_samples,
     Progress,
     put_doubles,
-    QUANTITIES,
     renamed,
 )
 from ..table import check_units, Recording
@@ -114,12 +108,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         raise InputError(f'{out} exists, expected a new file', 'choose another name')
     with open_bag(path) as bag:
         _check_kind(bag, out)
-        name = imu_topic(bag, topic)
-        sensor = first_frame_id(bag, name)
+        name = bag.imu_topic(topic)
+        sensor = bag.first_frame_id(name)
         check_sensor(calibration, sensor)
         calibration = calibration.in_units(units)
-        context = _needed(bag, calibration, context_of(bag, name, sensor, temperature_topic,
-                                                       supply_topic))
+        context = context_of(bag, name, sensor, temperature_topic, supply_topic)
+        context = context.needed(bag, calibration.model.needs)
         with _new(out) as folder:
             correction = _Correction(calibration, bag, name, sensor, context,
                                      units_of(units, gravity), gravity)
@@ -127,7 +121,7 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         for each in correction.outside.values():
             if each.count:
                 report(each)
-        for line in (*bag.notes, *context.notes, *lost(bag, name, count)):
+        for line in (*bag.notes, *context.notes, *bag.lost(name, count)):
             note(line)
         return count
 
@@ -139,21 +133,6 @@ def _check_kind(bag: Bag, out: Path) -> None:
                          'name of one', 'choose a name that ends in .mcap or .db3, or the '
                          'name of a folder' if bag.ros2 else
                          'choose a name that ends in .bag')
-
-
-def _needed(bag: Bag, calibration: Calibration, context: ContextTopics) -> ContextTopics:
-    """Return the topics that a calibration needs, without notes if it needs none."""
-    needs = {each.key: each for each in QUANTITIES if each.key in calibration.model.needs}
-    used = {each.quantity.key: each for each in context.used}
-    for key, quantity in needs.items():
-        if key not in used:
-            notes = ''.join(f'; {line}' for line in context.notes)
-            raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used{notes}, '
-                             f'but the calibration depends on the {quantity.words}',
-                             f'name the topic with {quantity.option}, or use a calibration '
-                             'without it')
-    return ContextTopics(tuple(each for key, each in used.items() if key in needs),
-                         context.notes if needs else ())
 
 
 @contextmanager
@@ -185,9 +164,7 @@ class _Correction:
 
     def __call__(self, raws: list[bytes]) -> Messages:
         """Return corrected messages in a new buffer."""
-        messages = self._bag.joined(raws, self.topic, self.done)
-        of_sensor(self._bag, self.topic, messages, self.done, self._sensor, chosen=False)
-        context = plausible_samples(self._bag, messages, self.done)
+        messages, context, _ = self._bag.imus(raws, self.topic, self.done, self._sensor)
         if not self.done:
             check_units(Recording(context, np.arange(len(messages))), self._units,
                         str(self._bag.path))
@@ -197,8 +174,8 @@ class _Correction:
         known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
         self.outside = joined_ranges(self.outside, outside(self._calibration, known))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
-            made = corrected(self._calibration, doubles, known, scale=self._scale)
-            put_doubles(messages, made)
+            put_doubles(messages, corrected(self._calibration, doubles, known,
+                                            scale=self._scale))
         self.done += len(messages)
         return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
 
