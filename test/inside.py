@@ -29,6 +29,8 @@ from accel_calib.calibrate.mounting import mounting, with_heading, with_heading_
 from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
 from accel_calib.capture import rounding_left
+from accel_calib.capture.trend import _long_run as long_run
+from accel_calib.capture.trend import lines_through
 from accel_calib.cli.commands import COMMANDS
 from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
 from accel_calib.cli.frame import Output
@@ -70,6 +72,7 @@ from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import distinct, kinds, noise_of, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
+from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
 from accel_calib.fleet.models import alike, estimated, priors_of
 from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects

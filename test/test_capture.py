@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from accel_calib.capture import capture, CaptureSettings, StillDetector
+from dataclasses import replace
+
+from accel_calib.capture import capture, CaptureSettings, select, StillDetector
 from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.table import Recording
@@ -95,6 +97,19 @@ def test_repeated_poses_are_kept_merged_or_refused_as_asked(repeated, poses, uni
     samples = samples.with_columns(reading=samples.reading * (4e3 if unit == 'native' else 1.0))
     settings = CaptureSettings(repeated=repeated)
     assert len(capture(samples, units_of(unit), settings).poses) == poses
+
+
+@pytest.mark.parametrize('repeated', ['merge', 'refuse'])
+def test_a_doubtful_pose_does_not_take_the_place_of_a_sure_one(repeated):
+    samples = visited(AGAIN)
+    detector = StillDetector(CaptureSettings(), G)
+    detector.push(np.column_stack([samples['time'], samples.reading]))
+    detector.close()
+    dwells = [replace(each, doubtful=k == 0) for k, each in enumerate(detector.dwells())]
+    kept = select(dwells, CaptureSettings(repeated=repeated), G)
+    assert [each.doubtful for each in kept] == [True, *[False] * 6]
+    assert kept[0] is dwells[0]
+    assert kept[6] is dwells[6]
 
 
 def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():

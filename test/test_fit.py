@@ -5,7 +5,13 @@
 
 from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate import lower_triangular, sensing_axes
+from accel_calib.estimate import (
+    lower_triangular,
+    NotConvergedError,
+    Point,
+    sensing_axes,
+    solve,
+)
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
 from inside import predict, rotation_from_rpy, simulate_poses, spread_directions
@@ -297,3 +303,25 @@ def test_auto_with_as_many_poses_as_parameters_warns():
     calibration = fit_poses(simulated(9, 9)[1], G, model='10')
     assert 'only as many poses as free parameters' in ' '.join(calibration.warnings)
     assert fit_poses(simulated(9, 9)[1], G).name in ('4', '7', '10')
+
+
+def stalled(slope):
+    """Return a solve whose ten other residuals are 1 and whose step never lowers the cost."""
+    residual = np.append(slope, np.ones(10))
+    columns = np.append(1.0, np.zeros(10))[:, np.newaxis]
+    return solve(lambda values: Point(residual, columns), np.zeros(1), np.array([-np.inf]),
+                 np.array([np.inf]))
+
+
+def test_a_stalled_fit_has_converged_if_its_step_is_small_beside_one_degree_of_freedom():
+    values, _ = stalled(np.sqrt(0.9e-5))
+    assert values == 0.0
+    with pytest.raises(NotConvergedError):
+        stalled(np.sqrt(1.2e-5))
+
+
+def test_a_fit_without_any_residual_has_converged():
+    zero = Point(np.zeros(3), np.eye(3)[:, :1])
+    values, point = solve(lambda values: zero, np.ones(1), np.zeros(1), np.full(1, 2.0))
+    assert values == 1.0
+    assert point.cost == 0.0

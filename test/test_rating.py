@@ -20,7 +20,7 @@ from accel_calib.findings import (
 from accel_calib.logs import read_poses, read_recording
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import spread_directions
+from inside import number, spread_directions
 import numpy as np
 import pytest
 from shared import data, random_directions
@@ -218,6 +218,20 @@ def test_a_robot_that_cannot_be_turned_over_is_usable(fitted, reason):
     rating = rate(fitted(tilted(), MS2))
     assert rating.name == 'USABLE'
     assert reason in rating.reason
+
+
+@pytest.mark.parametrize('fitted', [fit_partial, mounting_only])
+def test_what_a_robot_cannot_determine_is_stated_once(fitted):
+    kinds = [each.kind for each in rate(fitted(tilted(), MS2)).findings]
+    assert 'open' in kinds
+    assert not {'omitted', 'new_orientations', 'far_from_poses'} & {*kinds}
+
+
+@pytest.mark.parametrize(('value', 'expected'), [
+    (0.0009, '0'), (0.001, '0.001'), (9.94, '9.9'), (10.0, '10.0'), (99.9, '99.9'),
+    (100.0, '100')])
+def test_numbers_have_two_digits_and_one_after_the_point_from_10_to_100(value, expected):
+    assert number(value) == expected
 
 
 def known(mirror):

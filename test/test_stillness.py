@@ -8,6 +8,7 @@ from __future__ import annotations
 from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
 from accel_calib.table import Recording
 from accel_calib.units import units_of
+from inside import lines_through, long_run
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -311,3 +312,28 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     detector = pushed(np.arange(len(reading)) / 100.0, reading)
     assert len(detector.doubtful()) == 1
     assert min(detector.doubtful()) < 1.0
+
+
+def test_lines_through_series_of_unequal_length_are_those_of_least_squares():
+    rng, sizes = np.random.default_rng(4), np.array([12, 7])
+    series = [rng.normal(size=(3, size)) for size in sizes]
+    centred = np.zeros((3, 2, 12))
+    for k, values in enumerate(series):
+        centred[:, k, :sizes[k]] = values - values.mean(axis=1, keepdims=True)
+    line = lines_through(centred, sizes)
+    for k, values in enumerate(series):
+        time = np.arange(sizes[k])
+        fitted = np.polyfit(time, values.T, 1)
+        left = values.T - np.outer(time, fitted[0]) - fitted[1]
+        np.testing.assert_allclose(line.slope[:, k], fitted[0])
+        np.testing.assert_allclose(line.square[:, k], np.sum(left ** 2, axis=0))
+        np.testing.assert_allclose(line.time_square[k], np.sum((time - time.mean()) ** 2))
+
+
+def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
+    sizes = np.array([9])
+    known = np.array([[1.0, 0.5, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0]])
+    beyond = known + 0.3 * (np.arange(8) >= 4)
+    shorter = known * [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(long_run(beyond, sizes), long_run(known, sizes))
+    assert long_run(known, sizes) > long_run(shorter, sizes)
