@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 import math
 
 import numpy as np
@@ -96,3 +97,9 @@ OVER_THE_SPHERE = spread_directions(300)
 def unit(vectors: Floats) -> Floats:
     """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+ATTITUDES = unit(np.array(sorted((signs for signs in product((0.0, 1.0, -1.0), repeat=3)
+                                  if any(signs)), key=np.count_nonzero)))
+"""The 6 faces, 12 edges and 8 corners of a sensor that can point up, in this order: (26, 3) unit
+vectors, whose signs are those of the axes."""

@@ -24,11 +24,17 @@ from accel_calib.calibrate import (
     sound_rows,
     words_of,
 )
-from accel_calib.calibrate.checks import axes_of, doubts_about_flat, fault_of
-from accel_calib.calibrate.mounting import mounting, with_heading, with_heading_of
-from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
+from accel_calib.calibrate.known_orientation import axes_of, fault_of
+from accel_calib.calibrate.mounting import (
+    doubts_about_flat,
+    mounting,
+    with_heading,
+    with_heading_of,
+)
+from accel_calib.calibrate.partial import carried
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
 from accel_calib.capture import rounding_left
+from accel_calib.calibrate.prior import common_sensors, typical_spread, without_knocked
 from accel_calib.capture.trend import _long_run as long_run
 from accel_calib.capture.trend import lines_through
 from accel_calib.cli.commands import COMMANDS

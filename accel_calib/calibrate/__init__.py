@@ -4,37 +4,54 @@
 """
 From poses to a calibration.
 
-`fit` is the entry point; it calls `unknown_orientation` or `known_orientation`. `partial` is for a
-sensor that cannot be turned over. `pose_planning` explains what poses do not determine and plans
-the next pose. `mounting` computes the mounting. `checks` detects wrong units and wiring faults,
-and `gate` rejects implausible results. `calibration` is the record, `quality` computes its
-figures, and `rest_noise` those of the gyro and of the samples. `outside` compares samples with the
-range of a calibration.
+`fit` is the entry point and has the gate, which rejects implausible results. It calls
+`unknown_orientation` or `known_orientation`, which also detects wiring faults. `partial` is for
+few poses, with the typical values of `prior`. `pose_planning` explains what poses do not determine
+and plans the next pose. `mounting` computes the mounting. `calibration` is the record, `quality`
+makes it and computes its figures, and `rest_noise` those of the gyro and of the samples. `context`
+compares samples with the range of a calibration.
 
 """
 
-from .calibration import Calibration, check_sensor, converted, Quality, Rejected, RejectedKind
-from .context import joined_ranges, of_samples, Outside, outside, thermal_stream, USES_LIMIT
-from .fit import (
+from .calibration import (
     BASES,
-    fit_poses,
-    level,
-    level_by_rows,
-    MODEL_NAMES,
-    set_heading,
-    with_given_mounting,
-)
-from .fleet_prior import fit_with_fleet, FleetPrior, posterior
-from .gate import deviations_g, gated, sound_rows, sure_rows, uncertainty_g
-from .mounting import (
-    flat_direction,
+    Calibration,
+    check_sensor,
+    converted,
+    FLEET,
     FrameName,
     FRAMES,
+    Method,
+    METHODS,
+    MODEL_NAMES,
+    PRIOR,
+    Quality,
+    Rejected,
+    RejectedKind,
+    STORED_METHODS,
+)
+from .context import (
+    joined_ranges,
+    of_samples,
+    Outside,
+    outside,
+    thermal_stream,
+    USES_LIMIT,
+    with_history,
+    with_previous,
+)
+from .fit import deviations_g, fit_poses, gated, sound_rows, sure_rows, uncertainty_g
+from .mounting import (
+    flat_direction,
+    level,
+    level_by_rows,
     mounting_figures,
     mounting_of,
     mounting_words,
+    set_heading,
+    with_given_mounting,
 )
-from .partial import carried_words, fit_partial, mounting_only
+from .partial import carried_words, fit_partial, fit_with_fleet, mounting_only
 from .pose_planning import (
     determines,
     lies_in_cone,
@@ -45,6 +62,7 @@ from .pose_planning import (
     refuse_if_unfit,
     words_of,
 )
+from .prior import FleetPrior, posterior
 from .quality import (
     errors_after,
     errors_before,
@@ -52,22 +70,12 @@ from .quality import (
     in_g,
     OF_A_FIT,
     quality_of,
+    record_of,
     Verification,
     verify,
-    with_history,
-    with_previous,
 )
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
-from .unknown_orientation import (
-    directions_of,
-    fit_unknown,
-    FLEET,
-    Method,
-    METHODS,
-    only_norm,
-    PRIOR,
-    STORED_METHODS,
-)
+from .unknown_orientation import directions_of, fit_unknown, only_norm
 
 __all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
            'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias',
@@ -78,6 +86,6 @@ __all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PR
            'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'joined_ranges', 'level',
            'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of', 'mounting_only',
            'mounting_words', 'next_pose', 'of_samples', 'only_norm', 'outlook', 'outside',
-           'posterior', 'quality_of', 'refuse_if_unfit', 'sample_noise_of', 'set_heading',
-           'sound_rows', 'sure_rows', 'thermal_stream', 'uncertainty_g', 'verify',
+           'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'sample_noise_of',
+           'set_heading', 'sound_rows', 'sure_rows', 'thermal_stream', 'uncertainty_g', 'verify',
            'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise', 'words_of']

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The Calibration: a fitted model with its units, its sensor and its quality."""
+"""The record of a calibration: a fitted model with its units, its sensor and its quality."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
-from typing import Literal, TypeVar
+from typing import get_args, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .context import HELD, limited, of_samples, with_acting
-from .mounting import FrameName
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
     AXES,
@@ -32,7 +31,30 @@ from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..table import Floats, Poses, Table
 from ..text import table, with_sd
-from ..units import is_native, UnitName, Units, units_of
+from ..units import UnitName, Units, units_of
+
+FrameName = Literal['ros', 'ned', 'android', 'win8']
+FRAMES: tuple[str, ...] = get_args(FrameName)
+
+MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
+
+BASES = ('auto', 'ideal', '4', '7', '10', '12')
+"""Models that a refinement can start from."""
+
+ORIENTED = '12'
+"""The model of poses of known orientation."""
+
+Method = Literal['ml', 'algebraic']
+METHODS = get_args(Method)
+
+PRIOR = 'prior'
+"""Method of a calibration whose values are partly those of a common sensor; see `.partial`."""
+
+FLEET = 'fleet'
+"""Method of a calibration whose values are partly those of a fleet; see `.prior`."""
+
+STORED_METHODS = (*METHODS, PRIOR, FLEET)
+"""Methods of stored calibrations; the user selects one of `METHODS`."""
 
 _IN_READING_UNITS = ('reading', 'std', 'reference')
 
@@ -219,6 +241,11 @@ class Calibration:
         return self.model.rotation
 
     @property
+    def is_oriented(self) -> bool:
+        """Whether the values are from the known orientations of the poses."""
+        return self.name == ORIENTED
+
+    @property
     def is_levelled(self) -> bool:
         """Whether ΔR is known."""
         return not np.array_equal(self.rotation, np.eye(3))
@@ -233,18 +260,7 @@ class Calibration:
         Return the same calibration for readings in another unit.
 
         Drivers convert g to m/s² with the standard gravity, not with the local gravity, so only
-        the name of the unit matters here. The effects are in local g, and do not change. The
-        poses and the noise are converted.
-
-        Parameters
-        ----------
-        units : Units, or {'m/s2', 'g', 'native'}
-            Unit of the readings.
-
-        Returns
-        -------
-        Calibration
-            The converted calibration, or this one if it is in that unit.
+        the name of the unit matters here. The effects are in local g, and do not change.
 
         Raises
         ------
@@ -255,7 +271,7 @@ class Calibration:
         before, name = self.units, units.name if isinstance(units, Units) else units
         if name == before.name:
             return self
-        factor = conversion(before.name, name)
+        factor = _conversion(before.name, name)
         noise = self.noise and replace(self.noise, force=self.noise.force * factor)
         return replace(self, units=Units(name, before.per_g * factor), noise=noise,
                        poses=converted(self.poses, before.name, name))
@@ -265,11 +281,6 @@ class Calibration:
         Return the same calibration for the readings of a table.
 
         If the table states no unit, the median length of the readings decides between g and m/s².
-
-        Raises
-        ------
-        InputError
-            If one of the two units is native and the other is not.
 
         """
         own = self.units
@@ -302,13 +313,7 @@ class Calibration:
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """
-        Range over the poses of what the effects depend on.
-
-        A lag needs the time, but does not depend on it; its range is that of the temperature that
-        acts.
-
-        """
+        """Range over the poses of what the effects depend on; of a lag, the acting temperature."""
         known = with_acting(self.model, self.poses.columns)
         used = ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
@@ -410,48 +415,34 @@ class Calibration:
         return covariance * self.force_per_g ** 2
 
     def held_context(self, context: Context | None) -> Context:
+        """Return a context limited to `ranges`."""
         if not context or not self.ranges:
             return context or {}
         known = with_acting(self.model, context)
         return {**known, **limited(known, self.ranges)}
 
 
-def conversion(before: UnitName, after: UnitName) -> float:
-    """
-    Return the factor from readings in one unit to readings in another unit.
-
-    Raises
-    ------
-    InputError
-        If one of the two units is native and the other is not.
-
-    """
+def _conversion(before: UnitName, after: UnitName) -> float:
+    """Return the factor from readings in one unit to readings in another, with standard g."""
     if before == after:
         return 1.0
-    if is_native(before) or is_native(after):
+    one, other = units_of(before), units_of(after)
+    if one.is_native or other.is_native:
         raise InputError(f'the calibration is for readings in {before}, but the readings are in '
                          f'{after}, and the scale of native units is not known',
                          f'use readings in {before}, or fit a calibration to poses in {after}')
-    return units_of(after).per_g / units_of(before).per_g
+    return other.per_g / one.per_g
 
 
 def converted(table: _Known, before: UnitName, after: UnitName) -> _Known:
-    """Return a table with its readings in another unit; errors as in `conversion`."""
-    factor = conversion(before, after)
+    """Return a table with its readings in another unit; errors as in `Calibration.in_units`."""
+    factor = _conversion(before, after)
     known = {key: table[key] * factor for key in _IN_READING_UNITS if key in table}
     return replace(table.with_columns(**known), units=after)
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:
-    """
-    Check that a calibration belongs to this sensor; an empty name matches any sensor.
-
-    Raises
-    ------
-    StoredCalibrationError
-        If the calibration belongs to another sensor.
-
-    """
+    """Raise StoredCalibrationError if a calibration is of another sensor; '' matches any."""
     if calibration.sensor and sensor and calibration.sensor != sensor:
         raise StoredCalibrationError(f'the calibration belongs to sensor {calibration.sensor!r}, '
                                      f'but the readings come from {sensor!r}',

@@ -4,10 +4,11 @@
 """
 The context of readings: computed from other columns, and limited to the range of the poses.
 
-The effects of a calibration are not extrapolated: beyond the range of the poses, the correction
-uses the limit of the range (`Calibration.ranges`), and `Outside` says how far beyond it was. A
-curve over the vibration has a range, too. A single sample does not show its vibration, so that the
-correction uses the lower limit.
+The order of the poses determines the previous pose of each, for `hysteresis`, and the rate of the
+temperature, for `temperature_rate` and lags. The effects of a calibration are not extrapolated:
+beyond the range of the poses, the correction uses the limit of the range (`Calibration.ranges`),
+and `Outside` says how far beyond it was. A curve over the vibration has a range, too. A single
+sample does not show its vibration, so that the correction uses the lower limit.
 
 """
 
@@ -28,7 +29,8 @@ from ..effects import (
     rate_at,
     ThermalStream,
 )
-from ..table import COLUMNS, Floats
+from ..geometry import unit
+from ..table import COLUMNS, Floats, Poses
 from ..text import counted
 from ..units import MG
 
@@ -45,7 +47,7 @@ HELD = ('time', 'temperature', *THERMAL, 'supply_voltage')
 def of_samples(known: Context, count: int, model: Model,
                stream: ThermalStream | None = None) -> Context:
     """
-    Return the context of single samples.
+    Return the context of single samples that a model needs, ``count`` rows each.
 
     A single sample does not show the vibration or the previous pose. Both are set to zero, and so
     is a rate that is NaN. Lag and rate of the temperature come from earlier samples, unless they
@@ -61,11 +63,6 @@ def of_samples(known: Context, count: int, model: Model,
         Model that the context is for.
     stream : ThermalStream, optional
         Temperature before these samples; these samples are added.
-
-    Returns
-    -------
-    mapping of str to array
-        The columns that the model needs, ``count`` rows each.
 
     """
     none = np.zeros((count, 3))
@@ -94,6 +91,49 @@ def with_acting(model: Model, known: Context) -> Context:
                         for key, lag in model.lags.items()}}
 
 
+_MOVED = np.radians(3.0)
+"""Smallest change of direction of a move [rad]; less may be noise or settling."""
+
+
+def with_history(poses_g: Poses, model: Model) -> Poses:
+    """
+    Return poses with the context that comes from the poses before and after.
+
+    That is ``previous``, the unit vector towards the previous pose in order of time, or of rows,
+    and ``temperature_rate``. If successive poses have the same orientation, the last motion counts
+    for all of them; before the first motion, ``previous`` is zero.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        Poses in g. Columns that the table has already are kept.
+    model : Model
+        Model whose gain and offset are used to compute the directions.
+
+    """
+    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
+        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
+    if 'previous' in poses_g:
+        return poses_g
+    mat_w, vec_v = model.linear_part
+    return with_previous(poses_g, unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T))
+
+
+def with_previous(poses_g: Poses, force: Floats) -> Poses:
+    """Return poses with the unit vector towards the previous pose, given (n, 3) unit forces."""
+    order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
+             else np.arange(len(poses_g)))
+    previous = np.zeros_like(force)
+    towards, resting = np.zeros(3), order[0] if len(order) else 0
+    for here in order:
+        step = force[resting] - force[here]
+        length = float(np.linalg.norm(step))
+        if length > _MOVED:
+            towards, resting = step / length, here
+        previous[here] = towards
+    return poses_g.with_columns(previous=previous)
+
+
 def limited(context: Context, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Floats]:
     """Return the columns that have a range, limited to it."""
     return {key: np.clip(context[key], *limits) for key, limits in ranges.items()
@@ -112,12 +152,12 @@ _QUANTITIES: dict[str, tuple[str, str, float]] = {
 @dataclass(frozen=True)
 class Outside:
     """
-    A quantity of the context, compared with the range of a calibration.
+    A column of the context, compared with the range of a calibration.
 
     Parameters
     ----------
     key : str
-        The quantity: a column of the context.
+        The column.
     count, samples : int
         Number of samples outside of the range, and of all samples.
     low, high : float
@@ -165,17 +205,10 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
     """
     Compare the context of samples with the range of a calibration.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    known : mapping of str to array
-        Context of the samples, n rows each.
-
     Returns
     -------
     dict of str to Outside
-        Result for each quantity with a range, by column; ``count`` is 0 if it is inside.
+        Result for each column with a range; ``count`` is 0 if all samples are inside.
 
     """
     found = {}

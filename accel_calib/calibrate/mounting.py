@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The mounting ΔR of a sensor from one flat pose (NXP AN5286, section 7).
+The mounting ΔR of a sensor from one flat pose (NXP AN5286, section 7), as part of a calibration.
 
 ΔR transforms a vector from the levelled frame to the axes of the sensor. In a flat pose, the
 calibrated reading G of the sensor is ΔR times up:
@@ -25,28 +25,41 @@ of each frame. For `ros`, `ned` and `android` the sensor is rolled and pitched b
 which is singular if x is vertical (90° pitch). For `win8` the x column is in the x-z plane of the
 sensor, which is singular if y is vertical (90° roll). At these singularities the limit of a level
 y axis, or a level x axis, is used. A second pose, with the nose of the robot tilted straight down,
-determines the heading (TRIAD, Black 1964).
+determines the heading (TRIAD, Black 1964). One flat pose determines only the direction of up: an
+upside-down sensor and a wrong sign have the same reading.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import math
-from typing import Any, get_args, Literal
+from typing import Any
 
 import numpy as np
 
+from .calibration import Calibration, FrameName
+from .known_orientation import wiring
+from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError
+from ..finding import Finding, without
 from ..geometry import quaternion_of, rotation_from_rpy, rpy_of
-from ..table import Floats
-
-FrameName = Literal['ros', 'ned', 'android', 'win8']
-FRAMES: tuple[str, ...] = get_args(FrameName)
+from ..table import Floats, Poses
 
 _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]),
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
 """Reading of a sensor whose nose points straight down, for each frame [g]."""
+
+_ON_ITS_SIDE = 45.0
+"""Angle between a flat pose and the expected axis above which there is a warning [°]."""
+
+_SAME_TILT = np.cos(np.radians(10.0))
+
+_ARBITRARY_HEADING = Finding(
+    'heading', 'the heading of the mounting is arbitrary, because an axis of the sensor that '
+    'defines it is within 10° of the vertical', 'take a second pose with the nose of the robot '
+    'down (~/set_heading or --nose-down), or give the mounting (mounting_rpy or base_frame)')
 
 _VERTICAL = 1e-9
 _DIGITS = 9
@@ -60,7 +73,7 @@ def flat_direction(frame: str) -> Floats:
 
 def mounting(flat: Floats, frame: str = 'ros') -> Floats:
     """
-    Compute ΔR from one flat pose.
+    Compute ΔR, (3, 3), from one flat pose.
 
     Parameters
     ----------
@@ -68,16 +81,6 @@ def mounting(flat: Floats, frame: str = 'ros') -> Floats:
         Calibrated reading of the flat pose, in the axes of the sensor; any length.
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
-
-    Returns
-    -------
-    (3, 3) array
-        ΔR, a proper rotation.
-
-    Raises
-    ------
-    InputError
-        If the reading is zero or not finite.
 
     """
     length = np.linalg.norm(flat)
@@ -110,7 +113,9 @@ def _x_of_win8(up: Floats) -> Floats:
 
 def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Floats:
     """
-    Return a levelled mounting with the heading from a pose with the nose of the robot down.
+    Return a levelled ΔR with the heading from a pose with the nose of the robot down.
+
+    It matches the flat pose exactly, and the second pose in heading.
 
     Parameters
     ----------
@@ -122,16 +127,6 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
     frame : {'ros', 'ned', 'android', 'win8'}
         The levelled frame.
 
-    Returns
-    -------
-    (3, 3) array
-        ΔR, a proper rotation. It matches the flat pose exactly, and the second pose in heading.
-
-    Raises
-    ------
-    InputError
-        If the second pose is nearly the flat pose, or its opposite.
-
     """
     flat = flat_direction(frame)
     return _triad(rotation @ flat, nose_down) @ _triad(flat, _NOSE_DOWN[frame]).T
@@ -139,20 +134,10 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
 
 def with_heading_of(before: Floats, rotation: Floats) -> Floats:
     """
-    Return a levelled mounting with the heading of an earlier mounting.
+    Return the ΔR of a new flat pose with the heading of an earlier one.
 
-    Parameters
-    ----------
-    before : (3, 3) array
-        Earlier ΔR.
-    rotation : (3, 3) array
-        ΔR of a new flat pose, with any heading.
-
-    Returns
-    -------
-    (3, 3) array
-        ΔR with the earlier x axis, rotated into the new horizontal plane; `rotation` itself if the
-        earlier x axis is now within 10° of the vertical.
+    The earlier x axis is rotated into the new horizontal plane. If it is now within 10° of the
+    vertical, `rotation` is returned.
 
     """
     up, x = rotation[:, 2], before[:, 0]
@@ -230,3 +215,142 @@ def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
     """
     axis = 1 if frame == 'win8' else 0
     return bool(np.hypot(*np.delete(rotation[:, 2], axis)) < np.sin(_LEAST_HEADING_ANGLE))
+
+
+def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
+                  nose_down: int | None) -> Calibration:
+    """
+    Return a calibration with the mounting from rows of a pose table.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration, with any ΔR.
+    poses : Poses
+        The table, in the unit of the calibration.
+    frame : {'ros', 'ned', 'android', 'win8'}
+        The levelled frame.
+    flat, nose_down : int or None
+        Row of a pose with the robot level, and of one with its nose tilted straight down, which
+        determines the heading; 1-based.
+
+    Raises
+    ------
+    InputError
+        If a row does not exist, `nose_down` is set without `flat`, or the nose is tilted down by
+        less than 10°.
+
+    """
+    if flat is None:
+        if nose_down is not None:
+            raise InputError('there is a row with the nose down but no flat row, expected both',
+                             'set both rows, or only the flat row')
+        return replace(calibration, frame=frame)
+    levelled = level(calibration, _reading_in(poses, flat), frame)
+    return levelled if nose_down is None else set_heading(levelled, _reading_in(poses, nose_down))
+
+
+def _reading_in(poses: Poses, row: int) -> Floats:
+    if not 1 <= row <= len(poses):
+        raise InputError(f'row {row} is not in the table, expected 1 to {len(poses)}',
+                         'correct the row number')
+    return poses.reading[row - 1]
+
+
+def level(calibration: Calibration, reading: Floats, frame: FrameName,
+          context: Context | None = None) -> Calibration:
+    """
+    Return a calibration with the mounting from one flat pose.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration, with any ΔR. The heading of an existing mounting is kept.
+    reading : (3,) array
+        Mean reading of the flat pose, in the unit of the readings.
+    frame : {'ros', 'ned', 'android', 'win8'}
+        The levelled frame.
+    context : mapping of str to array, optional
+        Columns that the effects need, one row.
+
+    Returns
+    -------
+    Calibration
+        The calibration with ΔR of this pose, and a finding if the wiring may be wrong.
+
+    """
+    rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
+    kept = calibration.is_levelled and frame == calibration.frame
+    arbitrary = not kept and heading_is_arbitrary(rotation, frame)
+    if kept:
+        rotation = with_heading_of(calibration.rotation, rotation)
+    others = without(calibration.noted, 'flat_pose', 'heading')
+    levelled = replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
+    return replace(levelled, noted=(
+        *wiring(levelled), *without(others, 'wiring'), *doubts_about_flat(rotation, frame),
+        *((_ARBITRARY_HEADING,) if arbitrary else ())))
+
+
+def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
+                ) -> Calibration:
+    """
+    Return a levelled calibration with the heading from one pose with the nose of the robot down.
+
+    Parameters as in `level`.
+
+    Raises
+    ------
+    InputError
+        If the nose is tilted down by less than 10°.
+
+    """
+    nose_down = _in_sensor_axes(calibration, reading, context)
+    rotation = with_heading(calibration.rotation, nose_down, calibration.frame)
+    return with_mounting(calibration, rotation)
+
+
+def with_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
+    """Return a calibration with another ΔR, whose heading is known."""
+    turned = replace(calibration, model=Model(calibration.model.values, rotation))
+    return replace(turned, noted=(*wiring(turned),
+                                  *without(turned.noted, 'wiring', 'heading')))
+
+
+def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
+    """
+    Return a calibration with a mounting that is known from elsewhere, such as a URDF.
+
+    A calibration that is levelled to within 10° of the given ΔR keeps its tilt, which a flat pose
+    measured, and takes only the heading.
+
+    """
+    if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:
+        rotation = with_heading_of(rotation, calibration.rotation)
+    return with_mounting(calibration, rotation)
+
+
+def _in_sensor_axes(calibration: Calibration, reading: Floats, context: Context | None) -> Floats:
+    """Return the specific force of one reading in the axes of the sensor [g]."""
+    reading_g = calibration.units.to_g(np.asarray(reading, float))[np.newaxis]
+    return sensor_force(calibration.model, reading_g, calibration.held_context(context))[0]
+
+
+def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
+    """Yield a finding if the ΔR of a flat pose indicates a wiring fault."""
+    expected = flat_direction(frame)
+    force = rotation @ expected
+    off = np.degrees(np.arccos(np.clip(force @ expected, -1.0, 1.0)))
+    if off <= _ON_ITS_SIDE:
+        return
+    face = int(np.argmax(np.abs(force)))
+    seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
+    own = f'{"-" if expected[2] < 0.0 else "+"}z'
+    if face == 2:
+        causes = 'it is mounted upside down, or z (or every axis) has the wrong sign'
+        advice = 'if it is not upside down, correct the sign, because a rotation does not'
+    else:
+        causes = f'it is mounted with {seen} up, or {AXES[face]} and z are swapped'
+        advice = 'if it lies flat, correct the wiring or the driver'
+    yield Finding('flat_pose', f'the flat pose reads {force[face]:+.2f} g on {AXES[face]}, where '
+                  f'a sensor that lies flat reads 1 g on {own}: {causes}; one flat pose cannot '
+                  'distinguish them', advice, 'USABLE')

@@ -15,10 +15,8 @@ With n well spread poses, the error of |force| is the noise of a pose times √(
 sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose
 reduces the error by less than `_LEAST_GAIN` and the dilution is below `_GOOD_DILUTION`.
 
-**Refusal.** The refusal of poses that do not determine a model.
-
-The error contains the reason, the undetermined parameters, the poses to add, and the largest of
-the smaller models that the poses determine.
+Poses that do not determine a model are refused. The error contains the reason, the undetermined
+parameters, the poses to add, and the largest of the smaller models that the poses determine.
 
 """
 
@@ -27,12 +25,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 
-from .calibration import Calibration
-from ..effects import MODELS
+from .calibration import Calibration, ORIENTED
 from ..errors import RefusedFitError
 from ..estimate import (
     Combination,
@@ -53,7 +49,7 @@ from ..estimate import (
     WEAK_DILUTION,
 )
 from ..finding import Finding
-from ..geometry import OVER_THE_SPHERE, unit
+from ..geometry import ATTITUDES, OVER_THE_SPHERE, unit
 from ..table import Floats
 from ..text import counted
 from ..units import MG
@@ -109,13 +105,6 @@ def _mean_information(name: str) -> Floats:
     return mean
 
 
-@lru_cache(maxsize=1)
-def _attitudes() -> Floats:
-    """Return the (26, 3) signs of the axes that point up; the faces are first."""
-    signs = np.array([s for s in product((0, 1, -1), repeat=3) if any(s)], float)
-    return signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')]
-
-
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
               noise_g: float | None = None) -> NextPose:
     """
@@ -138,53 +127,43 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
         One of the 6 faces, 12 edges and 8 corners of the sensor that is not taken yet, or none.
 
     """
-    information = information_of(name, directions, relative_weights(noise, len(directions)))
-    error = _error(name, information, len(directions))
-    best = _next(name, directions, information)
-    fits = determines(name, directions, noise)
-    if best is None:
-        words = _enough(len(directions), error, noise_g)
-        return NextPose(None, words, error, len(directions), fits)
-    signs = _attitudes()[best]
-    return NextPose(unit(signs[np.newaxis])[0], f'turn the sensor so that {words_of(signs)} '
-                    f'points up ({_axes(signs)})', error,
-                    _poses_in_all(name, directions, information), fits)
+    count = len(directions)
+    information = information_of(name, directions, relative_weights(noise, count))
+    error, fits = _error(name, information, count), determines(name, directions, noise)
+    up = _best(name, directions, information)
+    if up is None or not _helps(name, up, information, count):
+        return NextPose(None, _enough(count, error, noise_g), error, count, fits)
+    total = count + len(list(_planned(name, directions, information, _SPARE)))
+    return NextPose(up, f'turn the sensor so that {words_of(up)} points up ({_axes(up)})', error,
+                    total, fits)
 
 
-def _next(name: str, directions: Floats, information: Floats) -> int | None:
-    """Return the index of the next orientation, or None if more poses no longer help."""
-    best = _best(name, directions, information)
-    if best is None:
-        return None
-    after = information + _information_at(name, best)
-    now = _error(name, information, len(directions))
-    helps = _error(name, after, len(directions) + 1) <= (1.0 - _LEAST_GAIN) * now
-    return best if helps or _is_poor(name, information) else None
+def _helps(name: str, up: Floats, information: Floats, count: int) -> bool:
+    """Return whether a pose in this direction improves a fit visibly."""
+    now, after = (_error(name, information, count),
+                  _error(name, information + _of_pose(name, up), count + 1))
+    return after <= (1.0 - _LEAST_GAIN) * now or _is_poor(name, information)
 
 
-def _information_at(name: str, index: int) -> Floats:
-    return information_of(name, unit(_attitudes()[index][np.newaxis]), np.ones(1))
+def _of_pose(name: str, up: Floats) -> Floats:
+    """Return the (p, p) information of one pose."""
+    return information_of(name, up[np.newaxis], np.ones(1))
 
 
-def _poses_in_all(name: str, directions: Floats, information: Floats) -> int:
-    """Return the number of poses that determine a model well, if each is the one asked for."""
-    while len(directions) < poses_needed(name) + _SPARE or _is_poor(name, information):
-        best = _best(name, directions, information)
-        if best is None:
-            break
-        directions = np.vstack([directions, unit(_attitudes()[best][np.newaxis])])
-        information = information + _information_at(name, best)
-    return len(directions)
+def _planned(name: str, directions: Floats, information: Floats, spare: int) -> Iterator[Floats]:
+    """Yield the attitudes to add until the poses determine a model well."""
+    while len(directions) < poses_needed(name) + spare or _is_poor(name, information):
+        up = _best(name, directions, information)
+        if up is None:
+            return
+        yield up
+        directions = np.vstack([directions, up])
+        information = information + _of_pose(name, up)
 
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
     """
-    Return the poses to add until they determine a model well.
-
-    Parameters
-    ----------
-    name, directions, noise
-        As in `next_pose`.
+    Return the poses to add until they determine a model well; parameters as in `next_pose`.
 
     Returns
     -------
@@ -192,18 +171,9 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
         Sides, edges and corners to point up in this order, such as ``the left side (+y)``.
 
     """
-    weights = relative_weights(noise, len(directions))
-    named = []
-    while len(directions) < poses_needed(name) or _is_poor(
-            name, information_of(name, directions, weights)):
-        best = _best(name, directions, information_of(name, directions, weights))
-        if best is None:
-            break
-        signs = _attitudes()[best]
-        directions = np.vstack([directions, unit(signs[np.newaxis])])
-        weights = np.append(weights, 1.0)
-        named.append(f'{words_of(signs)} ({_axes(signs)})')
-    return named
+    information = information_of(name, directions, relative_weights(noise, len(directions)))
+    return [f'{words_of(up)} ({_axes(up)})'
+            for up in _planned(name, directions, information, 0)]
 
 
 def _is_poor(name: str, information: Floats) -> bool:
@@ -215,17 +185,17 @@ def _is_poor(name: str, information: Floats) -> bool:
     return bool(np.max(errors) > _GOOD_DILUTION ** 2)
 
 
-def _best(name: str, directions: Floats, information: Floats) -> int | None:
-    """Return the index of the untaken orientation that increases det M most; None if all are."""
-    attitudes = _attitudes()[:6] if MODELS[name].known_orientation else _attitudes()
-    up = unit(attitudes)
+def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
+    """Return the untaken attitude that increases det M most, or None if all are taken."""
+    up = ATTITUDES[:6] if name == ORIENTED else ATTITUDES
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
     if not np.any(free):
         return None
     rows = rows_of(name, up)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
-    return int(np.argmax(np.where(free, np.round(gains, 6), -1.0)))  # the first of equal gains
+    found: Floats = up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
+    return found
 
 
 def _error(name: str, information: Floats, count: int) -> float:
@@ -280,14 +250,9 @@ class Outlook:
 
 def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     """
-    Return what the poses of a calibration determine, and the next pose.
+    Return what the poses of a calibration determine, and the next pose for the model asked for.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        A calibration of any kind; effects are taken in the middle of their range.
-    asked : {'auto', '4', '7', '9', '10', '12'}
-        The requested model.
+    Effects are taken in the middle of their range.
 
     """
     poses = calibration.used_poses
@@ -297,8 +262,8 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     noise = pose_noise(poses.noise, directions)
     uncertainty = _uncertainty(calibration) if calibration.model.effects else np.nan
     planned = asked
-    if asked == 'auto' or MODELS[asked].known_orientation:  # wrong ones: model 12 became 10
-        planned = calibration.form.largest
+    if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
+        planned = ORIENTED if calibration.is_oriented else NORM_MODELS[-1]
     known, noise_g = np.isfinite(uncertainty), None
     if known and determines(calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
@@ -314,7 +279,7 @@ def _uncertainty(calibration: Calibration) -> float:
     if any(key not in known for key in calibration.model.needs):
         return np.nan
     covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
-    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.is_oriented
               else np.einsum('ni,nij,nj->n', up, covariance, up))
     return float(np.sqrt(np.mean(errors)))
 
@@ -324,7 +289,8 @@ CONE = 30.0
 Largest angle between poses and their mean direction of a robot that cannot be turned over [°].
 
 Robots with wheels or tracks tilt by 10° to 25°. No number of poses within 30° determines model 10:
-the dilution is above 300 for 60 poses. Poses further apart come from a sensor that can be turned.
+the dilution is above 300 for 60 poses. Poses further apart, such as those in a ring, in a plane or
+at right angles, come from a sensor that can be turned.
 
 """
 
@@ -351,12 +317,7 @@ def cone_of(directions: Floats) -> Cone:
 
 
 def lies_in_cone(directions: Floats) -> bool:
-    """
-    Return whether (n, 3) unit vectors are those of a robot that cannot be turned over.
-
-    Poses in a ring, in a plane or at right angles are further apart than `CONE`.
-
-    """
+    """Return whether (n, 3) unit vectors are those of a robot that cannot be turned over."""
     return bool(len(directions) and cone_of(directions).degrees <= CONE)
 
 
@@ -401,17 +362,7 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
 
 
 def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iterator[Finding]:
-    """
-    Yield a finding if the poses do not determine the largest model.
-
-    Parameters
-    ----------
-    chosen : str
-        The largest model that was considered.
-    directions, noise
-        As in `refuse_if_unfit`.
-
-    """
+    """Yield a finding if the poses determine only `chosen`, and not the largest model."""
     largest = NORM_MODELS[-1]
     if chosen in NORM_MODELS[:-1]:
         open_ = identifiability(largest, directions, noise).undetermined
@@ -426,7 +377,7 @@ def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) ->
     """Return a text that offers a smaller model, with the effects that it omits."""
     offer = (f', or use model {smaller}, which these poses determine: it omits '
              f'{joined(left_out(smaller, name))}')
-    if MODELS[name].known_orientation:
+    if name == ORIENTED:
         return offer
     return f'{offer}, {_commonly(smaller, name, directions, noise)}'
 

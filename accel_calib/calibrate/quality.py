@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Residuals of a calibration, on the poses it was fitted to and on other poses.
+Figures and findings of a fit, its record, and the residuals of a calibration on other poses.
 
 The error of a pose is |force| - 1 g. For model 12 and poses of known orientation it is the length
 of the vector error. The residual of a calibration is the RMS of the errors over the poses.
-
-**Context from the order of the poses.** The previous pose of each pose, for `hysteresis`, and the
-rate of the temperature, for `temperature_rate` and lags.
 
 """
 
@@ -20,63 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, Quality
-from ..effects import correct, Model, rate_at, sensor_force
+from .calibration import Calibration, check_sensor, Quality, Rejected
+from .context import with_history
+from ..effects import correct, Model, sensor_force
 from ..estimate import coverage, Fit, judge, noise_of, Rival, unseen_mistakes, WEAK_DILUTION
 from ..finding import Finding
-from ..geometry import unit
 from ..table import Floats, Poses
 from ..text import listed
 from ..units import MG, Units
-
-_MOVED = np.radians(3.0)
-"""Smallest change of direction of a move [rad]; less may be noise or settling."""
-
-
-def with_history(poses_g: Poses, model: Model) -> Poses:
-    """
-    Return poses with the context that comes from the poses before and after.
-
-    That is the unit vector towards the previous pose, in order of time, or of rows, and the rate
-    of the temperature. If successive poses have the same orientation, the last motion counts for
-    all of them.
-
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g. Columns that the table has already are kept.
-    model : Model
-        Model whose gain and offset are used to compute the directions.
-
-    Returns
-    -------
-    Poses
-        The poses with the column ``previous``, which is zero before the first motion, and, if time
-        and temperature are known, ``temperature_rate``.
-
-    """
-    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
-        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
-    if 'previous' in poses_g:
-        return poses_g
-    mat_w, vec_v = model.linear_part
-    return with_previous(poses_g, unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T))
-
-
-def with_previous(poses_g: Poses, force: Floats) -> Poses:
-    """Return poses with the unit vector towards the previous pose, given (n, 3) unit forces."""
-    order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
-             else np.arange(len(poses_g)))
-    previous = np.zeros_like(force)
-    towards, resting = np.zeros(3), order[0] if len(order) else 0
-    for here in order:
-        step = force[resting] - force[here]
-        length = float(np.linalg.norm(step))
-        if length > _MOVED:
-            towards, resting = step / length, here
-        previous[here] = towards
-    return poses_g.with_columns(previous=previous)
-
 
 _LEAST_OWN = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
@@ -115,19 +63,7 @@ def in_g(poses: Poses, units: Units) -> Poses:
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
-    Compute the residuals of a calibration on poses.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    poses : Poses
-        The poses, in the unit of the calibration.
-
-    Returns
-    -------
-    Verification
-        Residuals without and with the calibration, and noise floor.
+    Compute the residuals of a calibration on poses, in the unit of the calibration.
 
     Raises
     ------
@@ -138,7 +74,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     model, units = calibration.model, calibration.units
     check_sensor(calibration, poses.sensor)
     poses_g = calibration.held(with_history(in_g(poses, units), model))
-    vectors = calibration.form.known_orientation and 'reference' in poses
+    vectors = calibration.is_oriented and 'reference' in poses
     before = errors_before(poses_g, units, vectors=vectors)
     after = errors_after(model, poses_g, vectors=vectors)
     floor = None
@@ -167,7 +103,7 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     units : Units
         Unit of the sensor's readings.
     directions : (n, 3) array
-        Direction of up in each pose, unit vectors.
+        Direction of up in each pose of the fit, unit vectors.
 
     """
     vectors = 'reference' in fit.poses_g
@@ -179,6 +115,42 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
                    noise_floor_mg(fit) if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
+
+
+def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: str, method: str, *,
+              covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
+              reason: str = '', noted: tuple[Finding, ...] = (), sensor: str = '', date: str = ''
+              ) -> Calibration:
+    """
+    Return a fit as a calibration with ΔR = I, or with the ΔR of its model.
+
+    The gate has not checked it yet: `accel_calib.calibrate.fit.finished` does. A fit is also
+    compared with another fit to fewer poses, or of a larger model, which need not be useful.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit, to the poses that are not rejected.
+    poses : Poses
+        All poses, in the unit of the readings.
+    units : Units
+        Unit of the readings.
+    directions : (n, 3) array
+        Direction of up in each pose of the fit, unit vectors.
+    name, method : str
+        Name of the model and method.
+    covariance : (p, p) array, optional
+        Covariance of the values; by default that of the fit.
+    rejected : tuple of Rejected
+        Rows that the fit does not use, in any order.
+    reason, noted, sensor, date
+        As in `Calibration`.
+
+    """
+    return Calibration(
+        name, method, fit.model, units, sensor, 'ros', date,
+        fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
+        poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
 
 
 def noise_floor_mg(fit: Fit) -> float:

@@ -18,14 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, Rejected
+from .calibration import Calibration, Method, Rejected
 from .pose_planning import refuse_if_unfit, unseen
-from .quality import fit_findings, in_g, quality_of, rival_findings
+from .quality import fit_findings, in_g, record_of, rival_findings
 from ..effects import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -58,18 +57,6 @@ from ..geometry import unit
 from ..table import Floats, Poses
 from ..text import listed
 from ..units import MG, Units
-
-Method = Literal['ml', 'algebraic']
-METHODS = get_args(Method)
-
-PRIOR = 'prior'
-"""Method of a calibration whose values are partly those of a common sensor; see `.partial`."""
-
-FLEET = 'fleet'
-"""Method of a calibration whose values are partly those of a fleet; see `.fleet_prior`."""
-
-STORED_METHODS = (*METHODS, PRIOR, FLEET)
-"""Methods of stored calibrations; the user selects one of `METHODS`."""
 
 _LEVEL = 0.03
 
@@ -150,11 +137,10 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calib
 
 def calibration_of(found: NormFit, poses: Poses, units: Units, method: Method) -> Calibration:
     """Return a fit to these poses as a Calibration."""
-    rejected = _rejections(in_g(poses, units), found)
-    quality = quality_of(found.fit, units, found.directions)
-    return Calibration(found.name, method, found.fit.model, units, '', 'ros', '',
-                       found.covariance, quality, poses, rejected, found.reason,
-                       found.findings)
+    out = rejected_by(found.fit.model, in_g(poses, units).take(found.left_out))
+    return record_of(found.fit, poses, units, found.directions, found.name, method,
+                     covariance=found.covariance, rejected=out, reason=found.reason,
+                     noted=found.findings)
 
 
 def own_scale(poses: Poses, units: Units) -> Units:
@@ -354,11 +340,6 @@ def _by_chance(small: Fit, large: Fit) -> float:
     added = small.dof - large.dof
     gained = max(small.chi2 - large.chi2, 0.0) / added
     return float(fdtrc(added, large.variance_dof, gained / max(large.variance, 1e-300)))
-
-
-def _rejections(poses_g: Poses, found: NormFit) -> tuple[Rejected, ...]:
-    """Return the outliers, with their distance from 1 g in the fit of the other poses."""
-    return rejected_by(found.fit.model, poses_g.take(found.left_out))
 
 
 def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:

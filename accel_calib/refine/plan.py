@@ -33,12 +33,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .records import attitude_words, attitudes, ENOUGH, plan_lines, PlannedPose, PosePlan, VARIED
+from .records import attitude_words, ENOUGH, plan_lines, PlannedPose, PosePlan, VARIED
 from .rivals import LEAST, probabilities
 from .state import fitted_state
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
-from ..geometry import spread_directions
+from ..geometry import ATTITUDES, spread_directions
 from ..table import Floats, Poses
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ class _Candidates:
     @classmethod
     def of(cls, fit: Fit, varied: tuple[str, ...]) -> _Candidates:
         """Return the candidates near a model; those that are easier to set come first."""
-        up = np.vstack([attitudes(), spread_directions(_DIRECTIONS)])
+        up = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
         levels = [_levels(key, fit.poses_g) for key in varied]
         shown = [dict(zip(varied, each, strict=True)) for each in product(*levels)]
         force = np.tile(up, (len(shown), 1))

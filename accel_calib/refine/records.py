@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from itertools import product
 import math
 from typing import Literal
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..calibrate import Calibration, words_of
 from ..effects import EMPIRICAL
-from ..geometry import unit
+from ..geometry import ATTITUDES, unit
 from ..table import Floats, Poses
 from ..text import table
 
@@ -118,12 +117,6 @@ def percent(probability: float) -> str:
     return '> 99 %' if 0.995 <= probability < 1.0 else f'{100.0 * probability:.0f} %'
 
 
-def attitudes() -> Floats:
-    """Return the faces, edges and corners as (26, 3) unit vectors, the faces first."""
-    signs = np.array([s for s in product((0, 1, -1), repeat=3) if any(s)], float)
-    return unit(signs[np.argsort(np.sum(np.abs(signs), axis=1), kind='stable')])
-
-
 def plan_lines(weights: Mapping[str, float], poses: Sequence[PlannedPose], expected: float
                ) -> Iterator[str]:
     """
@@ -188,7 +181,7 @@ def _duration(seconds: float) -> str:
 
 def attitude_words(up: Floats) -> str:
     """Return a direction that points up in words: a face, edge or corner, or a tilted face."""
-    known = attitudes()
+    known = ATTITUDES
     near = int(np.argmax(known @ up))
     if known[near] @ up >= _NEAR:
         return f'{words_of(np.sign(known[near]))} up ({_axes(known[near])})'

@@ -38,6 +38,7 @@ from ..calibrate import (
     in_g,
     OF_A_FIT,
     quality_of,
+    record_of,
     refuse_if_unfit,
     Rejected,
     sound_rows,
@@ -79,8 +80,7 @@ def ideal(poses: Poses, units: Units) -> Calibration:
         values = {'offset': vec_v / units.per_g}
     poses_g = in_g(poses, units)
     fit = judge(Model(values), poses_g)
-    return Calibration('ideal', 'ml', fit.model, units, '', 'ros', '', fit.covariance,
-                       quality_of(fit, units, unit(poses_g.reading)), poses, (), 'ideal', ())
+    return record_of(fit, poses, units, unit(poses_g.reading), 'ideal', 'ml', reason='ideal')
 
 
 _LEAST_POSES = 4

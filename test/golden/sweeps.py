@@ -435,9 +435,9 @@ def priors() -> Any:
         made = ac.simulate(SENSOR, directions=unit(spread_directions(12) * 0.3 + [0, 0, 1]),
                            units='g', seed=1)
         size = 1.0 + 0.02 * np.isin(np.arange(12), rows)[:, np.newaxis]
-        found, kept, evidence = without_knocked(made.with_columns(reading=made.reading * size),
-                                                np.arange(12), prior)
-        return [kept, evidence, found.factor, found.model.vector]
+        found = without_knocked(made.with_columns(reading=made.reading * size), np.arange(12),
+                                prior, 0.1, 0.25)
+        return [found.kept, found.log_evidence, found.fit.factor, found.fit.model.vector]
 
     def moved(size: float) -> Any:
         values, covariance, words = posterior(prior.mean + size * 0.01 * np.cos(K[:9]), np.diag(
