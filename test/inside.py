@@ -45,9 +45,7 @@ from accel_calib.cli.terminal import in_one_line, shown
 from accel_calib.cli.watch import changes, screen, state
 from accel_calib.compare import NAMES as PARAMETER_NAMES
 from accel_calib.compare import rotation_free
-from accel_calib.compare.drift import change, is_over
-from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
-from accel_calib.compare.parameters import (
+from accel_calib.compare.agreement import (
     on_one_scale,
     outlier,
     p_values,
@@ -55,6 +53,8 @@ from accel_calib.compare.parameters import (
     Scatter,
     scatter_of,
 )
+from accel_calib.compare.drift import change, is_over
+from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
     acting_temperature,

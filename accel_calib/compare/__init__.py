@@ -4,18 +4,17 @@
 """
 Whether a sensor has changed: comparison of repeated calibrations, and of rests with a calibration.
 
-`comparison` compares calibrations, given their uncertainties; it first checks that they can be
-compared. `parameters` computes parameters that do not depend on the axes, converts their
-covariances to one scale, and contains the test. A run is one of the calibrations. `history` sorts
-calibrations by date and compares each with the one before. `drift` compares every rest with the
-calibration in use.
+`comparison` compares calibrations, given their uncertainties, also in order of their dates.
+`agreement` prepares them: it checks that they can be compared, computes parameters that do not
+depend on the axes, converts their covariances to one scale, and contains the test. A run is one of
+the calibrations. `drift` compares every rest with the calibration in use.
 
 """
 
-from .comparison import compare, Comparison, Parameter
+from .agreement import LEVEL, NAMES, rotation_free
+from .comparison import compare, Comparison, DatedChange, History, history_of, Moment, Parameter
 from .drift import compared, Drift, monitor, rests_of, status
-from .history import Change, History, history_of, Moment
-from .parameters import LEVEL, NAMES, rotation_free
 
-__all__ = ['LEVEL', 'NAMES', 'Change', 'Comparison', 'Drift', 'History', 'Moment', 'Parameter',
-           'compare', 'compared', 'history_of', 'monitor', 'rests_of', 'rotation_free', 'status']
+__all__ = ['LEVEL', 'NAMES', 'Comparison', 'DatedChange', 'Drift', 'History', 'Moment',
+           'Parameter', 'compare', 'compared', 'history_of', 'monitor', 'rests_of',
+           'rotation_free', 'status']

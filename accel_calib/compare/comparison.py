@@ -2,23 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Comparison of calibrations of one sensor, to test whether they agree within uncertainties.
+Comparison of calibrations of one sensor, also in order of their dates.
 
-The test is applied to parameters that do not depend on the axes
-(`.parameters`), with covariances on a common scale.
+The test of `.agreement` is applied to parameters that do not depend on the axes, with covariances
+on a common scale, and in one unit and one context for all calibrations. So a change of the
+temperature between two dates does not appear as a change of the sensor, if the calibrations
+contain the effect of the temperature.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from itertools import combinations, pairwise
 
 import numpy as np
 
-from .comparable import Comparable, comparable
-from .parameters import (
+from .agreement import (
+    Comparable,
+    comparable,
     LEVEL,
     on_one_scale,
     outlier,
@@ -30,6 +34,7 @@ from .parameters import (
 )
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
+from ..errors import InputError
 from ..geometry import OVER_THE_SPHERE
 from ..table import Floats
 from ..text import counted, listed
@@ -62,30 +67,16 @@ def _own_context(run: Calibration) -> Context:
 
 def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,
               noisier: Sequence[int]) -> tuple[str, ...]:
-    """
-    Return notes that limit the meaning of a comparison.
-
-    Parameters
-    ----------
-    given : sequence of Comparable
-        The runs.
-    names : tuple of str
-        Names of the t common parameters.
-    deviation : (n, t) array
-        Standard deviations of the parameters; 0 if the model of a run omits the parameter.
-    noisier : sequence of int
-        Indices of runs whose poses repeat worse than those of the others.
-
-    """
+    """Return notes that limit the meaning; the (n, t) deviation is 0 where a model omits one."""
     calibrations = [run.calibration for run in given]
-    smaller = [f'run {k} (model {run.calibration.name}) omits parameters of model '
-               f'{run.sure.name}: they are taken as zero, with the uncertainty that its poses '
-               'allow'
-               for k, run in enumerate(given, 1) if run.calibration is not run.sure]
+    smaller = (
+        f'run {k} (model {run.calibration.name}) omits parameters of model {run.sure.name}: they '
+        'are taken as zero, with the uncertainty that its poses allow'
+        for k, run in enumerate(given, 1) if run.calibration is not run.sure)
+    worse = (f'the poses of run {k + 1} repeat significantly worse than those of the others: the '
+             'run has less weight' for k in noisier)
     return (*_shared(calibrations), *smaller, *_left_out(names, deviation),
-            *_temperatures(calibrations),
-            *(f'the poses of run {k + 1} repeat significantly worse than those of the others: the '
-              'run has less weight' for k in noisier))
+            *_temperatures(calibrations), *worse)
 
 
 def _shared(calibrations: Sequence[Calibration]) -> list[str]:
@@ -216,11 +207,10 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class _Run:
-    """A calibration, its fit with the largest model, its context and rotation-free parameters."""
+class _Prepared:
+    """A run with its context and rotation-free parameters."""
 
-    calibration: Calibration
-    sure: Calibration
+    given: Comparable
     context: Context
     free: RotationFree
     slope: Floats
@@ -229,8 +219,8 @@ class _Run:
     def length(self, reading: Floats) -> tuple[Floats, Floats]:
         """Return the corrected |a| of (n, 3) readings and its variance, in the common unit."""
         here = {key: np.repeat(column, len(reading), 0) for key, column in self.context.items()}
-        u = sensor_force(self.calibration.model, reading / self.free.reading_scale, here)
-        model = self.sure.model
+        u = sensor_force(self.given.calibration.model, reading / self.free.reading_scale, here)
+        model = self.given.sure.model
         rows = model.basis(u, here).along(length_rows(model, u, here))
         variance = np.maximum(np.einsum('np,pq,nq->n', rows, self.covariance, rows), 0.0)
         scale = self.free.force_scale
@@ -245,17 +235,7 @@ class _Run:
 
 def compare(calibrations: Sequence[Calibration]) -> Comparison:
     """
-    Test whether calibrations of one sensor agree within their uncertainties.
-
-    Parameters
-    ----------
-    calibrations : sequence of Calibration
-        Two or more calibrations with any models.
-
-    Returns
-    -------
-    Comparison
-        The result of the test, with the differences.
+    Test whether two or more calibrations of one sensor agree within their uncertainties.
 
     Raises
     ------
@@ -264,31 +244,18 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
         not, or one has no uncertainty.
 
     """
-    return compared(comparable(calibrations))
+    return compare_runs(comparable(calibrations))
 
 
-def compared(given: Sequence[Comparable]) -> Comparison:
-    """
-    Test whether prepared calibrations agree within their uncertainties.
-
-    Parameters
-    ----------
-    given : sequence of Comparable
-        Two or more of those that `comparable` returned.
-
-    Returns
-    -------
-    Comparison
-        The result of the test, with the differences.
-
-    """
+def compare_runs(given: Sequence[Comparable]) -> Comparison:
+    """Test whether calibrations that were prepared together agree, two or more of them."""
     scaled = on_one_scale([run.scatter for run in given])
     prepared = _prepared(given, scaled.covariances)
     names = tuple(dict.fromkeys(name for run in prepared for name in run.free.names))
     values = np.array([_into(names, run.free, run.free.values) for run in prepared])
     runs = Runs(values, np.array([run.spread(names, run.covariance) for run in prepared]),
                 scaled.dof)
-    stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.sure.covariance))
+    stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.given.sure.covariance))
                                  for run in prepared], 0.0))
     (chi2, rank), p_value = runs.squared, runs.p_value
     return Comparison(
@@ -298,7 +265,7 @@ def compared(given: Sequence[Comparable]) -> Comparison:
         _tilt_deg(prepared), _notes_of(given, names, stated, scaled.noisier))
 
 
-def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Run]:
+def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Prepared]:
     """Return each calibration with its context and parameters in the common unit."""
     calibrations = [run.calibration for run in given]
     per_g = float(np.mean([run.units.per_g for run in calibrations]))
@@ -306,9 +273,8 @@ def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> lis
     for run, context, covariance in zip(given, _contexts_of(calibrations), covariances,
                                         strict=True):
         free = rotation_free(run.calibration, context, per_g)
-        slope = free.slope if run.sure is run.calibration else rotation_free(
-            run.sure, context, per_g).slope
-        found.append(_Run(run.calibration, run.sure, context, free, slope, covariance))
+        slope = rotation_free(run.sure, context, per_g).slope
+        found.append(_Prepared(run, context, free, slope, covariance))
     return found
 
 
@@ -324,7 +290,7 @@ def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
-def _each(prepared: Sequence[_Run], chances: Floats) -> tuple[Run, ...]:
+def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
     """Compare the corrected |a| of each run with that of the others, over all directions."""
     reading = (np.mean([run.free.vec_v for run in prepared], axis=0)
                + OVER_THE_SPHERE @ np.mean([run.free.mat_s for run in prepared], axis=0))
@@ -347,11 +313,134 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
 
 
-def _tilt_deg(prepared: Sequence[_Run]) -> float | None:
+def _tilt_deg(prepared: Sequence[_Prepared]) -> float | None:
     """Return the largest angle between the directions of up of levelled runs [°]."""
-    up = [run.free.axes[:, 2] for run in prepared
-          if not np.array_equal(run.calibration.model.rotation, np.eye(3))]
+    up = [run.free.axes[:, 2] for run in prepared if run.given.calibration.is_levelled]
     if len(up) < 2:
         return None
     apart = np.linalg.norm(np.array(up)[:, np.newaxis] - np.array(up), axis=2)
     return float(np.degrees(2.0 * np.arcsin(np.max(apart) / 2.0)))
+
+
+_FIRST = datetime.min.replace(tzinfo=timezone.utc)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """
+    One calibration of a history, with its index among those given, 0-based.
+
+    The date is in UTC, the temperature [°C] is the median over the poses used, and both are None
+    if they are not known. The residual is that over the poses used [mg].
+
+    """
+
+    index: int
+    when: datetime | None
+    model: str
+    temperature: float | None
+    residual_mg: float
+
+
+@dataclass(frozen=True)
+class DatedChange:
+    """
+    The comparison of two successive calibrations.
+
+    The parameter that changed most, relative to its standard deviation, is named, with its change
+    and the stated standard deviation of the change [g].
+
+    """
+
+    comparison: Comparison
+    parameter: str
+    change: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class History:
+    """
+    Calibrations of one sensor over time.
+
+    The n calibrations, and the values of each parameter, are in order of date. There are n - 1
+    changes from each to the next, and `whole` compares all. Notes limit the meaning of the
+    history.
+
+    """
+
+    moments: tuple[Moment, ...]
+    parameters: tuple[Parameter, ...]
+    changes: tuple[DatedChange, ...]
+    whole: Comparison
+    notes: tuple[str, ...]
+    runs: tuple[Comparable, ...] = field(repr=False)
+
+    def between(self, first: int, second: int) -> Comparison:
+        """Return the comparison of two of the calibrations, by their number in the order."""
+        return compare_runs([self.runs[first], self.runs[second]])
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return the day of each calibration, with the time where a day has several."""
+        days = [moment.when and moment.when.strftime('%Y-%m-%d') for moment in self.moments]
+        short = len(set(days)) == len(days)
+        return tuple('no date' if moment.when is None else
+                     moment.when.strftime('%Y-%m-%d' if short else '%Y-%m-%d %H:%M')
+                     for moment in self.moments)
+
+
+def history_of(calibrations: Sequence[Calibration]) -> History:
+    """
+    Return calibrations of one sensor in order of date, with the change at each step.
+
+    If one has no date, the order is kept.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two, they cannot be compared, or a date is not valid.
+
+    """
+    runs = comparable(calibrations)
+    moments = [_moment(k, run) for k, run in enumerate(calibrations)]
+    undated = [moment.index + 1 for moment in moments if moment.when is None]
+    if not undated:
+        moments.sort(key=lambda moment: (moment.when or _FIRST, moment.index))
+    ordered = tuple(runs[moment.index] for moment in moments)
+    whole = compare_runs(ordered)
+    notes = [f'calibration {number} has no date: the order is that of the input'
+             for number in undated]
+    return History(tuple(moments), whole.parameters,
+                   tuple(_change_in(compare_runs(pair)) for pair in pairwise(ordered)),
+                   whole, (*notes, *whole.notes), ordered)
+
+
+def _moment(index: int, calibration: Calibration) -> Moment:
+    poses = calibration.used_poses
+    warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
+    return Moment(index, _when(index, calibration.date), calibration.name, warm,
+                  calibration.quality.rms_after_mg)
+
+
+def _when(index: int, date: str) -> datetime | None:
+    """Return a date in UTC; a date without a time zone is taken as UTC."""
+    if not date:
+        return None
+    try:
+        when = datetime.fromisoformat(date.replace('Z', '+00:00'))
+    except ValueError:
+        raise InputError(f'the date of calibration {index + 1} is {date!r}, expected a date such '
+                         'as 2026-11-22T09:30:00+00:00', 'correct date: in the file') from None
+    return when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
+
+
+def _change_in(comparison: Comparison) -> DatedChange:
+    """Return the change from the first to the second of two calibrations."""
+    changes = np.array([each.values[1] - each.values[0] for each in comparison.parameters])
+    deviations = np.array([np.hypot(*each.stated_sd) for each in comparison.parameters])
+    known = deviations > 0.0
+    sizes = np.where(known, np.abs(changes) / np.where(known, deviations, 1.0), 0.0)
+    most = int(np.argmax(sizes))
+    return DatedChange(comparison, comparison.parameters[most].name, float(changes[most]),
+                       float(deviations[most]))

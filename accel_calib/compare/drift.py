@@ -61,7 +61,7 @@ KINDS: dict[str, Callable[[Floats], Floats]] = {
 
 
 @dataclass(frozen=True)
-class Change:
+class LastingChange:
     """
     A lasting change.
 
@@ -90,9 +90,9 @@ class Change:
     error: float
 
 
-def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
+def change(error: Floats, covariance: Floats, up: Floats) -> LastingChange | None:
     """
-    Return a lasting change, or None.
+    Return a lasting change, or None if the stated uncertainty or knocks explain the errors.
 
     Parameters
     ----------
@@ -102,11 +102,6 @@ def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
         Covariance of these errors without a change [g²].
     up : (n, 3) array
         Direction of up in each rest, unit vectors in the sensor axes.
-
-    Returns
-    -------
-    Change or None
-        None if the stated uncertainty or knocks explain the errors.
 
     """
     most = 0.5 * float(error @ np.linalg.solve(covariance, error))
@@ -124,7 +119,7 @@ def change(error: Floats, covariance: Floats, up: Floats) -> Change | None:
     return _described(kind, rests, bool(np.ptp(each) > np.log(_CLEAR)), error, covariance, up)
 
 
-def is_over(known: Change, error: Floats, covariance: Floats, up: Floats) -> bool:
+def is_over(known: LastingChange, error: Floats, covariance: Floats, up: Floats) -> bool:
     """Return whether this change is clearly absent now; parameters as in `change`."""
     slope = KINDS[known.kind](up)
     stays = _likelihood(error - slope @ known.shift,
@@ -162,7 +157,7 @@ def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
 
 
 def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Floats,
-               up: Floats) -> Change:
+               up: Floats) -> LastingChange:
     """Return the estimate of a change, without the rests that were most likely knocked."""
     slope = _derivative(kind, rests, up)
     prior = max(_SIZES) ** 2
@@ -173,8 +168,8 @@ def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Fl
     shift = found @ weighted @ error
     moved = slope[len(up) - rests:] @ shift
     sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
-    return Change(rests, kind, clear, shift, found,
-                  sign * float(np.sqrt(np.mean(moved ** 2))))
+    return LastingChange(rests, kind, clear, shift, found,
+                         sign * float(np.sqrt(np.mean(moved ** 2))))
 
 
 _LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
@@ -184,7 +179,7 @@ _WARMER = 2.0         # temperatures outside of the range by more cause an advic
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestError:
     """
     One rest of the sensor.
 
@@ -223,13 +218,13 @@ class Drift:
         Variance of the poses of the calibration beyond the noise of their samples [g²].
     temperatures : tuple of float
         Lowest and highest temperature of these poses [°C]; empty if not known.
-    rests : tuple of Rest
+    rests : tuple of RestError
         The last rests.
     count : int
         Number of rests so far.
     scatter : float
         Factor on the stated scatter of the rests.
-    change : Change or None
+    change : LastingChange or None
         The lasting change; None if the sensor is unchanged.
     since : int
         Number of the first rest with the change, 1-based; 0 without a change.
@@ -239,10 +234,10 @@ class Drift:
     covariance: Floats
     repeats: float
     temperatures: tuple[float, ...]
-    rests: tuple[Rest, ...] = ()
+    rests: tuple[RestError, ...] = ()
     count: int = 0
     scatter: float = 1.0
-    change: Change | None = None
+    change: LastingChange | None = None
     since: int = 0
 
     @property
@@ -267,20 +262,8 @@ class Drift:
 
 
 def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
-             ) -> list[Rest]:
-    """
-    Return rests with their errors from 1 g.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration in use.
-    reading, noise : (n, 3) array
-        Mean readings and noise of these means, in the unit of the readings.
-    context : mapping of str to array
-        Columns that the effects need, n rows.
-
-    """
+             ) -> list[RestError]:
+    """Return rests from (n, 3) mean readings and the noise of these means, in their unit."""
     model, units = calibration.model, calibration.units
     u = sensor_force(model, units.to_g(reading), context)
     length = np.linalg.norm(u, axis=1)
@@ -288,8 +271,8 @@ def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: 
     variance = np.sum((rows * units.to_g(noise)) ** 2, axis=1)
     slope = -model.basis(u, context).along(rows)
     temperature = np.asarray(context.get('temperature', np.full(len(u), np.nan)), float)
-    return [Rest(float(length[k]) - 1.0, float(variance[k]) + _LEAST_NOISE ** 2, slope[k],
-                 u[k] / length[k], float(temperature[k])) for k in range(len(u))]
+    return [RestError(float(length[k]) - 1.0, float(variance[k]) + _LEAST_NOISE ** 2, slope[k],
+                      u[k] / length[k], float(temperature[k])) for k in range(len(u))]
 
 
 def monitor(calibration: Calibration) -> Drift:
@@ -303,12 +286,7 @@ def monitor(calibration: Calibration) -> Drift:
 
 
 def _repeats(calibration: Calibration) -> float:
-    """
-    Return the variance of pose means beyond the noise of their samples [g²].
-
-    It is infinite for a mounting alone, whose offset and gain are not calibrated.
-
-    """
+    """Return the variance of pose means beyond their noise [g²]; infinite for a mounting."""
     if not calibration.model.effects:
         return np.inf
     quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
@@ -317,20 +295,8 @@ def _repeats(calibration: Calibration) -> float:
     return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
 
 
-def compared(before: Drift, rest: Rest, least: float) -> Drift:
-    """
-    Return the state of the monitor after one more rest.
-
-    Parameters
-    ----------
-    before : Drift
-        The previous state.
-    rest : Rest
-        The next rest.
-    least : float
-        Smallest change to report [g].
-
-    """
+def compared(before: Drift, rest: RestError, least: float) -> Drift:
+    """Return the state of the monitor after one more rest; `least` is the least change [g]."""
     rests = (*before.rests, rest)
     scatter = _scatter(before, rests[:2]) if len(rests) > MEMORY else before.scatter
     after = replace(before, rests=rests[-MEMORY:], count=before.count + 1, scatter=scatter)
@@ -348,7 +314,7 @@ def compared(before: Drift, rest: Rest, least: float) -> Drift:
     return after
 
 
-def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
+def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
     noise = np.array([rest.variance + state.repeats for rest in rests])
@@ -356,7 +322,7 @@ def _covariance(state: Drift, rests: tuple[Rest, ...]) -> Floats:
     return covariance
 
 
-def _scatter(state: Drift, rests: tuple[Rest, ...]) -> float:
+def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:
     """Return the updated scatter, from two rests that are older than a possible change."""
     covariance = _covariance(state, rests)
     stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
@@ -380,7 +346,7 @@ def status(state: Drift) -> str:
             f'{_kind(found)}: {_advice(state)}')
 
 
-def _kind(found: Change) -> str:
+def _kind(found: LastingChange) -> str:
     """Return a text about what changed, if the orientations of the rests show it."""
     if not found.clear:
         return ''

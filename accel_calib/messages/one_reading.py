@@ -333,7 +333,7 @@ def _product(one: Sequence[float], other: Sequence[float]) -> Matrix:
 
 
 def _inverse(matrix: Sequence[float]) -> Matrix:
-    """Return the inverse of a gain. `calibrate.gate` has checked that it is not singular."""
+    """Return the inverse of a gain. `calibrate.gated` has checked that it is not singular."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     size = a * p + b * q + c * r

@@ -6,7 +6,7 @@ The refinement of few poses with the typical values of a fleet.
 
 The search for effects is that without a fleet, because a fleet says nothing about effects beyond
 offset, gain and cross-axis. It needs more poses than model 10 has values. If it names effects, the
-fitted values are combined with the fleet (`accel_calib.calibrate.fleet_prior`): offset, gain and
+fitted values are combined with the fleet (`accel_calib.calibrate.prior`): offset, gain and
 cross-axis move towards the fleet, and the effects with them as far as the poses cannot distinguish
 them.
 

@@ -2,23 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The parameters of a calibration that do not depend on its axes, and their uncertainty.
+Calibrations prepared for comparisons, and the test whether they agree.
 
-|force| depends on W only through W Wᵀ: a rotation of the axes of the force, W -> W Q, does not
-change it. Calibrations with different axes (model 9 in the sensing axes, 10 symmetric, 12 and
-levelled ones rotated) are therefore compared in V and in S = (W Wᵀ)^(1/2), the symmetric factor of
-the polar decomposition W = S Q. The derivative of S solves S dS + dS S = dW Wᵀ + W dWᵀ.
+**Parameters.** |force| depends on W only through W Wᵀ: a rotation of the axes of the force,
+W -> W Q, does not change it. Calibrations with different axes (model 9 in the sensing axes, 10
+symmetric, 12 and levelled ones rotated) are therefore compared in V and in S = (W Wᵀ)^(1/2), the
+symmetric factor of the polar decomposition W = S Q. The derivative of S solves
+S dS + dS S = dW Wᵀ + W dWᵀ. Effects that depend on the context are evaluated at one context, as
+parts of V and W. Effects with bending terms add their own parameters.
 
-Effects that depend on the context are evaluated at one context, as parts of V and W. Effects with
-bending terms add their own parameters.
-
-**Common scale.** The uncertainty of calibrations, estimated together with others of the same
-sensor.
-
-A fit with few degrees of freedom estimates its noise badly. With three, the stated variance is
-often wrong by a factor of three, and a test based on it would raise a false alarm in a third of
-all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not depend on the noise. The
-scale is therefore estimated from all runs together,
+**Common scale.** A fit with few degrees of freedom estimates its noise badly. With three, the
+stated variance is often wrong by a factor of three, and a test based on it would raise a false
+alarm in a third of all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not depend
+on the noise. The scale is therefore estimated from all runs together,
 
     s² = (b + Σ chi²) / (b + Σ dof)
 
@@ -26,10 +22,12 @@ where the measured noise of the runs counts as b degrees of freedom (for each ru
 `accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
 repeat significantly worse than those of the others keeps its own scale.
 
-**Agreement.** Test whether the parameters of several runs agree within their covariances.
+A smaller model assumes that the omitted effects are exactly zero. However, `auto` omits effects
+that are hidden in the noise. The uncertainty of a run with a smaller model is therefore that of
+the largest model of the runs, fitted to its poses, if they determine it.
 
-Runs of one sensor have parameters x_i with covariances C_i. The squared differences from their
-mean m, weighted by C_i⁻¹,
+**Agreement.** Runs of one sensor have parameters x_i with covariances C_i. The squared differences
+from their mean m, weighted by C_i⁻¹,
 
     T² = Σ (x_i - m)ᵀ C_i⁻¹ (x_i - m)
 
@@ -52,10 +50,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibrate import Calibration, in_g, with_history
-from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
-from ..estimate import Fit, judge
+from ..calibrate import Calibration, fit_unknown, in_g, with_history
+from ..effects import (
+    Context,
+    effect_named,
+    force_slope,
+    Model,
+    MODELS,
+    parameter_basis,
+    reading_of,
+)
+from ..errors import InputError, RefusedFitError
+from ..estimate import Fit, judge, NORM_MODELS
 from ..table import Floats, Poses
+from ..text import counted
 from ..units import STANDARD_GRAVITY
 
 NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain.xy', 'gain.xz',
@@ -100,7 +108,9 @@ class RotationFree:
     @property
     def mat_s(self) -> Floats:
         """S, (3, 3)."""
-        return _symmetric(self.values[3:9])
+        matrix = np.zeros((3, 3))
+        matrix[_ENTRIES] = self.values[3:9]
+        return matrix + np.triu(matrix, 1).T
 
 
 def rotation_free(calibration: Calibration, context: Context, per_g: float) -> RotationFree:
@@ -115,11 +125,6 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         Columns that the effects need, one row.
     per_g : float
         Native reading that counts as 1 g; not used for other units.
-
-    Returns
-    -------
-    RotationFree
-        The parameters at this context.
 
     """
     model = calibration.model
@@ -152,12 +157,6 @@ def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
     return scale, scale
 
 
-def _symmetric(entries: Floats) -> Floats:
-    matrix = np.zeros((3, 3))
-    matrix[_ENTRIES] = entries
-    return matrix + np.triu(matrix, 1).T
-
-
 def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
     """Return S (3, 3) and its (3, 3, p) derivative from W and the (3, 3, p) derivative of W."""
     squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
@@ -176,18 +175,11 @@ _CONTRADICTED = 0.1
 
 
 @dataclass(frozen=True)
-class Spread:
+class CommonScale:
     """
-    Covariances of several calibrations on one scale.
+    (p, p) covariances of several calibrations on one scale [g²], and its degrees of freedom.
 
-    Parameters
-    ----------
-    covariances : tuple of (p, p) arrays
-        Covariance of each ``model.vector`` [g²].
-    dof : float
-        Degrees of freedom of the common scale.
-    noisier : tuple of int
-        Indices of calibrations whose poses repeat significantly worse than the others.
+    The poses of the calibrations `noisier` repeat significantly worse than the others.
 
     """
 
@@ -205,10 +197,8 @@ class Scatter:
     ----------
     covariance : (p, p) array
         Stated covariance of ``model.vector`` [g²].
-    chi2 : float
-        Squared residuals over their variances.
-    dof : int
-        Degrees of freedom of the residuals.
+    chi2, dof : float, int
+        Squared residuals over their variances, and their degrees of freedom.
     stated : float
         Factor of the stated covariance.
     belief : float
@@ -223,7 +213,7 @@ class Scatter:
     belief: float
 
 
-def on_one_scale(runs: Sequence[Scatter]) -> Spread:
+def on_one_scale(runs: Sequence[Scatter]) -> CommonScale:
     """Return the covariances of calibrations of one sensor on a common scale."""
     factors, noisier, dofs = np.ones(len(runs)), [], []
     for measured in (True, False):  # without measured noise, chi² has no unit
@@ -234,9 +224,8 @@ def on_one_scale(runs: Sequence[Scatter]) -> Spread:
             factors[k] = own / runs[k].stated if runs[k].stated > 0.0 and dof > 0.0 else 1.0
         noisier += [group[j] for j in worse]
         dofs += [dof] if group and dof > 0.0 else []
-    return Spread(tuple(run.covariance * factor
-                        for run, factor in zip(runs, factors, strict=True)),
-                  min(dofs, default=np.inf), tuple(sorted(noisier)))
+    scaled = tuple(run.covariance * factor for run, factor in zip(runs, factors, strict=True))
+    return CommonScale(scaled, min(dofs, default=np.inf), tuple(sorted(noisier)))
 
 
 def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
@@ -286,6 +275,80 @@ def _fit_of(calibration: Calibration) -> Fit:
         poses_g = Poses({key: values for key, values in poses_g.columns.items()
                          if key != 'reference'}, poses_g.row)
     return judge(model, poses_g, np.eye(len(model.vector)))
+
+
+@dataclass(frozen=True)
+class Comparable:
+    """
+    A calibration prepared for comparisons with others of its sensor.
+
+    `sure` is the fit of the largest model of the sensor to the same poses, or the calibration
+    itself, and `scatter` is how well the poses of `sure` repeat.
+
+    """
+
+    calibration: Calibration
+    sure: Calibration
+    scatter: Scatter
+
+
+def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
+    """
+    Prepare two or more calibrations of one sensor for any number of comparisons among them.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two, or they cannot be compared.
+
+    """
+    _refuse_if_unlike(calibrations)
+    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in
+                 zip(calibrations, _with_largest_model(calibrations), strict=True))
+
+
+def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
+    """Raise InputError if calibrations cannot be compared."""
+    if len(calibrations) < 2:
+        raise InputError(f'found {counted(len(calibrations), "calibration")}, expected at least 2',
+                         'select two or more calibrations of the same sensor')
+    sensors = list(dict.fromkeys(run.sensor for run in calibrations if run.sensor))
+    if len(sensors) > 1:
+        raise InputError(f'the calibrations are of the sensors {" and ".join(sensors)}, expected '
+                         'one sensor', 'select calibrations of one sensor; if it was only '
+                         'renamed, set sensor: in the files to one name')
+    native = [run.units.is_native for run in calibrations]
+    if any(native) and not all(native):
+        other = next(run.units.name for run in calibrations if not run.units.is_native)
+        raise InputError(f'run {native.index(True) + 1} is in native units and another run in '
+                         f'{other}, expected the same unit, because the conversion is not known',
+                         'fit all runs from readings in one unit')
+    for k, run in enumerate(calibrations, 1):
+        if not run.model.effects:
+            raise InputError(f'run {k} is a mounting alone, expected a fit of offset and gain',
+                             'leave it out, or fit it with more poses')
+        if not np.all(np.isfinite(run.covariance)):
+            raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
+                             'fit it again with more poses')
+
+
+def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
+    """Return each run, or the fit of the largest model of all runs to its poses."""
+    names = {run.name if run.name in NORM_MODELS else NORM_MODELS[-1]  # the same for |force|
+             for run in calibrations if run.name in MODELS}
+    largest = max(names, key=NORM_MODELS.index, default=NORM_MODELS[0])
+    return tuple(_fitted_with(largest, run) for run in calibrations)
+
+
+def _fitted_with(name: str, run: Calibration) -> Calibration:
+    """Return a fit of a larger model to the poses of a run, or the run if that is not possible."""
+    larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
+    if name not in larger or run.model.effects != MODELS[run.name]:
+        return run
+    try:
+        return fit_unknown(run.used_poses, run.units, name, 'ml')
+    except RefusedFitError:
+        return run
 
 
 LEVEL = 0.03
