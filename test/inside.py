@@ -124,8 +124,13 @@ from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
 from accel_calib.noise.components import fit_components
-from accel_calib.noise.curve import allan_variances, octaves, shares, spread_of
-from accel_calib.noise.rest import longest_rest
+from accel_calib.noise.curve import (
+    allan_variances,
+    longest_rest,
+    octaves,
+    shares,
+    spread_of,
+)
 from accel_calib.refine import state as refine_state
 from accel_calib.refine.curves import (
     best_curve,

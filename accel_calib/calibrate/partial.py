@@ -23,7 +23,7 @@ import numpy as np
 
 from .calibration import Calibration, FLEET, PRIOR, Rejected
 from .fit import deviations_g, finished, sound_rows, sure_rows, uncertainty_g
-from .pose_planning import Cone, cone_of, determines, joined, missing_poses, turn_words
+from .pose_planning import Cone, cone_of, determines, enumerated, missing_poses, turn_words
 from .prior import (
     FIRST_NOISE_G,
     FLEET_NOISE_G,
@@ -312,8 +312,8 @@ def _known_words(about: Carried) -> str:
 
 def _open(about: Carried) -> Finding:
     """Return what the poses leave open, and the poses that determine it."""
-    gains = joined([f'±{100.0 * gain:.1f} % on {axis}'
-                    for axis, gain in zip(AXES, about.gain, strict=True)])
+    gains = enumerated([f'±{100.0 * gain:.1f} % on {axis}'
+                        for axis, gain in zip(AXES, about.gain, strict=True)])
     missing = turn_words(missing_poses(NAME, about.cone.axis[np.newaxis]))
     return Finding(
         'open', f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '

@@ -368,7 +368,7 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iter
         open_ = identifiability(largest, directions, noise).undetermined
         yield Finding(
             'undetermined', f'the poses do not determine {combination_words(open_)}, so model '
-            f'{chosen} is the largest possible: it omits {joined(left_out(chosen, largest))}, '
+            f'{chosen} is the largest possible: it omits {enumerated(left_out(chosen, largest))}, '
             f'{_commonly(chosen, largest, directions, noise)}',
             f'to determine them, {turn_words(missing_poses(largest, directions, noise))}')
 
@@ -376,7 +376,7 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iter
 def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:
     """Return a text that offers a smaller model, with the effects that it omits."""
     offer = (f', or use model {smaller}, which these poses determine: it omits '
-             f'{joined(left_out(smaller, name))}')
+             f'{enumerated(left_out(smaller, name))}')
     if name == ORIENTED:
         return offer
     return f'{offer}, {_commonly(smaller, name, directions, noise)}'
@@ -393,17 +393,17 @@ def combination_words(open_: Sequence[Combination]) -> str:
     words = [each.words for each in open_[:_MOST_NAMED]]
     if len(open_) > _MOST_NAMED:
         words.append(f'{len(open_) - _MOST_NAMED} more')
-    return joined(words)
+    return enumerated(words)
 
 
 def turn_words(missing: Sequence[str]) -> str:
     """Return how to turn the sensor for the missing poses."""
     if len(missing) <= 1:
         return f'turn the sensor so that {"".join(missing) or "another side"} points up'
-    return f'turn the sensor so that in turn {joined(missing)} point up'
+    return f'turn the sensor so that in turn {enumerated(missing)} point up'
 
 
-def joined(words: Sequence[str]) -> str:
+def enumerated(words: Sequence[str]) -> str:
     """Join words by commas and 'and'."""
     return ' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))
 

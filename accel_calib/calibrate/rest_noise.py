@@ -167,14 +167,9 @@ class SampleNoise:
 
 def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
     """
-    Return a calibration with gyro bias and noise from rests.
+    Return a calibration with gyro bias and noise from the rests that it does not reject.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration. Figures that the rests do not determine are kept.
-    poses : Poses
-        The rests, in the unit of the readings. Those that the calibration rejects are not used.
+    Figures that the rests do not determine are kept.
 
     """
     rejected = [pose.row for pose in calibration.rejected]
@@ -185,18 +180,9 @@ def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
 
 def sample_noise_of(poses: Poses) -> SampleNoise | None:
     """
-    Return the white noise of one sample, by axis.
+    Return the white noise of one sample, by axis; None if the rests state no noise.
 
-    Parameters
-    ----------
-    poses : Poses
-        Rests, with ``std`` and ``rate_std`` where they are known.
-
-    Returns
-    -------
-    SampleNoise or None
-        The noise, in the unit of the readings and in rad/s. An axis whose samples never change has
-        no known noise. None if no noise is known.
+    An axis whose samples never change has no known noise.
 
     """
     force, rate = (_median(poses, key) for key in ('std', 'rate_std'))
@@ -221,25 +207,15 @@ def _in_rad_s(rate: Floats) -> bool:
 
 def gyro_bias_of(poses: Poses) -> GyroBias | None:
     """
-    Return the bias of the gyro, from the rates at rest.
+    Return the bias of the gyro, from the rates of the rests that did not turn.
 
-    Parameters
-    ----------
-    poses : Poses
-        Rests with ``rate``, and with ``rate_std``, ``count``, ``time`` and ``temperature`` where
-        they are known.
-
-    Returns
-    -------
-    GyroBias or None
-        The bias, without the rests that turned. None if there are no rates or fewer than
-        `LEAST_RESTS` rests, if the rates are all 0 or not in rad/s, or if they differ so much that
-        the poses are not rests.
+    It is None if there are no rates or fewer than `LEAST_RESTS` rests, if the rates are all 0 or
+    not in rad/s, or if they differ so much that the poses are not rests.
 
     """
     if 'rate' not in poses or len(poses) < LEAST_RESTS:
         return None
-    rests = _rests_of(poses)
+    rests = _rates_of(poses)
     if not np.any(rests.rate) or not _in_rad_s(rests.rate):
         return None
     rests = rests.take(_agreeing(rests))
@@ -258,28 +234,28 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
 
 
 @dataclass(frozen=True)
-class _Rests:
+class _Rates:
     """Rates (n, 3) [rad/s], variances of their noise, and (n,) temperatures, in order of time."""
 
     rate: Floats
     variance: Floats
     temperature: Floats | None
 
-    def take(self, which: NDArray[np.bool_]) -> _Rests:
-        return _Rests(self.rate[which], self.variance[which],
+    def take(self, which: NDArray[np.bool_]) -> _Rates:
+        return _Rates(self.rate[which], self.variance[which],
                       None if self.temperature is None else self.temperature[which])
 
 
-def _rests_of(poses: Poses) -> _Rests:
+def _rates_of(poses: Poses) -> _Rates:
     if 'time' in poses:
         poses = poses.take(np.argsort(poses['time'], kind='stable'))
     variance = np.zeros_like(poses['rate'], dtype=float)
     if 'rate_std' in poses and 'count' in poses:
         variance = poses['rate_std'] ** 2 / poses['count'][:, np.newaxis]
-    return _Rests(poses['rate'], variance + _TINY, poses.columns.get('temperature'))
+    return _Rates(poses['rate'], variance + _TINY, poses.columns.get('temperature'))
 
 
-def _agreeing(rests: _Rests) -> NDArray[np.bool_]:
+def _agreeing(rests: _Rates) -> NDArray[np.bool_]:
     """Return which rests have the rate that noise and scatter explain."""
     from scipy.special import stdtrit
 
@@ -314,7 +290,7 @@ def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _RateFit:
     """(p, 3) values by axis, their variances, and (n, 3) residuals over their deviation."""
 
     values: Floats
@@ -342,27 +318,27 @@ class _Fit:
         limit = float(stdtrit(count - 2, 1.0 - _TAIL))
         return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
 
-    def where(self, mine: NDArray[np.bool_], other: _Fit) -> _Fit:
+    def where(self, mine: NDArray[np.bool_], other: _RateFit) -> _RateFit:
         """Return this fit for some axes, and another without slope for the others."""
         values, variance = (np.where(mine, one, np.vstack([two, np.zeros(3)])) for one, two in (
             (self.values, other.values), (self.variance, other.variance)))
-        return _Fit(values, variance, np.where(mine, self.residual, other.residual))
+        return _RateFit(values, variance, np.where(mine, self.residual, other.residual))
 
 
-def _means(rests: _Rests) -> _Fit:
-    return _fit(np.ones((len(rests.rate), 1)), rests)
+def _means(rests: _Rates) -> _RateFit:
+    return _fitted(np.ones((len(rests.rate), 1)), rests)
 
 
-def _lines(rests: _Rests) -> _Fit | None:
+def _lines(rests: _Rates) -> _RateFit | None:
     """Return lines over temperature minus its mean; None if they are not determined."""
     temperature = rests.temperature
     if temperature is None or len(temperature) < _ENOUGH or not np.ptp(temperature) > 0.0:
         return None
     design = np.column_stack([np.ones(len(temperature)), temperature - temperature.mean()])
-    return _fit(design, rests)
+    return _fitted(design, rests)
 
 
-def _fit(design: Floats, rests: _Rests) -> _Fit:
+def _fitted(design: Floats, rests: _Rates) -> _RateFit:
     """Fit the rates of each axis with noise and scatter; `design` is (n, p)."""
     from scipy.special import stdtrit
 
@@ -376,7 +352,7 @@ def _fit(design: Floats, rests: _Rests) -> _Fit:
         values.append(found)
         variance.append(np.diag(covariance))
         residual.append(left / np.sqrt(noise + scatter))
-    return _Fit(np.column_stack(values), np.column_stack(variance), np.column_stack(residual))
+    return _RateFit(np.column_stack(values), np.column_stack(variance), np.column_stack(residual))
 
 
 def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, Floats, Floats]:

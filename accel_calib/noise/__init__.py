@@ -4,16 +4,15 @@
 """
 Noise figures from a long rest, by Allan deviation.
 
-`rest` finds the longest rest. `curve` computes the Allan variances and the covariance of their
-estimates, and `components` fits white noise, bias instability and random walk to them. `figures`
+`curve` finds the longest rest, and computes its Allan variances and the covariance of their
+estimates. `components` fits white noise, bias instability and random walk to them. `figures`
 returns these by axis, with their limits in words, and as JSON.
 
 """
 
 from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
-from .curve import check_allantools
+from .curve import check_allantools, joined
 from .figures import duration, noise_of, to_json
-from .rest import joined
 
 __all__ = ['FIGURES', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
            'duration', 'joined', 'noise_of', 'shown_unit', 'to_json']

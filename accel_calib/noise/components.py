@@ -154,7 +154,7 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
     """
     shape = shares(lengths)
     first, last = _range(variances, shape, spread)
-    curve = _Curve(variances, shape, spread, slice(first, last + 1))
+    curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
     free = sorted([*_WANTED, *(c for c in _NUISANCE if curve.rise(_EVERY, c) > _RISE[c])])
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
@@ -167,8 +167,8 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
                   first, last, curve.p_value(found))
 
 
-class _Curve:
-    """The variances of one axis in a range of τ."""
+class _RangeFit:
+    """The variances of one axis in a range of τ, to which components are fitted."""
 
     def __init__(self, variances: Floats, shape: Floats, spread: Spread, which: slice) -> None:
         self._spread = spread
@@ -295,7 +295,7 @@ def _range(variances: Floats, shape: Floats, spread: Spread) -> tuple[int, int]:
 def _tried(variances: Floats, shape: Floats, spread: Spread, first: int, last: int
            ) -> tuple[float, float]:
     """Return χ² and its probability over a range of octaves."""
-    curve = _Curve(variances, shape, spread, slice(first, last + 1))
+    curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
     found = curve.solve(_EVERY)
     return found.chi_square, curve.p_value(found)
 

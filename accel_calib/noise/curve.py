@@ -2,7 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The Allan deviation of a still sensor, and the covariance of its estimates.
+The longest rest of a recording, its Allan deviation, and the covariance of the estimates.
+
+**Rest.** The detector of `accel_calib.capture` finds the rests. A rest ends at an interruption of
+the stamps. Single samples that are missing are replaced by the sample before, if they are few,
+because a recording that loses one sample in a thousand would otherwise have no long rest. Stamps
+with jitter are not used one by one: samples come from a regular clock, and their order is right.
 
 **Deviation.** For the averaging time τ = m τ0, the Allan variance is half the mean square of the
 difference between successive averages of m samples. The overlapping estimate uses each start
@@ -45,6 +50,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -52,8 +58,11 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture import CaptureSettings, samples_of, StillDetector
 from ..errors import InputError
-from ..units import Floats
+from ..table import Floats, numbered, Recording
+from ..text import counted
+from ..units import Units
 
 FLAT = 2.0 * np.log(2.0) / np.pi
 """Allan variance of flicker noise in units of B²."""
@@ -66,6 +75,22 @@ _GROWTH = 1.15
 
 _RANDOM = 4
 """Number of components that are random."""
+
+LEAST_SAMPLES = 64
+"""Smallest number of samples of a rest: five octaves of τ."""
+
+_BLOCK = 1 << 16
+_LONG = 1.5
+"""Interval between stamps that indicates a missing sample, in units of the usual interval."""
+
+_INTERRUPTED = 10
+"""Number of missing samples in a row that interrupts a rest."""
+
+_MOST_MISSING = 0.02
+"""Largest part of missing samples; with more long intervals, the stamps have jitter."""
+
+_UNEVEN = 0.1
+"""Standard deviation of the intervals that is worth a note, in units of the mean interval."""
 
 _SECOND = np.array([1.0, -2.0, 1.0])
 _FLICKER = np.array([[0.0], [0.0], [1.0], [0.0]])
@@ -88,22 +113,7 @@ def shares(lengths: Counts) -> Floats:
 
 
 def allan_variances(values: Floats, lengths: Counts) -> Floats:
-    """
-    Return the overlapping Allan variance at each length.
-
-    Parameters
-    ----------
-    values : (n,) array
-        Samples with equal spacing.
-    lengths : (k,) array of int
-        Numbers of samples per average, at most n/2.
-
-    Raises
-    ------
-    InputError
-        If allantools is not installed.
-
-    """
+    """Return the overlapping Allan variances of (n,) samples at (k,) lengths of at most n/2."""
     check_allantools()
     found = import_module('allantools').oadev(values - np.mean(values), rate=1.0,
                                               data_type='freq', taus=lengths.astype(float))
@@ -111,15 +121,7 @@ def allan_variances(values: Floats, lengths: Counts) -> Floats:
 
 
 def check_allantools() -> None:
-    """
-    Check that the Allan deviation can be computed.
-
-    Raises
-    ------
-    InputError
-        If allantools is not installed.
-
-    """
+    """Raise InputError if allantools is not installed."""
     if find_spec('allantools') is None:
         raise InputError('allantools is not installed, but the Allan deviation needs it',
                          'run pip install allantools')
@@ -225,3 +227,133 @@ def _generalised(lag: Counts) -> Floats:
     t = np.abs(lag).astype(float)
     log = np.log(np.maximum(t, 1.0))
     return np.array([(t == 0.0).astype(float), -0.5 * t, t**2 * log / (2.0 * np.pi), t**3 / 12.0])
+
+
+@dataclass(frozen=True)
+class LongRest:
+    """
+    The longest rest of a recording.
+
+    Parameters
+    ----------
+    start : float
+        Stamp of the first sample [s].
+    rate : float
+        Samples per second [Hz].
+    values : (c, n) array
+        Readings [g], and angular rates [rad/s] if the recording has them.
+    temperature : (n,) array or None
+        Temperature [°C], if the recording has it.
+    recorded : float
+        Duration of the recording [s].
+    notes : tuple of str
+        What is not regular.
+
+    """
+
+    start: float
+    rate: float
+    values: Floats
+    temperature: Floats | None
+    recorded: float
+    notes: tuple[str, ...]
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples."""
+        return int(self.values.shape[1])
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return self.samples / self.rate
+
+
+def longest_rest(recording: Recording, units: Units) -> LongRest:
+    """Return the longest rest without an interruption; raise InputError if it is too short."""
+    time = recording['time']
+    best, seconds = (0, 0), 0.0
+    for start, end in sorted(_still(recording, units), key=lambda each: each[0] - each[1]):
+        if end - start <= seconds:
+            break
+        for part in _uninterrupted(time, start, end):
+            length = float(time[part[1] - 1] - time[part[0]])
+            best, seconds = (part, length) if length > seconds else (best, seconds)
+    count = best[1] - best[0]
+    recorded = float(np.ptp(time)) if len(time) else 0.0
+    if count < LEAST_SAMPLES:
+        found = f'{counted(count, "sample")}' if count else 'no sample'
+        raise InputError(f'the longest rest in {recorded:.3g} s has {found}, expected at least '
+                         f'{LEAST_SAMPLES}', 'record the sensor for some minutes to hours while '
+                         'nothing touches it')
+    return _regular(recording.take(slice(*best)), units, recorded)
+
+
+def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int, int]]:
+    """Yield first index and end of the parts of a rest without interruptions."""
+    inside = np.flatnonzero((time >= start) & (time <= end))
+    step = np.diff(time[inside])
+    if not len(step):
+        return
+    cuts = (np.diff(inside) > 1) | (step < 0.0) | (
+        step > _INTERRUPTED * float(np.median(step)) + _least(step))
+    for part in np.split(inside, np.flatnonzero(cuts) + 1):
+        yield int(part[0]), int(part[-1]) + 1
+
+
+def _least(step: Floats) -> float:
+    """Return ten mean intervals: stamps that come in groups have a median near 0."""
+    return _INTERRUPTED * float(np.mean(np.maximum(step, 0.0)))
+
+
+def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:
+    """Return first and last stamp of each rest."""
+    detector = StillDetector(CaptureSettings(), units, keep=None)
+    count = len(recording)
+    detector.add(samples_of(recording, first, min(first + _BLOCK, count))
+                 for first in range(0, count, _BLOCK))
+    detector.close()
+    return [(dwell.start, dwell.end) for dwell in detector.dwells()]
+
+
+def _regular(rest: Recording, units: Units, recorded: float) -> LongRest:
+    """Return the samples of a rest with equal spacing."""
+    time = rest['time']
+    step = np.diff(time)
+    usual = float(np.median(step))
+    late = step > _LONG * usual
+    missing = np.maximum(np.round(step[late] / usual) - 1.0, 0.0).sum() if usual > 0.0 else np.inf
+    if not 0.0 < missing <= _MOST_MISSING * len(time):
+        rate = (len(time) - 1) / float(time[-1] - time[0])
+        notes = _jitter(step)
+    else:
+        steps = np.where(late, np.maximum(np.round(step / usual), 1.0), 1.0)
+        place = np.append(0.0, np.cumsum(steps)).astype(np.int64)
+        rate = place[-1] / float(time[-1] - time[0])
+        rest = rest.take(np.searchsorted(place, np.arange(place[-1] + 1), side='right') - 1)
+        notes = [f'{counted(int(missing), "sample")} of {len(rest)} are missing in the rest, '
+                 'and are replaced by the sample before']
+    values = units.to_g(rest.reading.T)
+    if 'rate' in rest:
+        values = np.concatenate([values, rest['rate'].T])
+    return LongRest(float(time[0]), rate, values, rest.columns.get('temperature'), recorded,
+                    tuple(notes))
+
+
+def _jitter(step: Floats) -> list[str]:
+    mean = float(np.mean(step))
+    if float(np.std(step)) <= _UNEVEN * mean:
+        return []
+    return [f'the stamps are uneven ({np.min(step) * 1e3:.3g} to {np.max(step) * 1e3:.3g} ms '
+            f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms']
+
+
+def joined(blocks: Iterable[Recording]) -> Recording:
+    """Return blocks of a recording as one, with the columns that all have."""
+    parts = [block for block in blocks if len(block)]
+    if not parts:
+        raise InputError('the recording has no samples, expected a long rest',
+                         'check that this is the intended file')
+    names = [name for name in parts[0].columns if all(name in part for part in parts)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
+    return Recording(columns, numbered(columns), parts[0].units, parts[0].sensor)

@@ -40,12 +40,13 @@ from .curve import (
     check_allantools,
     Counts,
     FLAT,
+    longest_rest,
+    LongRest,
     octaves,
     shares,
     Spread,
     spread_of,
 )
-from .rest import longest_rest, Rest
 from ..table import Floats, Recording
 from ..units import is_native, STANDARD_GRAVITY, Units
 
@@ -133,7 +134,7 @@ def _departures(axis: AxisNoise) -> Iterator[str]:
                '(vibration?); the figures are approximate')
 
 
-def needs_of(axes: Sequence[AxisNoise], rest: Rest) -> dict[tuple[Kind, str], str]:
+def needs_of(axes: Sequence[AxisNoise], rest: LongRest) -> dict[tuple[Kind, str], str]:
     """Return why figures are not seen, and what to do."""
     longest: dict[tuple[Kind, str], tuple[float, str]] = {}
     for axis in axes:
@@ -145,7 +146,7 @@ def needs_of(axes: Sequence[AxisNoise], rest: Rest) -> dict[tuple[Kind, str], st
     return {key: words for key, (_, words) in longest.items()}
 
 
-def _white_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+def _white_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
     """Return why the white noise is not seen."""
     if rest.samples < _WHITE_SAMPLES:
         return _needs_rest(_WHITE_SAMPLES / rest.rate, rest)
@@ -153,7 +154,7 @@ def _white_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
                     f'({duration(axis.tau[0])}); record at a higher rate, with more digits')
 
 
-def _instability_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+def _instability_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
     """Return how long the rest has to be for the flat part of the curve."""
     white = axis.figures['noise_density']
     if axis.figures['random_walk'].seen:
@@ -165,7 +166,7 @@ def _instability_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
     return _needs_rest(max(_INSTABILITY_S, hidden, _LONGER * rest.seconds), rest)
 
 
-def _walk_need(axis: AxisNoise, rest: Rest) -> tuple[float, str]:
+def _walk_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
     """Return how long the rest has to be for a curve that rises."""
     if _disturbed(axis):
         return np.inf, _DISTURBED
@@ -177,12 +178,12 @@ def _disturbed(axis: AxisNoise) -> bool:
     return bool(axis.tau[-1] > axis.used[1])
 
 
-_NEEDED: dict[str, Callable[[AxisNoise, Rest], tuple[float, str]]] = {
+_NEEDED: dict[str, Callable[[AxisNoise, LongRest], tuple[float, str]]] = {
     'noise_density': _white_need, 'bias_instability': _instability_need,
     'random_walk': _walk_need}
 
 
-def _needs_rest(seconds: float, rest: Rest) -> tuple[float, str]:
+def _needs_rest(seconds: float, rest: LongRest) -> tuple[float, str]:
     """Return a length, and the words for it."""
     about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
              else f'about {duration(_rounded(seconds))}')
@@ -278,7 +279,7 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
                         temperature, (*notes, *notes_of(axes, temperature)), needs)
 
 
-def _in_rad_s(rest: Rest) -> bool:
+def _in_rad_s(rest: LongRest) -> bool:
     """Return whether the noise of the rates is that of a gyro in rad/s."""
     rates = rest.values[3:]
     if not len(rates):
@@ -364,7 +365,7 @@ def _coarse_step(values: Floats, noise: float) -> float:
     return step if noise < _COARSE * step else 0.0
 
 
-def _temperatures(rest: Rest) -> tuple[float, float] | None:
+def _temperatures(rest: LongRest) -> tuple[float, float] | None:
     """Return the lowest and highest mean temperature of a hundredth of the rest."""
     if rest.temperature is None or not np.isfinite(rest.temperature).any():
         return None
