@@ -33,8 +33,8 @@ from accel_calib.calibrate.mounting import (
 )
 from accel_calib.calibrate.partial import carried
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
-from accel_calib.capture import rounding_left
 from accel_calib.calibrate.prior import common_sensors, typical_spread, without_knocked
+from accel_calib.capture import rounding_left
 from accel_calib.capture.trend import _long_run as long_run
 from accel_calib.capture.trend import lines_through
 from accel_calib.cli.commands import COMMANDS

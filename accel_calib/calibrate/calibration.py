@@ -241,11 +241,6 @@ class Calibration:
         return self.model.rotation
 
     @property
-    def is_oriented(self) -> bool:
-        """Whether the values are from the known orientations of the poses."""
-        return self.name == ORIENTED
-
-    @property
     def is_levelled(self) -> bool:
         """Whether ΔR is known."""
         return not np.array_equal(self.rotation, np.eye(3))

@@ -199,7 +199,7 @@ def _check_covariance(covariance: Floats) -> None:
 def _check_gain(calibration: Calibration) -> None:
     mat_w, vec_v = calibration.model.linear_part
     gains = np.linalg.svd(mat_w, compute_uv=False)
-    if not np.linalg.det(mat_w) > 0.0 and not calibration.is_oriented:
+    if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
         raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
                               _CHECK_POSES)
     if not GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1]:

@@ -202,7 +202,7 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
         return
     level: Level = 'USABLE'
     mirrored = np.linalg.det(mat_q) < 0.0
-    if calibration.is_oriented:
+    if calibration.form.known_orientation:
         level, effect = 'USABLE' if mirrored else 'GOOD', f'model {name} corrects it'
     elif mirrored:
         level = 'BAD'

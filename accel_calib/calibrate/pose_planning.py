@@ -263,7 +263,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     uncertainty = _uncertainty(calibration) if calibration.model.effects else np.nan
     planned = asked
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
-        planned = ORIENTED if calibration.is_oriented else NORM_MODELS[-1]
+        planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
     known, noise_g = np.isfinite(uncertainty), None
     if known and determines(calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
@@ -279,7 +279,7 @@ def _uncertainty(calibration: Calibration) -> float:
     if any(key not in known for key in calibration.model.needs):
         return np.nan
     covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
-    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.is_oriented
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
               else np.einsum('ni,nij,nj->n', up, covariance, up))
     return float(np.sqrt(np.mean(errors)))
 

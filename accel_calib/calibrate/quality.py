@@ -74,7 +74,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     model, units = calibration.model, calibration.units
     check_sensor(calibration, poses.sensor)
     poses_g = calibration.held(with_history(in_g(poses, units), model))
-    vectors = calibration.is_oriented and 'reference' in poses
+    vectors = calibration.form.known_orientation and 'reference' in poses
     before = errors_before(poses_g, units, vectors=vectors)
     after = errors_after(model, poses_g, vectors=vectors)
     floor = None

@@ -56,7 +56,6 @@ from ..effects import (
     effect_named,
     force_slope,
     Model,
-    MODELS,
     parameter_basis,
     reading_of,
 )
@@ -334,16 +333,15 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
 
 def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """Return each run, or the fit of the largest model of all runs to its poses."""
-    names = {run.name if run.name in NORM_MODELS else NORM_MODELS[-1]  # the same for |force|
-             for run in calibrations if run.name in MODELS}
-    largest = max(names, key=NORM_MODELS.index, default=NORM_MODELS[0])
+    names = {run.form.norm for run in calibrations}
+    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
     return tuple(_fitted_with(largest, run) for run in calibrations)
 
 
 def _fitted_with(name: str, run: Calibration) -> Calibration:
     """Return a fit of a larger model to the poses of a run, or the run if that is not possible."""
     larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
-    if name not in larger or run.model.effects != MODELS[run.name]:
+    if name not in larger or run.model.effects != run.form.effects:
         return run
     try:
         return fit_unknown(run.used_poses, run.units, name, 'ml')
