@@ -131,7 +131,16 @@ from accel_calib.noise.curve import (
     shares,
     spread_of,
 )
-from accel_calib.refine import state as refine_state
+from accel_calib.refine import base as refine_base
+from accel_calib.refine.base import (
+    beginning,
+    clipped,
+    fitted_state,
+    grid_step,
+    off_grid,
+    sampled,
+    unclipped,
+)
 from accel_calib.refine.curves import (
     best_curve,
     is_curve,
@@ -144,14 +153,10 @@ from accel_calib.refine.curves import (
 from accel_calib.refine.linear import _RARE as RARE
 from accel_calib.refine.linear import Block, Linear, linearised, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
-from accel_calib.refine.output import clipped, grid_step, off_grid, unclipped
-from accel_calib.refine.records import attitude_words
-from accel_calib.refine.records import NOTHING as NOTHING_TO_PLAN
-from accel_calib.refine.rivals import probabilities
+from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import search as search_effects
-from accel_calib.refine.sets import accepted, explored, is_significant, names_of, with_outliers
-from accel_calib.refine.state import beginning, fitted_state, sampled
-from accel_calib.refine.words import advice_for, values_of, verdict_words
+from accel_calib.refine.sets import accepted, explored, probabilities
+from accel_calib.refine.words import advice_for, attitude_words, values_of, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page
 from accel_calib.report.page import page as refinement_page
@@ -219,7 +224,7 @@ HEAD_OF_A_PORT = sources, '_HEAD_S'
 CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
-LARGEST_SAMPLE = refine_state, 'MOST'
+LARGEST_SAMPLE = refine_base, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 DECOMPRESSED = bounded_bags, 'decompressed'
 STUCK = viewer, 'STUCK_S'

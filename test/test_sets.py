@@ -12,11 +12,9 @@ from inside import (
     Block,
     explored,
     fitted_state,
-    is_significant,
     Linear,
     linearised,
     Model,
-    names_of,
     Process,
     process_of,
     RARE,
@@ -25,7 +23,6 @@ from inside import (
     simulate_poses,
     Walk,
     walk_beside,
-    with_outliers,
     WORTH,
 )
 import numpy as np
@@ -61,7 +58,7 @@ def problem_of(poses, *names):
 def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1e6):
     """Return a linear problem with one column for each effect, and no base."""
     count = len(residual)
-    blocks = tuple(Block(name, np.zeros(0), slice(k, k + 1), 0, tried)
+    blocks = tuple(Block(name, np.zeros(0), slice(k, k + 1), EFFECTS[name], 0, tried)
                    for k, name in enumerate(names))
     return Linear(np.zeros((count, 0)), residual, np.arange(count), blocks, columns,
                   np.full(len(names), size), worth, count, float(residual @ residual),
@@ -74,7 +71,7 @@ def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1
     ('offset_step', [3e-3, -2e-3, 2e-3, 900.0])])
 def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
     state, linear = problem_of(poses_of({name: values}), name)
-    gain, _ = linear.gains(linear.made())
+    gain, _ = linear.gains(linear.set_of())
     best = int(np.argmax(gain))
     shape = linear.blocks[best].shape
     if name.endswith('temperature'):  # a fit would change the lag, too
@@ -85,7 +82,7 @@ def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
     after = fitted_state(Model({**state.model.values, name: start}), state.poses_g)
     assert gain[best] > 50.0
     assert gain[best] == pytest.approx(state.fit.chi2 - after.fit.chi2, rel=0.01)
-    chosen = linear.made((best,))
+    chosen = linear.set_of((best,))
     assert linear.base_rss - chosen.rss == pytest.approx(gain[best], rel=1e-9)
     np.testing.assert_allclose(linear.values_of(chosen)[best],
                                after.model.values[name][:len(effect.parameters)],
@@ -95,10 +92,10 @@ def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
 def test_the_gain_beside_a_set_is_the_fall_that_the_larger_set_brings():
     _, linear = problem_of(poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(5,)),
                            'quadratic', 'cubic', 'gain_asymmetry', 'offset_drift')
-    beside = linear.made((0,), (5,))
+    beside = linear.set_of((0,), (5,))
     gain, rank = linear.gains(beside)
     for block in range(1, len(linear.blocks)):
-        larger = linear.made((0, block), (5,))
+        larger = linear.set_of((0, block), (5,))
         assert beside.rss - larger.rss == pytest.approx(gain[block], rel=1e-6)
         assert larger.ranks[-1] == rank[block]
     assert (gain[0], rank[0]) == (pytest.approx(0.0, abs=1e-9), 0.0)
@@ -110,7 +107,7 @@ def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
     context = {'reference': True} if known else {}
     poses = poses_of({}, knocked=out, **context)
     state, linear = problem_of(poses, 'quadratic')
-    chosen = linear.made((), out)
+    chosen = linear.set_of((), out)
     others = np.delete(np.arange(COUNT), out)
     after = fitted_state(state.model, state.poses_g.take(others))
     assert chosen.parameters == len(out) * (3 if known else 1)
@@ -124,7 +121,7 @@ def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
 def test_an_effect_in_a_set_without_a_pose_is_fitted_without_it():
     poses = poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(7, 30))
     state, linear = problem_of(poses, 'quadratic')
-    chosen = linear.made((0,), (7, 30))
+    chosen = linear.set_of((0,), (7, 30))
     others = np.delete(np.arange(COUNT), (7, 30))
     after = fitted_state(Model({**state.model.values, 'quadratic': np.zeros(3)}),
                          state.poses_g.take(others))
@@ -138,19 +135,18 @@ def test_the_score_counts_values_shapes_choice_and_size():
     residual[:3] = 6.0, 8.0, 2.0
     columns = np.eye(40)[:, :2]
     linear = by_hand(residual, columns, ['supply_ratio', 'supply_ratio'], choice=3.0, tried=5.0)
-    one, both = linear.made((0,)), linear.made((0, 1))
+    one, both = linear.set_of((0,)), linear.set_of((0, 1))
 
     def expected(rss, values, charge):
         whole = WORTH + 40.0
         return (whole * math.log((WORTH + 104.0) / (WORTH + rss))
                 - values * math.log(40.0) * whole / (whole - values - 1.0) - charge)
 
-    assert linear.made().score == 0.0
+    assert linear.set_of().score == 0.0
     assert one.score == pytest.approx(expected(68.0, 1.0, 3.0 + 2.0 * math.log(5.0)))
     assert both.score == pytest.approx(expected(4.0, 2.0, 2.0 * (3.0 + 2.0 * math.log(5.0))))
-    gain, rank = linear.gains(one)
-    assert linear.score_with(one, 1, gain[1], rank[1]) == pytest.approx(both.score)
-    left_out = linear.made((), (0, 1))
+    assert linear.scores_beside(one)[1] == pytest.approx(both.score)
+    left_out = linear.set_of((), (0, 1))
     assert left_out.score == pytest.approx(
         expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
@@ -161,7 +157,7 @@ def test_noise_alone_is_significant_as_often_as_stated():
     for seed in range(600):
         residual = np.random.default_rng(seed).normal(size=30)
         linear = by_hand(residual, np.eye(30)[:, :4], names)
-        best.append(min(linear.probability(linear.made((k,)), k) for k in range(4)))
+        best.append(min(linear.probability(linear.set_of((k,)), k) for k in range(4)))
     assert np.mean(np.array(best) < 0.1) == pytest.approx(0.1, abs=0.03)
     assert np.mean(np.array(best) < REFINE_LEVEL) == pytest.approx(REFINE_LEVEL, abs=0.009)
 
@@ -175,17 +171,17 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
     _, linear = problem_of(poses_of(hidden, time=time, temperature=warm), *EFFECTS)
     for block, each in enumerate(linear.blocks):
         if each.effect in hidden:
-            assert linear.probability(linear.made((block,)), block) > REFINE_LEVEL
+            assert linear.probability(linear.set_of((block,)), block) > REFINE_LEVEL
     best = next(accepted(linear, explored(linear)))
-    assert set(names_of(linear, best)) == set(hidden)
-    assert is_significant(linear, best)
+    assert set(linear.effects_of(best)) == set(hidden)
+    assert linear.is_significant(best)
 
 
 def test_an_effect_and_knocked_poses_are_found_together():
     hidden, knocked = {'offset_temperature': [3e-4, -2e-4, 2e-4]}, (4, 17, 33, 51)
     _, linear = problem_of(poses_of(hidden, knocked=knocked), *EFFECTS)
     best = next(accepted(linear, explored(linear)))
-    assert names_of(linear, best) == ('offset_temperature',)
+    assert linear.effects_of(best) == ('offset_temperature',)
     assert best.out == knocked
     values = next(iter(linear.values_of(best).values()))
     np.testing.assert_allclose(values, hidden['offset_temperature'], atol=3e-5)
@@ -195,7 +191,7 @@ def test_a_pose_that_an_effect_explains_is_not_left_out():
     poses = poses_of({'offset_step': [4e-3, -4e-3, 4e-3, 180.0]})  # before it: 6 poses of 60
     _, linear = problem_of(poses, 'offset_step', 'quadratic', 'offset_drift')
     best = next(accepted(linear, explored(linear)))
-    assert names_of(linear, best) == ('offset_step',)
+    assert linear.effects_of(best) == ('offset_step',)
     assert best.out == ()
 
 
@@ -203,7 +199,7 @@ def test_noise_alone_has_no_effects_and_no_outliers():
     _, linear = problem_of(poses_of({}), *EFFECTS)
     best = next(accepted(linear, explored(linear)))
     assert (best.blocks, best.out, best.score) == ((), (), 0.0)
-    assert [each.out for each in with_outliers(linear, linear.made())] == [()]
+    assert [each.out for each in linear.with_outliers(linear.set_of())] == [()]
 
 
 def random_process(count, modes, rng):
@@ -224,7 +220,7 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     np.testing.assert_allclose(white.columns.T @ white.columns, columns.T @ inverse @ columns)
     np.testing.assert_allclose(white.columns.T @ white.residual, columns.T @ inverse @ residual)
     values = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ residual)
-    found = white.values_of(white.made((0, 1)))
+    found = white.values_of(white.set_of((0, 1)))
     np.testing.assert_allclose([found[0][0], found[1][0]], values)
     flat = Walk(process, 0.0, 0.0, 0.0).whitened(linear)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
@@ -243,7 +239,7 @@ def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
         moved[7] += knock
         linear = by_hand(moved, np.eye(30)[:, :1], ['supply_ratio'])
         white = Walk(process, 50.0, 0.0, 0.0).whitened(linear)
-        assert white.made((), (7,)).rss == pytest.approx(expected)
+        assert white.set_of((), (7,)).rss == pytest.approx(expected)
 
 
 def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses():
@@ -253,7 +249,7 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses():
     variance = np.eye(15) + ratio * (process.axes * process.values) @ process.axes.T
     linear = by_hand(residual, np.eye(15)[:, :1], ['supply_ratio'])
     walk = Walk(process, ratio, 0.0, 0.0)
-    left, held_out = walk.residuals(linear, linear.made())
+    left, held_out = walk.residuals(linear, linear.set_of())
     for k in range(15):
         others = np.delete(np.arange(15), k)
         weights = np.linalg.solve(variance[np.ix_(others, others)], variance[others, k])
@@ -273,7 +269,7 @@ def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
     likely = []
     for size_g in (1e-3, 0.0):
         linear, poses = wandering(size_g)
-        walk = walk_beside(linear, linear.made(), process_of(linear, poses))
+        walk = walk_beside(linear, linear.set_of(), process_of(linear, poses))
         likely.append(walk.likelihood_ratio)
     assert likely[0] > 3.0 * SIGNIFICANT
     assert likely[1] < 0.5 * SIGNIFICANT

@@ -33,18 +33,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .linear import Block, held_out, LEVEL, Linear, linearised, Set
-from .sets import with_outliers
-from .state import State
+from .base import State
+from .linear import Block, held_out, LEVEL, Linear, linearised, outside_of, Set
 from ..effects import (
     CARRIERS,
+    curve_pairs,
     effect_named,
+    EFFECTS,
     EMPIRICAL,
     empirical_name,
     empirical_parts,
     Model,
     MODES,
-    VARIABLES,
 )
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
@@ -55,6 +55,8 @@ _LARGEST_SHARE = 0.35
 
 _LEAST_DOF = 30
 """Degrees of freedom below which no curve is looked for; a few poses fit many curves."""
+
+_ALL_MODES = range(1, MODES + 1)
 
 _PATIENCE = 2
 """Cosines without a better score after which no more are added; a wave needs several."""
@@ -107,7 +109,7 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
 
     """
     fit = judge(state.model, poses_g)
-    plain = linearised(fit, state.model.effects, ())
+    plain = linearised(fit, state.model.effects)
     if plain.dof < _LEAST_DOF:
         return None
     best, tried = None, 0
@@ -119,50 +121,39 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
     if best is None:
         return None
     score, problem, chosen = best
-    return _accepted(score - 2.0 * math.log(tried), problem, problem.made(chosen.blocks, out),
+    return _accepted(score - 2.0 * math.log(tried), problem, problem.set_of(chosen.blocks, out),
                      tried)
 
 
-def _pairs(poses_g: Poses) -> Iterator[tuple[str, str]]:
-    """Yield the carriers and variables that the poses can show."""
-    for variable in VARIABLES:
-        for carrier in CARRIERS:
-            if (variable in poses_g or variable == 'force') and (
-                    variable != 'force' or carrier == 'offset'):
-                yield carrier, variable
+def _pairs(poses_g: Poses) -> list[tuple[str, str]]:
+    """Return the carriers and variables that the poses can show."""
+    return [(carrier, variable) for carrier, variable in curve_pairs()
+            if all(key in poses_g for key in
+                   effect_named(empirical_name(carrier, variable, _ALL_MODES)).needs)]
 
 
 def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
     """Yield the problem with the cosines of a carrier as candidates, and of each of its parts."""
-    name = empirical_name(carrier, variable, range(1, MODES + 1))
+    name = empirical_name(carrier, variable, _ALL_MODES)
     effect = effect_named(name)
     shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(fit.poses_g.columns))
     if not shapes:
         return
-    count = len(effect.parameters)
+    count, parts = len(effect.parameters), CARRIERS[carrier]
     model = Model({name: np.concatenate([np.zeros(count), shapes[0]])})
-    columns = fit.equations.columns(model)[:, :count]
-    sizes = np.linalg.norm(columns, axis=0)
-    sizes[sizes == 0.0] = 1.0
-    columns = columns / sizes
-    columns = columns - plain.onto @ (plain.onto.T @ columns)
-    parts = CARRIERS[carrier]
-    width = len(parts)
-    yield replace(plain, columns=columns, sizes=sizes, choice=0.0, blocks=tuple(
-        Block(empirical_name(carrier, variable, (mode,)), shapes[0],
-              slice(width * (mode - 1), width * mode), 0, float(mode))
-        for mode in range(1, MODES + 1)))
-    for k, part in enumerate(parts if width > 1 else ()):
-        yield replace(plain, columns=columns[:, k::width], sizes=sizes[k::width], choice=0.0,
-                      blocks=tuple(
-                          Block(empirical_name(f'{carrier}.{part}', variable, (mode,)), shapes[0],
-                                slice(mode - 1, mode), 0, float(mode))
-                          for mode in range(1, MODES + 1)))
+    columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
+    whole = [(carrier, slice(None), len(parts))]
+    alone = [(f'{carrier}.{part}', slice(k, None, len(parts)), 1) for k, part in enumerate(parts)]
+    for own, which, width in whole + alone if len(parts) > 1 else whole:
+        yield replace(plain, columns=columns[:, which], sizes=sizes[which], choice=0.0,
+                      blocks=tuple(Block(empirical_name(own, variable, (mode,)), shapes[0],
+                                         slice(width * (mode - 1), width * mode), effect, 0,
+                                         float(mode)) for mode in _ALL_MODES))
 
 
 def _compressed(problem: Linear, out: tuple[int, ...]) -> Linear:
     """Return a problem with the same products of its columns, but with few rows."""
-    nothing = problem.made((), out)
+    nothing = problem.set_of((), out)
     columns = problem.columns - nothing.onto @ (nothing.onto.T @ problem.columns)
     rows = np.linalg.qr(np.column_stack([columns, nothing.residual]))[1]
     count = len(rows)
@@ -173,13 +164,11 @@ def _compressed(problem: Linear, out: tuple[int, ...]) -> Linear:
 
 def _grown(problem: Linear) -> Set:
     """Return the cosines with the best score."""
-    best = now = problem.made()
+    best = now = problem.set_of()
     for _ in range(_MOST_MODES):
-        gain, rank = problem.gains(now)
-        scores = [problem.score_with(now, k, gain[k], rank[k])
-                  if rank[k] and k not in now.blocks else -np.inf
-                  for k in range(len(problem.blocks))]
-        now = problem.made((*now.blocks, int(np.argmax(scores))))
+        scores = problem.scores_beside(now)
+        scores[list(now.blocks)] = -np.inf
+        now = problem.set_of((*now.blocks, int(np.argmax(scores))))
         if now.parameters > _LARGEST_SHARE * problem.dof:
             break
         if now.score > best.score:
@@ -192,8 +181,8 @@ def _grown(problem: Linear) -> Set:
 def _accepted(score: float, problem: Linear, chosen: Set, tried: int) -> Curve | None:
     """Return a curve, or None if it is not significant or poses held out do not agree."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
-    chosen = max(with_outliers(problem, chosen), key=lambda each: each.score)
-    nothing = problem.made((), chosen.out)
+    chosen = max(problem.with_outliers(chosen), key=lambda either: either.score)
+    nothing = problem.set_of((), chosen.out)
     choices = tried * math.prod(problem.blocks[block].tried for block in chosen.blocks)
     p_value = min(1.0, problem.chance(nothing, chosen) * choices)
     if p_value > LEVEL or score < _CLEARLY:
@@ -220,6 +209,35 @@ def _held_out(problem: Linear, chosen: Set) -> float:
 def is_curve(name: str) -> bool:
     """Return whether an effect is an empirical curve."""
     return name.startswith(f'{EMPIRICAL}-')
+
+
+_NEAREST = 2
+"""Number of known effects that are named as the nearest to a curve."""
+
+
+def nearest_effects(before: State) -> dict[str, float]:
+    """Return the known effects that leave least of the residual, and what they leave [mg]."""
+    names = tuple(name for name in EFFECTS if name not in before.model.values)
+    linear = linearised(before.fit, before.model.effects, names)
+    gain, rank = linear.gains(linear.set_of())
+    left_mg: dict[str, float] = {}
+    for number in np.argsort(-gain):
+        effect = linear.blocks[number].effect
+        if rank[number] and effect not in left_mg and len(left_mg) < _NEAREST:
+            left_mg[effect] = before.gap_mg(linear.set_of((int(number),)).residual)
+    return left_mg
+
+
+def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:
+    """Return the values of a variable of one number between which a curve changes most."""
+    if variable in ('force', 'std'):
+        return None
+    values = poses_g[variable]
+    parts = np.array_split(np.argsort(values, kind='stable'), 5)
+    middle = [float(np.mean(values[part])) for part in parts]
+    size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
+    at = int(np.argmax(np.abs(np.diff(size))))
+    return middle[at], middle[at + 1]
 
 
 _MODES = 60

@@ -35,7 +35,7 @@ left out costs 2 log n + 5: it is selected among n poses, and few poses are knoc
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
@@ -44,8 +44,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context, effect_named, Model
-from ..estimate import Equations, Fit
+from ..effects import Context, Effect, effect_named, Model
+from ..estimate import by_pose, Equations, Fit, outliers_among
 from ..table import Floats
 
 WORTH = 4.0
@@ -93,6 +93,8 @@ class Block(NamedTuple):
         Its shape.
     columns : slice
         Its columns in `Linear.columns`.
+    entry : Effect
+        Entry of the effect in the catalogue.
     searched : int
         Number of values of the shape that were searched in the same data.
     tried : float
@@ -103,6 +105,7 @@ class Block(NamedTuple):
     effect: str
     shape: Floats
     columns: slice
+    entry: Effect
     searched: int = 0
     tried: float = 1.0
 
@@ -158,10 +161,10 @@ class Linear:
     penalty: float = 0.0
     white: tuple[Floats, Floats] | None = None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the candidates."""
-        return tuple(dict.fromkeys(block.effect for block in self.blocks))
+    @cached_property
+    def poses(self) -> int:
+        """Return the number of poses."""
+        return int(self.pose.max()) + 1
 
     @cached_property
     def along(self) -> Floats:
@@ -171,21 +174,25 @@ class Linear:
     @cached_property
     def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
         """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
-        groups: dict[int, list[int]] = {}
+        numbers_of: dict[int, list[int]] = {}
         for number, block in enumerate(self.blocks):
-            groups.setdefault(block.columns.stop - block.columns.start, []).append(number)
-        found: list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]] = []
-        for width, numbers in groups.items():
+            numbers_of.setdefault(block.columns.stop - block.columns.start, []).append(number)
+        groups: list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]] = []
+        for width, numbers in numbers_of.items():
             starts = np.array([self.blocks[number].columns.start for number in numbers], np.intp)
             index = starts[:, np.newaxis] + np.arange(width)
             products = np.empty((len(numbers), width, width))
-            for one in range(width):
-                for other in range(one, width):
-                    pair = self.columns[:, index[:, one]], self.columns[:, index[:, other]]
-                    products[:, one, other] = np.einsum('mk,mk->k', *pair)
-                    products[:, other, one] = products[:, one, other]
-            found.append((np.array(numbers, np.intp), index, products))
-        return found
+            for i in range(width):
+                for j in range(i, width):
+                    pair = self.columns[:, index[:, i]], self.columns[:, index[:, j]]
+                    products[:, i, j] = np.einsum('mk,mk->k', *pair)
+                    products[:, j, i] = products[:, i, j]
+            groups.append((np.array(numbers, np.intp), index, products))
+        return groups
+
+    def effects_of(self, chosen: Set) -> tuple[str, ...]:
+        """Return the names of the effects of a set."""
+        return tuple(self.blocks[block].effect for block in chosen.blocks)
 
     def score(self, rss: float, parameters: float, charge: float) -> float:
         """Return the score of a set from its RSS, number of values and other charges."""
@@ -196,7 +203,7 @@ class Linear:
         few = whole / max(whole - parameters - 1.0, 1e-9)
         return fall - few * parameters * math.log(max(self.dof, 2)) - charge - self.penalty
 
-    def made(self, blocks: Sequence[int] = (), out: Iterable[int] = ()) -> Set:
+    def set_of(self, blocks: Sequence[int] = (), out: Iterable[int] = ()) -> Set:
         """Return the set of these blocks, with these poses left out."""
         out = tuple(sorted(out))
         rows = np.flatnonzero(np.isin(self.pose, out)) if out else np.zeros(0, np.intp)
@@ -206,12 +213,12 @@ class Linear:
         onto, ranks = np.linalg.qr(units)[0], [float(len(rows))]
         raw = [self.columns[:, self.blocks[block].columns] for block in blocks]
         for columns in raw:
-            new = outside(columns, onto)
+            new = _outside(columns, onto)
             onto, ranks = np.hstack([onto, new]), [*ranks, float(new.shape[1])]
         residual = self.residual - onto @ (onto.T @ self.residual)
         searched = sum(self.blocks[block].searched for block in blocks)
         charge = 2.0 * sum(math.log(self.blocks[block].tried) for block in blocks)
-        charge += sum(self._unusual(blocks, raw, out, onto[:, :len(rows)]))
+        charge += self._unusual(blocks, raw, onto[:, :len(rows)])
         charge += len(blocks) * self.choice
         charge += len(out) * (2.0 * math.log(max(self.poses, 2)) + _RARE)
         parameters = sum(ranks) + searched
@@ -219,54 +226,65 @@ class Linear:
         return Set(tuple(blocks), out, onto, residual, rss, tuple(ranks[1:]), parameters,
                    charge, self.score(rss, parameters, charge))
 
-    @property
-    def poses(self) -> int:
-        """Return the number of poses."""
-        return int(self.pose.max()) + 1
+    def without(self, chosen: Set, block: int) -> Set:
+        """Return a set without one of its blocks."""
+        return self.set_of([other for other in chosen.blocks if other != block], chosen.out)
 
-    def _unusual(self, blocks: Sequence[int], raw: list[Floats], out: tuple[int, ...],
-                 units: Floats) -> Iterator[float]:
-        """Yield the penalty for the size of each effect."""
-        if not blocks:
-            return
-        values = self._values(blocks, raw, units)
-        for block in blocks:
-            effect = effect_named(self.blocks[block].effect)
-            size = float(np.max(np.abs(values[block]))) / effect.typical
-            yield min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
+    def fewer(self, chosen: Set) -> list[Set]:
+        """Return a set of several blocks without each of them."""
+        several = chosen.blocks if len(chosen.blocks) > 1 else ()
+        return [self.without(chosen, block) for block in several]
 
-    def _values(self, blocks: Sequence[int], raw: list[Floats], units: Floats
-                ) -> dict[int, Floats]:
-        columns = np.hstack(raw)
-        columns = columns - units @ (units.T @ columns)
-        values = np.linalg.lstsq(columns, self.residual, rcond=1e-7)[0]
-        found: dict[int, Floats] = {}
-        start = 0
-        for block in blocks:
-            part = self.blocks[block].columns
-            width = part.stop - part.start
-            found[block] = values[start:start + width] / self.sizes[part]
-            start += width
-        return found
+    def with_outliers(self, chosen: Set) -> list[Set]:
+        """Return a set as it is, and with the outliers that it leaves, if they differ."""
+        plain = self.set_of(chosen.blocks) if chosen.out else chosen
+        onto = np.hstack([self.onto, plain.onto])
+        outliers = outliers_among(
+            by_pose(plain.residual, onto, self.pose), plain.rss,
+            self.dof - int(plain.parameters), self.poses, noise_known=self.worth > 0.0)
+        out = outliers.poses.tolist()
+        return [chosen] if tuple(out) == chosen.out else [chosen, self.set_of(chosen.blocks, out)]
+
+    def _unusual(self, blocks: Sequence[int], raw: list[Floats], units: Floats) -> float:
+        """Return the penalty for the sizes of the effects."""
+        penalty = 0.0
+        for block, values in self._values(blocks, raw, units).items():
+            size = float(np.max(np.abs(values))) / self.blocks[block].entry.typical
+            penalty += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
+        return penalty
 
     def values_of(self, chosen: Set) -> dict[int, Floats]:
         """Return the (p,) values of the effect of each block of a set."""
-        if not chosen.blocks:
-            return {}
         raw = [self.columns[:, self.blocks[block].columns] for block in chosen.blocks]
         rows = int(chosen.onto.shape[1] - sum(chosen.ranks))
         return self._values(chosen.blocks, raw, chosen.onto[:, :rows])
 
+    def _values(self, blocks: Sequence[int], raw: list[Floats], units: Floats
+                ) -> dict[int, Floats]:
+        if not blocks:
+            return {}
+        columns = np.hstack(raw)
+        columns = columns - units @ (units.T @ columns)
+        values = np.linalg.lstsq(columns, self.residual, rcond=1e-7)[0]
+        by_block: dict[int, Floats] = {}
+        start = 0
+        for block in blocks:
+            part = self.blocks[block].columns
+            end = start + part.stop - part.start
+            by_block[block] = values[start:end] / self.sizes[part]
+            start = end
+        return by_block
+
     def visible(self) -> dict[str, float]:
         """Return the effect on the residuals of each candidate of typical size, per noise."""
-        found: dict[str, float] = {}
+        largest: dict[str, float] = {}
         for block in self.blocks:
-            left = outside(self.columns[:, block.columns], self.onto[:, :0])
+            left = _outside(self.columns[:, block.columns], self.onto[:, :0])
             if left.shape[1]:
                 own = self.columns[:, block.columns] * self.sizes[block.columns]
-                size = float(np.linalg.norm(own, 2)) * effect_named(block.effect).typical
-                found[block.effect] = max(size, found.get(block.effect, 0.0))
-        return found
+                size = float(np.linalg.norm(own, 2)) * block.entry.typical
+                largest[block.effect] = max(size, largest.get(block.effect, 0.0))
+        return largest
 
     def gains(self, beside: Set) -> tuple[Floats, Floats]:
         """Return the (b,) gain of each block in addition to a set, and its (b,) rank."""
@@ -283,28 +301,35 @@ class Linear:
             gain[numbers], rank[numbers] = np.sum(squares, axis=1), np.sum(kept, axis=1)
         return gain, rank
 
-    def whitened(self, columns: Floats) -> Floats:
-        """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
-        if self.white is None:
-            return columns
-        axes, loss = self.white
-        found: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
-        return found
-
-    def without(self, chosen: Set, block: int) -> Set:
-        """Return a set without one of its blocks."""
-        return self.made([other for other in chosen.blocks if other != block], chosen.out)
-
     def score_with(self, before: Set, block: int, gain: float, rank: float) -> float:
         """Return the score of a set with one more block, without the penalty for its size."""
         entry = self.blocks[block]
         return self.score(before.rss - gain, before.parameters + rank + entry.searched,
                           before.charge + self.choice + 2.0 * math.log(entry.tried))
 
+    def scores_beside(self, before: Set) -> Floats:
+        """Return the (b,) scores with one more block; -inf for one that determines nothing."""
+        gain, rank = self.gains(before)
+        return np.array([self.score_with(before, k, gain[k], rank[k]) if rank[k] else -np.inf
+                         for k in range(len(self.blocks))])
+
+    def whitened(self, columns: Floats) -> Floats:
+        """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
+        if self.white is None:
+            return columns
+        axes, loss = self.white
+        whitened: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
+        return whitened
+
     def probability(self, chosen: Set, block: int) -> float:
         """Return the probability that noise alone makes a block this good beside the others."""
         chance = self.chance(self.without(chosen, block), chosen)
-        return min(1.0, chance * len(self.names) * self.blocks[block].tried)
+        candidates = len({other.effect for other in self.blocks})
+        return min(1.0, chance * candidates * self.blocks[block].tried)
+
+    def is_significant(self, chosen: Set) -> bool:
+        """Return whether each effect of a set is significant beside the others."""
+        return all(self.probability(chosen, block) < LEVEL for block in chosen.blocks)
 
     def chance(self, fewer: Set, more: Set) -> float:
         """Return the probability that noise alone makes a set this good beside a smaller one."""
@@ -325,16 +350,12 @@ class Set:
 
     Parameters
     ----------
-    blocks : tuple of int
-        Indices of the blocks.
-    out : tuple of int
-        Indices of the poses left out.
+    blocks, out : tuple of int
+        Indices of the blocks, and of the poses left out.
     onto : (m, q) array
         Orthonormal columns that span both; those of the poses first.
-    residual : (m,) array
-        The residual that they leave.
-    rss : float
-        Its sum of squares.
+    residual, rss : (m,) array, float
+        The residual that they leave, and its sum of squares.
     ranks : tuple of float
         Number of values that each block determines beside the blocks before it.
     parameters : float
@@ -357,7 +378,7 @@ class Set:
     score: float
 
 
-def outside(columns: Floats, onto: Floats) -> Floats:
+def _outside(columns: Floats, onto: Floats) -> Floats:
     """Return the part of (m, w) columns outside of an orthonormal basis, orthonormal (m, r)."""
     left = columns - onto @ (onto.T @ columns)
     vectors, scales, _ = np.linalg.svd(left, full_matrices=False)
@@ -365,23 +386,12 @@ def outside(columns: Floats, onto: Floats) -> Floats:
 
 
 def held_out(residual: Floats, own: Floats) -> Floats:
-    """
-    Return (m,) residuals, each predicted without its own equation (PRESS).
-
-    Parameters
-    ----------
-    residual : (m,) array
-        Residuals of a fit to all equations.
-    own : (m,) array
-        1 minus the leverage of each equation.
-
-    """
-    found: Floats = residual / np.maximum(own, _LEAST_OWN)
-    return found
+    """Return (m,) residuals without their own equation (PRESS), from (m,) 1 - leverage `own`."""
+    predicted: Floats = residual / np.maximum(own, _LEAST_OWN)
+    return predicted
 
 
-def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str], worth: float = WORTH
-               ) -> Linear:
+def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str] = ()) -> Linear:
     """
     Return the linear problem at a model, with candidates.
 
@@ -389,12 +399,8 @@ def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str], worth: flo
     ----------
     fit : Fit
         The model at all poses; it may have more effects than the base.
-    base : tuple of str
-        Effects of the base.
-    names : iterable of str
-        Names of the candidates.
-    worth : float
-        ν, for known noise.
+    base, names : iterable of str
+        Names of the effects of the base, and of the candidates.
 
     """
     near, model = fit.equations, fit.model
@@ -405,59 +411,64 @@ def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str], worth: flo
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = _orthonormal(near.columns(held)[:, held.fitted])
     residual = residual - onto @ (onto.T @ residual)
-    blocks, columns = _blocks(near, fit.poses_g.columns, further, names, len(fit.poses_g))
-    sizes = np.linalg.norm(columns, axis=0)
-    sizes[sizes == 0.0] = 1.0
-    columns = columns / sizes
-    columns = columns - onto @ (onto.T @ columns)
-    rss = float(residual @ residual)
+    candidates = {name: effect_named(name) for name in names}
+    blocks, raw = _blocks(near, fit.poses_g.columns, further, candidates, len(fit.poses_g))
+    columns, sizes = outside_of(onto, raw)
     return Linear(onto, residual, near.pose, blocks, columns, sizes,
-                  worth if near.noise_known else 0.0, near.count - onto.shape[1], rss,
-                  near.columns(_OFFSET), 2.0 * math.log(1.0 + len({b.effect for b in blocks})))
+                  WORTH if near.noise_known else 0.0, near.count - onto.shape[1],
+                  float(residual @ residual), near.columns(_OFFSET),
+                  2.0 * math.log(1.0 + len({block.effect for block in blocks})))
+
+
+def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
+    """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
+    sizes = _norms(columns)
+    columns = columns / sizes
+    return columns - onto @ (onto.T @ columns), sizes
+
+
+def _norms(columns: Floats) -> Floats:
+    """Return the norms of columns, 1 for a column of zeros."""
+    sizes: Floats = np.linalg.norm(columns, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    return sizes
 
 
 def _amplitudes(model: Model) -> Floats:
     """Return the (p,) values of a model with those of its shapes set to zero."""
-    parts = [np.concatenate([values[:len(effect_named(name).parameters)],
-                             np.zeros(len(effect_named(name).shape))])
-             for name, values in model.values.items()]
+    parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
+             for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
     return np.concatenate(parts)
 
 
 def _orthonormal(columns: Floats) -> Floats:
     if not columns.shape[1]:
         return columns
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    vectors, scales, _ = np.linalg.svd(columns / size, full_matrices=False)
-    found: Floats = vectors[:, scales > 1e-6 * scales[0]]
-    return found
+    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
+    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
 
 
-def _blocks(near: Equations, context: Context, present: Model, names: Iterable[str], poses: int
-            ) -> tuple[tuple[Block, ...], Floats]:
-    """Return the blocks of the candidates, and their columns."""
+def _blocks(near: Equations, context: Context, present: Model, candidates: dict[str, Effect],
+            poses: int) -> tuple[tuple[Block, ...], Floats]:
+    """Return the blocks of the candidates that the context allows, and their columns."""
     blocks: list[Block] = []
     columns: list[Floats] = [np.zeros((len(near.pose), 0))]
     start = 0
-    for name in names:
-        effect = effect_named(name)
+    for name, effect in candidates.items():
         if effect.output is not None or any(key not in context for key in effect.needs):
             continue
         count = len(effect.parameters)
-        shapes = _shapes(name, context, present, poses)
-        for shape, searched, tried in shapes:
+        for shape, searched, tried in _shapes(effect, context, present.values.get(name), poses):
             model = Model({name: np.concatenate([np.zeros(count), shape])})
             columns.append(near.columns(model)[:, :count])
-            blocks.append(Block(name, shape, slice(start, start + count), searched, tried))
+            blocks.append(Block(name, shape, slice(start, start + count), effect, searched, tried))
             start += count
     return tuple(blocks), np.hstack(columns)
 
 
-def _shapes(name: str, context: Context, present: Model, poses: int
+def _shapes(effect: Effect, context: Context, present: Floats | None, poses: int
             ) -> list[tuple[Floats, int, float]]:
     """Return the shapes of an effect to try, with the values searched and the number tried."""
-    effect = effect_named(name)
     if effect.shapes is None:
         return [(np.zeros(0), 0, 1.0)]
     shapes = list(effect.shapes(context))
@@ -466,7 +477,7 @@ def _shapes(name: str, context: Context, present: Model, poses: int
     if len(shapes) == 1:
         return [(shapes[0], 0, 1.0)]
     tried = max(len(shapes) / _SHAPES_ALIKE, 1.0)
-    if name in present.values:
-        shapes = [*shapes, effect.split(present.values[name])[1]]
+    if present is not None:
+        shapes = [*shapes, effect.split(present)[1]]
     return [(shape, 0, 1.0) if np.array_equal(shape, effect.usual) else (shape, 1, tried)
             for shape in shapes]

@@ -33,16 +33,26 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .records import attitude_words, ENOUGH, plan_lines, PlannedPose, PosePlan, VARIED
-from .rivals import LEAST, probabilities
-from .state import fitted_state
+from .base import fitted_state, with_effect
+from .sets import LEAST, Near, probabilities
+from .words import attitude_words, condition_words, percent, plan_lines, versus
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import ATTITUDES, spread_directions
 from ..table import Floats, Poses
 
 if TYPE_CHECKING:
-    from .search import Found, Near
+    from .search import Found
+
+ENOUGH = 0.95
+"""Expected probability of the right effect at which a plan ends."""
+
+NOTHING = (f'there is nothing to separate: no named effect has a rival that leaves it a '
+           f'probability below {100.0 * ENOUGH:.0f} %')
+"""The line of an empty plan."""
+
+VARIED = ('temperature', 'supply_voltage', 'time', 'std')
+"""Context that a plan can vary, by column."""
 
 MOST_POSES = 6
 """Largest number of poses of a plan."""
@@ -72,20 +82,79 @@ _DRAWS, _SEED = 1000, 1
 """Random readings for the expected probability; the same for each plan."""
 
 
-def plan_poses(found: Found) -> PosePlan:
+@dataclass(frozen=True)
+class PlannedPose:
     """
-    Return the poses that separate the named effects from their rivals soonest.
+    One pose of a plan.
 
     Parameters
     ----------
-    found : Found
-        The result of a search.
+    up : tuple of float
+        Direction to point up, a unit vector in the sensor axes.
+    words : str
+        The same in words.
+    context : mapping of str to float
+        What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
+        ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
+    separates : tuple of str
+        The named effect and its rivals.
+    expected : float
+        Expected probability of the right one of them after this pose and those before it.
 
-    Returns
-    -------
-    PosePlan
-        At most `MOST_POSES` poses. A random walk of the offset cannot be predicted, so it is not
-        planned for.
+    """
+
+    up: tuple[float, float, float]
+    words: str
+    context: Mapping[str, float]
+    separates: tuple[str, ...]
+    expected: float
+
+    @property
+    def purpose(self) -> str:
+        """Return what the pose is for."""
+        return f'to separate {versus(self.separates)}'
+
+    @property
+    def conditions(self) -> str:
+        """Return the context in words; empty if the pose can be taken at once."""
+        return condition_words(self.context)
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """
+    Poses that separate named effects from their rivals soonest.
+
+    Parameters
+    ----------
+    poses : tuple of PlannedPose
+        The poses in the order to take them; empty if there are no rivals, or no pose separates
+        them.
+    lines : tuple of str
+        The plan in words.
+
+    """
+
+    poses: tuple[PlannedPose, ...] = ()
+    lines: tuple[str, ...] = (NOTHING,)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return a line about the first pose; empty without poses."""
+        if not self.poses:
+            return ()
+        first, last = self.poses[0], self.poses[-1]
+        where = f', {first.conditions}' if first.conditions else ''
+        return (f'next pose to separate {versus(first.separates)}: {first.words}{where} (1 of '
+                f'{len(self.poses)} poses, with which the expected probability of the right one '
+                f'is {percent(last.expected)})',)
+
+
+def plan_poses(found: Found) -> PosePlan:
+    """
+    Return at most `MOST_POSES` poses that separate named effects from their rivals soonest.
+
+    A random walk of the offset cannot be predicted, so it is not planned for.
 
     """
     near = found.near
@@ -232,11 +301,11 @@ def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
     gain, _ = near.linear.gains(others)
     best = max((number for number, block in enumerate(near.linear.blocks)
                 if block.effect == rival), key=lambda number: float(gain[number]))
-    chosen = near.linear.made((*others.blocks, best), others.out)
-    values = {each: part for each, part in found.final.model.values.items()
-              if each != name and not (each == 'gain' and rival == 'axis_gain')}
-    part = near.linear.values_of(chosen)[best]
-    values[rival] = np.concatenate([part, near.linear.blocks[best].shape])
+    chosen = near.linear.set_of((*others.blocks, best), others.out)
+    unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
+    block = near.linear.blocks[best]
+    values = with_effect(unchanged, rival, np.concatenate(
+        [near.linear.values_of(chosen)[best], block.shape]))
     state = fitted_state(Model(values), found.final.poses_g)
     return None if state is None else state.fit
 
@@ -360,10 +429,12 @@ def _in_words(contests: Sequence[_Contest], grid: _Candidates,
         PlannedPose(_triple(grid.up[index]), attitude_words(grid.up[index]), grid.shown[index],
                     contests[reason].names, own[reason].expected(range(number)))
         for number, (index, reason) in enumerate(zip(taken, reasons, strict=True), 1))
-    lines = [line for reason, contest in enumerate(contests) for line in plan_lines(
-        dict(zip(contest.names, contest.weights.tolist(), strict=True)),
-        [pose for pose, why in zip(poses, reasons, strict=True) if why == reason],
-        own[reason].expected(range(len(taken))) if own else 0.0)]
+    lines = []
+    for reason, contest in enumerate(contests):
+        expected = own[reason].expected(range(len(taken))) if own else 0.0
+        lines += plan_lines(dict(zip(contest.names, contest.weights.tolist(), strict=True)), [
+            (pose.words, pose.conditions) for pose, why in zip(poses, reasons, strict=True)
+            if why == reason], expected, enough=expected >= ENOUGH)
     return PosePlan(poses, tuple(lines))
 
 

@@ -2,89 +2,77 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The refinement of a calibration: the entry point and the record of the result.
+The refinement of a calibration: from poses and a base to the record of the result.
 
-See `accel_calib.refine.search` for the method, and `.stored` for a stored calibration as the base.
+See `accel_calib.refine.search` for the method, and `.calibrations` for a stored calibration as the
+base.
 
-**Base.** The base: the model that a refinement starts from.
+**Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
+nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
+values. If it names effects, the fitted values are combined with the fleet
+(`accel_calib.calibrate.prior`): offset, gain and cross-axis move towards the fleet, and the
+effects with them as far as the poses cannot distinguish them. Otherwise the result is the fit with
+the fleet. If the poses do not carry a search, the first advice states the reason, and all effects
+are listed as not testable.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
-import math
+from dataclasses import replace
 
 import numpy as np
 
-from .curves import is_curve
-from .linear import linearised
-from .plan import plan_poses
-from .records import Refinement, Stage, Step, Verdict
-from .rivals import LEAST, probabilities
+from .base import is_noise, sampled, State
+from .calibrations import (
+    base_of,
+    beside_stored,
+    Given,
+    refined_calibration,
+    without_orientation,
+)
+from .plan import plan_poses, PosePlan
+from .result import (
+    beside_walk,
+    not_testable,
+    Refinement,
+    Stage,
+    steps_of,
+    untestable,
+    verdict_of,
+)
 from .search import Found, search
-from .state import fitted_state, is_noise, sample_words, sampled, State
-from .stored import beside_stored, with_changes, with_stored
-from .words import advice_for, change_words, curve_words, not_testable, where
+from .words import advice_for, sample_words
 from ..calibrate import (
-    BASES,
     Calibration,
     check_sensor,
-    fit_findings,
-    fit_poses,
+    fit_with_fleet,
+    FLEET,
+    FleetPrior,
     gated,
     in_g,
-    OF_A_FIT,
+    only_norm,
+    posterior,
     quality_of,
-    record_of,
-    refuse_if_unfit,
     Rejected,
     sound_rows,
     sure_rows,
-    uncertainty_g,
     with_history,
     with_rest_noise,
 )
-from ..effects import CHANGES, effect_named, EFFECTS, EMPIRICAL, LADDER, Model, WANDER
-from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import fit_sphere, judge, LARGEST_DILUTION, NotConvergedError, variance_factor
-from ..finding import Finding, without
+from ..effects import Model, MODELS, PROCESSES, with_vector
+from ..errors import RefusedFitError
+from ..estimate import judge, NotConvergedError
+from ..finding import Finding
 from ..geometry import unit
-from ..table import check_units, Floats, Poses
-from ..text import counted, listed
+from ..table import check_units, Poses
+from ..text import counted
 from ..units import MG, Units
 
-
-def base_of(poses: Poses, units: Units, name: str) -> Calibration:
-    """Return the base as a calibration; errors as in `fit_poses`."""
-    if name not in BASES:
-        raise ValueError(f'base is {name!r}, expected one of {BASES}')
-    if name == 'ideal':
-        return ideal(poses, units)
-    try:
-        return fit_poses(poses, units, model=name)
-    except RefusedFitError:
-        if name == 'auto' and 'orientation' in poses:
-            return ideal(poses, units)
-        raise
-
-
-def ideal(poses: Poses, units: Units) -> Calibration:
-    """Return the ideal sensor; for native readings with a fitted offset and scale."""
-    values: dict[str, Floats] = {}
-    if units.is_native:
-        mat_w, vec_v = fit_sphere(poses.reading)
-        units = Units('native', float(mat_w[0, 0]))
-        values = {'offset': vec_v / units.per_g}
-    poses_g = in_g(poses, units)
-    fit = judge(Model(values), poses_g)
-    return record_of(fit, poses, units, unit(poses_g.reading), 'ideal', 'ml', reason='ideal')
-
-
 _LEAST_POSES = 4
-_NAMED = 4
+"""Smallest number of poses in which an effect can be found."""
+
+_BASE = '10'
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
@@ -158,58 +146,28 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
             f'{counted(found.base.linear.onto.shape[1], "parameter")} of the base, expected more '
             'poses to find an effect', 'take 24 poses or more')
     note = (Finding('note', sample_words(len(poses_g), total)),) if len(poses_g) < total else ()
-    given = _Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
+    given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
 
 
-@dataclass(frozen=True)
-class _Given:
-    """The input poses, those used [g], whether the base is stored, rejected rows, and notes."""
-
-    poses: Poses
-    poses_g: Poses
-    stored: bool
-    rejected: tuple[Rejected, ...]
-    notes: tuple[Finding, ...]
-
-    @property
-    def joint(self) -> bool:
-        """Whether the poses of the stored calibration are used, too."""
-        return 'new' in self.poses_g
-
-
-def _record(calibration: Calibration, found: Found, given: _Given, sensor: str, date: str
+def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str
             ) -> Refinement:
     """Return the record of a search."""
-    start = _as_stored(calibration, found) if given.stored else found.base
-    states = _sequence(found, start)
-    steps = (*_output_steps(found), *(
-        _step(name, pair, found, calibration.date, unseen=given.joint and k == 0)
-        for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))))
-    remaining, noise = _remaining(found)
-    verdict = _verdict(found, bool(steps), noise)
+    start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
+    steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
+    verdict = verdict_of(found, bool(steps))
     rejected = _rejected(found, given)
     clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
     outliers = tuple(each.row for each in rejected if each.row not in clipped)
-    refined, refusal = _refined(calibration, found, given, rejected)
+    refined, refusal = refined_calibration(calibration, found, given, rejected)
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
-    untestable = _untestable(found, steps)
-    plan = plan_poses(found)
+    missing, plan = untestable(found, steps), plan_poses(found)
+    advice = (*advice_for(verdict, found, steps, missing, len(outliers)), *plan.advice)
     return Refinement(
-        verdict, found.final.floor_mg, start.gap_mg(start.fit.residual), remaining, steps,
-        outliers, untestable, (
-            *advice_for(verdict, found, steps, untestable, len(outliers)), *plan.advice),
-        refined, refusal, found.final.poses_g, found.final.fit.equations.force,
-        _stages(found, states, steps), plan)
-
-
-def _verdict(found: Found, named: bool, noise: bool) -> Verdict:
-    if not noise:
-        return 'unexplained'
-    if found.curve is not None:
-        return 'described'
-    return 'explained' if named else 'no_gap'
+        verdict, final.floor_mg, start.gap_mg(start.fit.residual),
+        final.gap_mg(beside_walk(found)[0]), steps, outliers, missing, advice, refined, refusal,
+        final.poses_g, final.fit.equations.force, stages, plan)
 
 
 def _as_stored(calibration: Calibration, found: Found) -> State:
@@ -218,7 +176,7 @@ def _as_stored(calibration: Calibration, found: Found) -> State:
     return State(judge(Model(calibration.model.values), kept))
 
 
-def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
+def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
     """Return the rows of the table that were left out, with the reason."""
     out = given.poses_g.take(found.outliers)
     force = found.final.model.at(out.columns).force(out.reading)
@@ -235,182 +193,83 @@ def _rejected(found: Found, given: _Given) -> tuple[Rejected, ...]:
                         key=lambda each: each.row))
 
 
-def _sequence(found: Found, start: State) -> list[State]:
-    """Return the initial state and the state after each added effect."""
-    states, values = [start], dict(found.base.model.values)
-    for name in found.added:
-        if name != WANDER:
-            if name == 'axis_gain':
-                values.pop('gain', None)
-            own = found.final.model.values.get(name)
-            values[name] = np.zeros(len(effect_named(name).values)) if own is None else own
-            states.append(fitted_state(Model(dict(values)), found.base.poses_g) or states[-1])
-    if len(states) > 1:
-        states[-1] = State(judge(found.final.model, states[-1].poses_g))
-    return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
+def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
+                      date: str = '') -> Refinement:
+    """
+    Find effects beyond model 10, with the typical values of a fleet for model 10.
 
+    Parameters
+    ----------
+    poses : Poses
+        Poses in the unit of the readings.
+    units : Units
+        Unit of the readings, not native.
+    fleet : FleetPrior
+        Typical values of sensors of the same model.
+    sensor, date : str
+        Name of the sensor and date for the refined calibration.
 
-def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
-          ) -> Step:
-    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
-    before, after = states
-    if name == WANDER:
-        return _wander_step(before, found)
-    values = after.model.values.get(name, np.zeros(len(effect_named(name).values)))
-    seen = where(name, before, after.fit.residual)
-    if is_curve(name):
-        seen = curve_words(name, before, after)
-    if name in CHANGES:
-        seen = f'{change_words(name, after, date)}; {seen}'
-    held_out = before.fit.residual if unseen else before.held_out
-    own, chances = _shown(name), _probabilities(name, found)
-    return Step(own, _rivals(own, chances), chances, effect_named(name).shown(values),
-                before.gap_mg(before.fit.residual), after.gap_mg(after.fit.residual),
-                before.gap_mg(held_out), after.gap_mg(after.held_out),
-                _p_value(name, before, found), seen)
+    Returns
+    -------
+    Refinement
+        The refined calibration has the method ``fleet``, and its covariance includes the prior.
+        Its steps have the residuals of the search, which does not use the fleet.
 
+    Raises
+    ------
+    InputError
+        If the readings are in native units, or clearly in another unit.
+    RefusedFitError
+        As `accel_calib.calibrate.fit_with_fleet`.
 
-def _probabilities(name: str, found: Found) -> dict[str, float]:
-    """Return the probability of an effect and of each effect in its place, by its name."""
-    parts: dict[str, float] = {}
-    for each, part in probabilities(name, found.near).items():
-        parts[_shown(each)] = parts.get(_shown(each), 0.0) + part
-    return parts
-
-
-def _rivals(name: str, chances: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the other effects whose probability is not small."""
-    return tuple(other for other, part in chances.items() if other != name and part > LEAST)
-
-
-def _shown(name: str) -> str:
-    """Return the name of an effect in the record."""
-    return EMPIRICAL if is_curve(name) else name.removesuffix('_change')
-
-
-def _p_value(name: str, before: State, found: Found) -> float:
-    """Return the probability that noise alone makes an effect this good."""
-    near = found.near
-    if found.curve is not None and name == found.curve.name:
-        return found.curve.p_value
-    if name in near.names:
-        return near.linear.probability(near.chosen, near.chosen.blocks[near.names.index(name)])
-    linear = linearised(before.fit, before.model.effects, LADDER)
-    own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
-    return linear.probability(linear.made(own), own[0]) if own else 1.0
-
-
-def _output_steps(found: Found) -> tuple[Step, ...]:
-    """Return the steps for readings clipped at a limit or on a grid."""
-    steps = []
-    base = found.base
-    gap, held_out = base.gap_mg(base.residual), base.gap_mg(base.held_out)
-    if found.clipped is not None and found.with_clipped is not None:
-        whole = found.with_clipped
-        rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
-        steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': found.clipped.limit_g},
-                          whole.gap_mg(whole.residual), gap,
-                          whole.gap_mg(whole.held_out), held_out, 0.0,
-                          f'in {rows}: an axis reads {found.clipped.limit_g:.4g} g and its '
-                          'samples hardly scatter'))
-    if found.grid_g is not None:
-        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g},
-                          gap, gap, held_out, held_out, 0.0,
-                          f'pose means are multiples of {found.grid_g * MG:.3g} mg, which '
-                          f'causes {found.grid_g * MG / np.sqrt(12.0):.2g} mg RMS per axis'))
-    return tuple(steps)
-
-
-def _wander_step(before: State, found: Found) -> Step:
-    residual, held_out = _beside_walk(found)
-    p_value = math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
-    chances = _probabilities(WANDER, found)
-    return Step(WANDER, _rivals(WANDER, chances), chances, {},
-                before.gap_mg(before.residual), before.gap_mg(residual),
-                before.gap_mg(before.held_out),
-                before.gap_mg(held_out), p_value, where(WANDER, before, residual))
-
-
-def _beside_walk(found: Found) -> tuple[Floats, Floats]:
-    """Return the final residual without the walk, and the same held out."""
-    final = found.final
-    if found.walk is None:
-        return final.residual, final.held_out
-    return found.walk.residuals(final.linear, final.nothing)
-
-
-def _remaining(found: Found) -> tuple[float, bool]:
-    """Return the remaining residual, and whether noise explains it."""
-    final, (residual, _) = found.final, _beside_walk(found)
-    noise = not final.fit.noise_known or is_noise(float(residual @ residual), final.dof)
-    return final.gap_mg(residual), noise
-
-
-def _untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
-    final = found.final
-    names = tuple(name for name in EFFECTS if name not in final.model.effects)
-    linear = linearised(final.fit, final.model.effects, names)
-    others = tuple(rival for step in steps for rival in step.rivals)
-    return tuple(not_testable(final.poses_g, linear.visible(), (*final.model.effects, *others)))
-
-
-def _stages(found: Found, states: list[State], steps: Sequence[Step]) -> tuple[Stage, ...]:
-    """Return the residuals of the base and after each step; limit and grid leave those kept."""
-    of_output = len(steps) + 1 - len(states)
-    stages = []
-    for name, state in zip(('base', *(step.effect for step in steps)),
-                           (*states[:1] * of_output, *states), strict=True):
-        residual = state.fit.residual
-        if name == WANDER:
-            residual = _beside_walk(found)[0]
-        stages.append(Stage(name, state.fit.equations.of_poses(residual) * MG))
-    return tuple(stages)
-
-
-def _refined(base: Calibration, found: Found, given: _Given, rejected: tuple[Rejected, ...]
-             ) -> tuple[Calibration, tuple[str, ...]]:
-    """Return the refined calibration, and the refusal if it must not be used."""
-    final = found.final
-    model, matrix = with_changes(final.model)
-    kept, poses = final.poses_g, given.poses
-    unchanged = final.model.effects == model.effects
-    if given.joint and unchanged and all(key in base.poses for key in model.needs):
-        poses = with_stored(given.poses, base)
-    elif given.joint:
-        kept = kept.take(kept['new'] > 0.0)
-    if not base.form.known_orientation:
-        kept = Poses({key: values for key, values in kept.columns.items()
-                      if key not in ('reference', 'orientation')}, kept.row)
-    at_poses = judge(model, kept)
-    names = ', '.join(name.removesuffix('_change') for name in found.added)
-    others = without(base.noted, *OF_A_FIT)
-    kept_findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
-    refined = replace(
-        base, model=Model(model.values, base.model.rotation),
-        covariance=matrix @ final.fit.covariance @ matrix.T,
-        quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
-        rejected=rejected, noted=(*given.notes, *kept_findings), method='ml',
-        reason=f'{base.reason}; refined: {names or "nothing added"}')
+    """
+    fitted = fit_with_fleet(poses, units, fleet, sensor=sensor, date=date)
     try:
-        return _determined(gated(with_rest_noise(refined, given.poses)), final)
-    except RefusedFitError as refused:
-        return refined, (refused.message, refused.advice)
+        found = refine(poses, units, base=_BASE, sensor=sensor, date=date)
+    except RefusedFitError as err:
+        return _without_search(fitted, err.message, err.advice)
+    if found.refusal:
+        return _without_search(fitted, *found.refusal)
+    if found.calibration.model.effects == MODELS[_BASE].effects:
+        return _with(found, fitted)
+    return _with(found, _combined(found.calibration, found.poses_g, fleet))
 
 
-def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration with findings, or a refusal if the poses do not determine it."""
-    fit = final.fit
-    if refined.name == 'ideal':  # an offset that was not fitted is not zero
-        refuse_if_unfit('4', unit(fit.equations.force))
-    if fit.undetermined:
-        return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
-                         f'{", …" if len(fit.undetermined) > _NAMED else ""}',
-                         TAKE_ALL_SIDES)
-    factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
-    dilution = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
-    if dilution > LARGEST_DILUTION:
-        return refined, ('the poses do not determine the refined calibration: the error of |a| '
-                         f'is up to {dilution:.3g} times that of a pose, expected less than '
-                         f'{LARGEST_DILUTION:.0f} times',
-                         TAKE_ALL_SIDES)
-    return replace(refined, noted=(*refined.noted, *fit_findings(fit, dilution))), ()
+def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
+    """Return a refined calibration with the fleet included."""
+    values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
+    model = with_vector(refined.model.effects, values)
+    fit = judge(model, without_orientation(poses_g))
+    name = f' of model {fleet.model}' if fleet.model else ''
+    return with_rest_noise(gated(replace(
+        refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
+        method=FLEET, noted=(*findings, *refined.noted),
+        quality=quality_of(fit, refined.units, unit(fit.equations.force)),
+        reason=f'{refined.reason}; with the typical values of '
+               f'{counted(fleet.sensors, "sensor")}{name}')), refined.poses)
+
+
+def _with(found: Refinement, calibration: Calibration) -> Refinement:
+    """Return a refinement with another calibration of the same effects."""
+    if any(step.effect in PROCESSES for step in found.steps):  # not in the calibration
+        return replace(found, calibration=calibration)
+    state = State(judge(Model(calibration.model.values), found.poses_g))
+    last = Stage(found.stages[-1].name, state.mg_of_poses(state.fit.residual))
+    return replace(found, calibration=calibration, stages=(*found.stages[:-1], last),
+                   remaining_gap_mg=state.gap_mg(state.fit.residual))
+
+
+def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
+    """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
+    poses_g = in_g(fitted.used_poses, fitted.units)
+    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
+    state, ratio = State(fit), fitted.quality.chi2_per_dof
+    gap_mg = state.gap_mg(fit.residual)
+    quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
+    return Refinement(
+        'no_gap' if quiet else 'unexplained', fitted.quality.noise_floor_mg, gap_mg, gap_mg, (),
+        tuple(each.row for each in fitted.rejected),
+        not_testable(poses_g, {}, fitted.model.effects),
+        (f'no effects were searched: {message}; the result is the fit with the fleet', advice),
+        fitted, (), fit.poses_g, fit.equations.force,
+        (Stage('base', state.mg_of_poses(fit.residual)),), PosePlan())

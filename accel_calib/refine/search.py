@@ -27,13 +27,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .base import (
+    beginning,
+    Clipped,
+    fitted_state,
+    is_noise,
+    off_grid,
+    State,
+    unclipped,
+    with_effect,
+)
 from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, walk_beside
 from .linear import LEVEL, Linear, linearised, Set
-from .output import Clipped, off_grid, unclipped
-from .sets import accepted, explored, names_of, simpler
-from .state import beginning, changes_beside, fitted_state, is_noise, State
+from .sets import accepted, explored, Near, simpler
 from ..calibrate import with_previous
-from ..effects import effect_named, EFFECTS, empirical_parts, LADDER, Model, WANDER
+from ..effects import CHANGES, EFFECTS, empirical_parts, included, LADDER, Model, WANDER
 from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses
@@ -97,43 +105,6 @@ class Found:
     with_clipped: State | None = None
 
 
-@dataclass(frozen=True)
-class Near:
-    """
-    The equations of all poses near a model, and what was chosen in them.
-
-    Parameters
-    ----------
-    linear : Linear
-        The equations, with candidates; whitened if there is a walk.
-    chosen : Set
-        The chosen effects and outliers.
-    walk : Walk or None
-        The random walk of the offset.
-    plain : Linear
-        The equations before they were whitened.
-    process : Process or None
-        The modes of a walk; None if it is not tried.
-
-    """
-
-    linear: Linear
-    chosen: Set
-    walk: Walk | None
-    plain: Linear
-    process: Process | None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the chosen effects."""
-        return names_of(self.linear, self.chosen)
-
-    @property
-    def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
-        """Return what was chosen, apart from values and shapes."""
-        return frozenset(self.names), self.chosen.out, self.walk is not None
-
-
 def search(poses_g: Poses, base: Model) -> Found:
     """
     Search for the effects that a base model lacks.
@@ -169,10 +140,9 @@ def _search(poses_g: Poses, base: Model) -> Found:
     begun, near = _settled(start, poses_g, base.effects, _ladder_effects(start), walks=False)
     ladder = near.names
     fixed = (*base.effects, *ladder)
-    if 'axis_gain' in fixed:
-        fixed = tuple(name for name in fixed if name != 'gain')
+    fixed = tuple(name for name in fixed if name not in included(fixed))
     names = (*_ladder_effects(begun), *(name for name in EFFECTS if name not in LADDER),
-             *changes_beside(begun.model))
+             *_beside(begun.model, CHANGES))
     state, near = _settled(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
@@ -201,7 +171,7 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     out = np.array(curve.out, np.intp)
     near = found.near
     near = replace(near, linear=near.plain, walk=None,
-                   chosen=near.plain.made(near.chosen.blocks, near.chosen.out))
+                   chosen=near.plain.set_of(near.chosen.blocks, near.chosen.out))
     return replace(found, base=_without(start, poses_g, out), final=after, near=near,
                    walk=None, outliers=out, curve=curve,
                    added=(*(name for name in found.added if name != WANDER), curve.name))
@@ -212,20 +182,20 @@ def _walking(found: Found) -> Found | None:
     near = found.near
     if found.walk is not None or near.process is None:
         return None if found.walk is None else found
-    walk = walk_beside(near.plain, near.plain.made(near.chosen.blocks, near.chosen.out),
+    walk = walk_beside(near.plain, near.plain.set_of(near.chosen.blocks, near.chosen.out),
                        near.process)
     if walk.likelihood_ratio < SIGNIFICANT:
         return None
     white = walk.whitened(near.plain)
     near = replace(near, linear=white, walk=walk,
-                   chosen=white.made(near.chosen.blocks, near.chosen.out))
+                   chosen=white.set_of(near.chosen.blocks, near.chosen.out))
     return replace(found, near=near, walk=_walk(found.final, near),
                    added=(*found.added, WANDER))
 
 
 def _is_better(curve: Curve, near: Near) -> bool:
     """Return whether a curve is better than a walk; one over time must be clearly better."""
-    plain = near.plain.made(near.chosen.blocks, near.chosen.out)
+    plain = near.plain.set_of(near.chosen.blocks, near.chosen.out)
     walk = 0.0 if near.walk is None else near.walk.score - plain.score
     return curve.score > walk + (_TIMED if empirical_parts(curve.name)[1] == 'time' else 0.0)
 
@@ -250,7 +220,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
             seen.append(near.key)
     else:
         linear = linearised(judge(state.model, poses_g), fixed, names)
-    near = _at(linear, settled or Near(linear, linear.made(), None, linear, None), poses_g)
+    near = _at(linear, settled or Near(linear, linear.set_of(), None, linear, None), poses_g)
     return _significant(state, near, poses_g, fixed, names)
 
 
@@ -262,7 +232,7 @@ def _significant(state: State, near: Near, poses_g: Poses, fixed: tuple[str, ...
                 if near.linear.probability(near.chosen, block) > LEVEL]
         if not weak:
             break
-        fewer = replace(near, chosen=max(weak, key=lambda each: each.score))
+        fewer = replace(near, chosen=max(weak, key=lambda fewer: fewer.score))
         after = _fitted(fewer, state, poses_g, fixed)
         if after is None:
             break
@@ -293,39 +263,42 @@ def _best_near(linear: Linear, poses_g: Poses, refused: set[frozenset[str]], *, 
                ) -> Near:
     """Return the best set near a model, with or without a walk."""
     def best_of(problem: Linear) -> Set:
-        return next((each for each in accepted(problem, explored(problem))
-                     if frozenset(names_of(problem, each)) not in refused), problem.made())
+        return next((chosen for chosen in accepted(problem, explored(problem))
+                     if frozenset(problem.effects_of(chosen)) not in refused), problem.set_of())
 
     process = process_of(linear, poses_g) if walks else None
     best = Near(linear, best_of(linear), None, linear, process)
-    in_time = any('time' in effect_named(name).needs for name in best.names)
-    if linear.worth and not in_time and _is_all_noise(linear, best.chosen):
+    if linear.worth and not any(_in_time(best)) and _is_all_noise(linear, best.chosen):
         return best
     return best if process is None else _with_walk(best, process, best_of)
 
 
 def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
     """Return a set with a walk, if it has a better score than the set without one."""
-    linear, beside = best.plain, best.plain.made()
+    linear, beside = best.plain, best.plain.set_of()
     tried = [beside, best.chosen]
     for _ in range(_WALK_ROUNDS):
         walk = walk_beside(linear, beside, process)
         if walk.likelihood_ratio < SIGNIFICANT:
             break
         chosen = best_of(walk.whitened(linear))
-        beside = linear.made(chosen.blocks, chosen.out)
+        beside = linear.set_of(chosen.blocks, chosen.out)
         tried.append(beside)
     most = best.chosen.score
-    if all('time' in effect_named(name).needs for name in best.names) and not _is_all_noise(
-            linear, best.chosen):
+    if all(_in_time(best)) and not _is_all_noise(linear, best.chosen):
         most -= _TREND  # what changes with time only, and not as known, wanders
     for beside in tried:
         walk = walk_beside(linear, beside, process)
         if walk.likelihood_ratio > SIGNIFICANT and walk.score > most:
             white, most = walk.whitened(linear), walk.score
-            best = replace(best, linear=white, chosen=white.made(beside.blocks, beside.out),
+            best = replace(best, linear=white, chosen=white.set_of(beside.blocks, beside.out),
                            walk=walk)
     return best
+
+
+def _in_time(near: Near) -> list[bool]:
+    """Return which of the chosen effects change with time."""
+    return ['time' in near.linear.blocks[block].entry.needs for block in near.chosen.blocks]
 
 
 def _is_all_noise(linear: Linear, chosen: Set) -> bool:
@@ -334,13 +307,10 @@ def _is_all_noise(linear: Linear, chosen: Set) -> bool:
 
 def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]) -> State | None:
     """Return the fit of a set, or None if it is not sound."""
-    values = near.linear.values_of(near.chosen)
     model = {name: part for name, part in state.model.values.items() if name in fixed}
-    for block, part in values.items():
-        entry = near.linear.blocks[block]
-        if entry.effect == 'axis_gain':
-            model.pop('gain', None)
-        model[entry.effect] = np.concatenate([part, entry.shape])
+    for number, values in near.linear.values_of(near.chosen).items():
+        block = near.linear.blocks[number]
+        model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
     kept = np.delete(np.arange(len(poses_g)), near.chosen.out)
     after = fitted_state(Model(model), poses_g.take(kept))
     if after is None or (near.chosen.blocks and after.fit.at_bound):
@@ -352,12 +322,12 @@ def _at(linear: Linear, near: Near, poses_g: Poses) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
     blocks = [max(number for number, block in enumerate(linear.blocks) if block.effect == name)
               for name in near.names]
-    plain = linear.made(blocks, near.chosen.out)
+    plain = linear.set_of(blocks, near.chosen.out)
     walk = None if near.walk is None else walk_beside(linear, plain, near.walk.process)
     problem = linear if walk is None else walk.whitened(linear)
-    whole = problem.made(blocks, near.chosen.out)
+    whole = problem.set_of(blocks, near.chosen.out)
     blocks.sort(key=lambda block: -problem.without(whole, block).rss)
-    return Near(problem, problem.made(blocks, near.chosen.out), walk, linear,
+    return Near(problem, problem.set_of(blocks, near.chosen.out), walk, linear,
                 process_of(linear, poses_g))
 
 
@@ -369,13 +339,15 @@ def _without(state: State, poses_g: Poses, out: NDArray[np.intp]) -> State:
 
 def _ladder_effects(state: State) -> tuple[str, ...]:
     """Return the effects of the ladder that can be added."""
-    present = state.model.values
-    possible = ['offset', 'cross_axis']
-    if 'axis_gain' not in present:
-        possible += ['gain', 'axis_gain']
-    if len(kinds(state.poses_g)[0]):
-        possible.append('misalignment')
-    return tuple(name for name in LADDER if name in possible and name not in present)
+    unknown = not len(kinds(state.poses_g)[0])
+    return tuple(name for name in _beside(state.model, LADDER)
+                 if not (unknown and EFFECTS[name].known_orientation))
+
+
+def _beside(model: Model, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the effects of these names that a model neither has nor contains."""
+    present = {*model.values, *included(model.values)}
+    return tuple(name for name in names if name not in present)
 
 
 def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[str, ...]]:
@@ -384,7 +356,7 @@ def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[
         return state, near, ()
     if _explains(begun, state):
         return state, near, ()
-    return begun, replace(near, chosen=near.linear.made((), near.chosen.out)), near.names
+    return begun, replace(near, chosen=near.linear.set_of((), near.chosen.out)), near.names
 
 
 def _explains(before: State, after: State) -> bool:
@@ -395,9 +367,7 @@ def _explains(before: State, after: State) -> bool:
 
 def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
          poses_g: Poses) -> Found:
-    there = {*state.model.values, WANDER}
-    if 'axis_gain' in there:
-        there.add('gain')  # axis_gain includes it
+    there = {*state.model.values, *included(state.model.values), WANDER}
     out = np.array(near.chosen.out, np.intp)
     base = _without(start, poses_g, out) if out.size else start
     return Found(base, state, tuple(name for name in added if name in there), out, near,

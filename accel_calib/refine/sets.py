@@ -2,29 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Search over sets of effects and outliers, by the score of `.linear`.
+Search over sets of effects and outliers, and the probability of each effect of a set.
 
-The search is a beam: it keeps the best few sets, and extends each by one effect at a time. After
-each extension the shapes are chosen again, and the outliers are found again among all poses, with
-and without the earlier ones. So a pair may be found of which neither effect is visible alone, and
-an effect is not judged by poses that were knocked.
+The search is a beam: it keeps the best few sets by the score of `.linear`, and extends each by one
+effect at a time. After each extension the shapes are chosen again, and the outliers are found
+again among all poses, with and without the earlier ones. So a pair may be found of which neither
+effect is visible alone, and an effect is not judged by poses that were knocked. A set is accepted
+only if each of its effects is significant beside the others.
 
-A set is accepted only if each of its effects is significant beside the others.
-
-**Random walk.** A walk of the offset (`.wander`) competes with the sets: the same search is done
+**Random walk.** A walk of the offset (`.curves`) competes with the sets: the same search is done
 with equations whitened for the walk, and its score includes the walk.
+
+**Rivals** are effects that would explain the data about as well as a named one. The probability of
+an effect against its rivals follows from the score of the set with each of them in its place,
+exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is estimated from the
+same equations, so differences are less certain: c is the share of the degrees of freedom that the
+set leaves.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from .linear import Block, LEVEL, Linear, Set
-from ..effects import effect_named, fitted_places
-from ..estimate import by_pose, outliers_among
+from .curves import Process, Walk, walk_beside
+from .linear import Block, Linear, Set
+from ..effects import fitted_places, LADDER, WANDER
 
 LARGEST = 5
 """Largest number of effects in a set."""
@@ -47,32 +53,23 @@ _NEARLY = 0.3
 _PATIENCE = 2
 """The search ends if the best score has not risen for this number of extensions."""
 
-_INSTEAD = ({'gain', 'axis_gain'}, {'gain_change', 'axis_gain_change'})
-"""Effects of which one includes the other."""
+LEAST = 0.01
+"""Smallest probability of a rival."""
 
 
 def explored(linear: Linear) -> list[Set]:
-    """
-    Return the sets visited, the best score first.
-
-    Parameters
-    ----------
-    linear : Linear
-        The equations, with candidates.
-
-    """
-    front = _distinct(linear, with_outliers(linear, linear.made()))
+    """Return the sets visited, the best score first."""
+    front = _distinct(linear, linear.with_outliers(linear.set_of()))
     visited = list(front)
-    best, idle = max(each.score for each in front), 0
+    best, idle = max(chosen.score for chosen in front), 0
     for _ in range(LARGEST):
-        grown = _distinct(linear, [new for before in front for new in _extended(linear, before)])
-        grown = [_with_best_shapes(linear, new) for new in grown[:_TESTED]]
-        grown = [each for new in grown for each in with_outliers(linear, new)]
-        front = _distinct(linear, grown)[:_WIDTH]
+        larger = _distinct(linear, [new for before in front for new in _extended(linear, before)])
+        larger = [_with_best_shapes(linear, new) for new in larger[:_TESTED]]
+        larger = [chosen for new in larger for chosen in linear.with_outliers(new)]
+        front = _distinct(linear, larger)[:_WIDTH]
         if not front:
             break
-        fewer = [each for one in front[:3] for each in _fewer(linear, one)]
-        visited += [*front, *fewer]
+        visited += [*front, *(fewer for new in front[:3] for fewer in linear.fewer(new))]
         idle = 0 if front[0].score > best else idle + 1
         best = max(best, front[0].score)
         if idle == _PATIENCE:
@@ -80,80 +77,66 @@ def explored(linear: Linear) -> list[Set]:
     return _distinct(linear, visited)
 
 
-def simpler(linear: Linear, chosen: Set) -> Iterator[Set]:
+def simpler(linear: Linear, chosen: Set) -> list[Set]:
     """
-    Yield sets with one effect less, in which another effect has the best searched shape.
+    Return sets with one effect less, in which another effect has the best searched shape.
 
     Between the shapes that are tried, two effects may imitate one: an offset that changes with
     temperature and with its rate is one that lags.
 
     """
-    if len(chosen.blocks) < 2:
-        return
-    for less in _fewer(linear, chosen):
-        for effect in dict.fromkeys(block.effect for block in linear.blocks if _is_fitted(block)):
+    fitted: dict[str, list[int]] = {}
+    for number, block in enumerate(linear.blocks if len(chosen.blocks) > 1 else ()):
+        if block.searched and fitted_places(block.entry, block.shape):
+            fitted.setdefault(block.effect, []).append(number)
+    sets = []
+    for less in linear.fewer(chosen):
+        for effect, own in fitted.items():
             others = [block for block in less.blocks if linear.blocks[block].effect != effect]
-            if effect in _barred({linear.blocks[block].effect for block in others}):
+            if _is_barred(linear.blocks[own[0]], [linear.blocks[block] for block in others]):
                 continue
-            gain, _ = linear.gains(linear.made(others, chosen.out))
-            own = [number for number, block in enumerate(linear.blocks)
-                   if block.effect == effect and _is_fitted(block)]
-            new = linear.made([*others, max(own, key=lambda number: gain[number])], chosen.out)
+            gain, _ = linear.gains(linear.set_of(others, chosen.out))
+            new = linear.set_of([*others, max(own, key=lambda number: gain[number])], chosen.out)
             if new.score > _NEARLY * chosen.score:
-                yield new
-
-
-def _is_fitted(block: Block) -> bool:
-    """Return whether a fit changes the shape of a block."""
-    return bool(block.searched and fitted_places(effect_named(block.effect), block.shape))
-
-
-def names_of(linear: Linear, chosen: Set) -> tuple[str, ...]:
-    """Return the names of the effects of a set."""
-    return tuple(linear.blocks[block].effect for block in chosen.blocks)
+                sets.append(new)
+    return sets
 
 
 def accepted(linear: Linear, visited: Iterable[Set]) -> Iterator[Set]:
     """Yield the sets whose effects are all significant, the preferred one first."""
-    left = sorted(visited, key=lambda each: -each.score)
+    left = sorted(visited, key=lambda chosen: -chosen.score)
     while left:
         near: list[Set] = []
-        for each in left:
-            if near and each.score < near[0].score - _AS_GOOD:
+        for chosen in left:
+            if near and chosen.score < near[0].score - _AS_GOOD:
                 break
-            if is_significant(linear, each):
-                near.append(each)
+            if linear.is_significant(chosen):
+                near.append(chosen)
         if not near:
             return
-        best = min(near, key=lambda each: (
-            each.parameters, any('new' in effect_named(name).needs
-                                 for name in names_of(linear, each)), -each.score))
+        best = min(near, key=lambda chosen: (
+            chosen.parameters, any('new' in linear.blocks[block].entry.needs
+                                   for block in chosen.blocks), -chosen.score))
         yield best
-        left = [each for each in left if each is not best]
+        left = [chosen for chosen in left if chosen is not best]
 
 
-def is_significant(linear: Linear, chosen: Set) -> bool:
-    """Return whether each effect of a set is significant beside the others."""
-    return all(linear.probability(chosen, block) < LEVEL for block in chosen.blocks)
+def _extended(linear: Linear, before: Set) -> list[Set]:
+    """Return the set with one more effect, for the effects with the best scores."""
+    present = [linear.blocks[block] for block in before.blocks]
+    best: dict[str, tuple[float, int]] = {}
+    for number, score in enumerate(linear.scores_beside(before).tolist()):
+        block = linear.blocks[number]
+        if score > best.get(block.effect, (-np.inf, 0))[0] and not _is_barred(block, present):
+            best[block.effect] = score, number
+    return [linear.set_of((*before.blocks, number), before.out)
+            for _, number in sorted(best.values(), reverse=True)[:_BRANCHES]]
 
 
-def _extended(linear: Linear, before: Set) -> Iterator[Set]:
-    """Yield the set with one more effect, for the effects with the best scores."""
-    gain, rank = linear.gains(before)
-    barred = _barred(set(names_of(linear, before)))
-    scores: dict[str, tuple[float, int]] = {}
-    for number, block in enumerate(linear.blocks):
-        if rank[number] and block.effect not in barred:
-            score = linear.score_with(before, number, gain[number], rank[number])
-            if score > scores.get(block.effect, (-np.inf, 0))[0]:
-                scores[block.effect] = score, number
-    for _, number in sorted(scores.values(), reverse=True)[:_BRANCHES]:
-        yield linear.made((*before.blocks, number), before.out)
-
-
-def _barred(names: set[str]) -> set[str]:
-    """Return the effects that cannot be added to a set with these names."""
-    return names.union(*(group for group in _INSTEAD if group & names))
+def _is_barred(block: Block, present: Iterable[Block]) -> bool:
+    """Return whether one of the effects present is that of a block, contains it or is in it."""
+    return any(block.effect == other.effect or block.effect in other.entry.includes
+               or other.effect in block.entry.includes for other in present)
 
 
 def _with_best_shapes(linear: Linear, chosen: Set) -> Set:
@@ -163,38 +146,105 @@ def _with_best_shapes(linear: Linear, chosen: Set) -> Set:
                 if block.effect == linear.blocks[number].effect]
         if len(same) == 1:
             continue
-        others = (*chosen.blocks[:place], *chosen.blocks[place + 1:])
-        gain, _ = linear.gains(linear.made(others, chosen.out))
+        before, after = chosen.blocks[:place], chosen.blocks[place + 1:]
+        gain, _ = linear.gains(linear.set_of((*before, *after), chosen.out))
         best = max(same, key=lambda other: gain[other])
         if best != number:
-            new = linear.made((*chosen.blocks[:place], best, *chosen.blocks[place + 1:]),
-                              chosen.out)
-            chosen = max(chosen, new, key=lambda each: each.score)
+            new = linear.set_of((*before, best, *after), chosen.out)
+            chosen = max(chosen, new, key=lambda either: either.score)
     return chosen
-
-
-def with_outliers(linear: Linear, chosen: Set) -> Iterator[Set]:
-    """Yield a set as it is, and with the outliers that it leaves."""
-    yield chosen
-    plain = linear.made(chosen.blocks) if chosen.out else chosen
-    onto = np.hstack([linear.onto, plain.onto])
-    found = outliers_among(by_pose(plain.residual, onto, linear.pose), plain.rss,
-                           linear.dof - int(plain.parameters), linear.poses,
-                           noise_known=linear.worth > 0.0)
-    if tuple(found.poses.tolist()) != chosen.out:
-        yield linear.made(chosen.blocks, found.poses.tolist())
-
-
-def _fewer(linear: Linear, chosen: Set) -> Iterator[Set]:
-    """Yield a set without one of its effects."""
-    if len(chosen.blocks) > 1:
-        for block in chosen.blocks:
-            yield linear.without(chosen, block)
 
 
 def _distinct(linear: Linear, sets: Iterable[Set]) -> list[Set]:
     """Return the best set of each list of names and outliers, the best score first."""
-    found: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
-    for each in sorted(sets, key=lambda each: -each.score):
-        found.setdefault((frozenset(names_of(linear, each)), each.out), each)
-    return list(found.values())
+    best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
+    for chosen in sorted(sets, key=lambda chosen: -chosen.score):
+        best.setdefault((frozenset(linear.effects_of(chosen)), chosen.out), chosen)
+    return list(best.values())
+
+
+@dataclass(frozen=True)
+class Near:
+    """
+    The equations of all poses near a model, and what was chosen in them.
+
+    Parameters
+    ----------
+    linear : Linear
+        The equations, with candidates; whitened if there is a walk.
+    chosen : Set
+        The chosen effects and outliers.
+    walk : Walk or None
+        The random walk of the offset.
+    plain : Linear
+        The equations before they were whitened.
+    process : Process or None
+        The modes of a walk; None if it is not tried.
+
+    """
+
+    linear: Linear
+    chosen: Set
+    walk: Walk | None
+    plain: Linear
+    process: Process | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the chosen effects."""
+        return self.linear.effects_of(self.chosen)
+
+    @property
+    def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
+        """Return what was chosen, apart from values and shapes."""
+        return frozenset(self.names), self.chosen.out, self.walk is not None
+
+
+def probabilities(name: str, near: Near) -> dict[str, float]:
+    """
+    Return the probability of a named effect and of each effect in its place.
+
+    Parameters
+    ----------
+    name : str
+        A chosen effect, or `WANDER`.
+    near : Near
+        The final equations and set.
+
+    Returns
+    -------
+    dict
+        Probability by name, the most probable first; they sum to 1.
+
+    """
+    if name != WANDER and name not in near.names:
+        return {name: 1.0}
+    whole = near.plain.worth + near.plain.dof
+    certainty = max((whole - near.chosen.parameters) / whole, LEAST)
+    scores = _scores(name, near, near.chosen.score + 2.0 * np.log(LEAST) / certainty)
+    most = max(scores.values())
+    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
+               for key, score in scores.items()}
+    total = sum(weights.values())
+    ordered = sorted(weights, key=lambda key: -weights[key])
+    return {key: weights[key] / total for key in ordered}
+
+
+def _scores(name: str, near: Near, least: float) -> dict[str, float]:
+    """Return the scores above `least` of the set with each effect in the place of a named one."""
+    if name == WANDER:
+        problem, own = near.plain, []
+    else:
+        problem, own = near.linear, [near.chosen.blocks[near.names.index(name)]]
+    others = problem.set_of([block for block in near.chosen.blocks if block not in own],
+                            near.chosen.out)
+    names, scores = near.names, {name: near.chosen.score}
+    for number, likely in enumerate(problem.scores_beside(others)):
+        effect = problem.blocks[number].effect
+        if (likely > least and effect not in names
+                and (effect in LADDER or name not in LADDER)):
+            score = problem.set_of((*others.blocks, number), others.out).score
+            scores[effect] = max(score, scores.get(effect, -np.inf))
+    if name != WANDER and near.walk is None and near.process is not None:
+        scores[WANDER] = walk_beside(near.plain, others, near.process).score
+    return scores

@@ -1,210 +1,37 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Text about a refinement: its verdict, its advice, and where the gap is.
-
-**Not testable.** Effects that the poses cannot show, and the data to record for them.
-
-**Where.** Description of where simulation and measurement disagree: directions, ranges or poses.
-
-"""
+"""Sentences about a refinement and about a plan of poses, from their figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .linear import linearised
-from .state import State
+from ..calibrate import words_of
 from ..effects import (
     CHANGES,
     effect_named,
-    EFFECTS,
     EMPIRICAL,
     empirical_parts,
-    parameter_names,
-    PROCESSES,
     TO_SEPARATE,
     value_unit,
     VARIABLES,
     WANDER,
 )
-from ..estimate import kinds
-from ..table import COLUMNS, Floats, Poses
+from ..geometry import ATTITUDES, unit
+from ..table import COLUMNS, Floats
 from ..text import counted, short
-from ..units import MG
 
 if TYPE_CHECKING:
-    from .records import Refinement, Step
+    from .result import Refinement, Step
     from .search import Found
 
-_LEAST_VISIBLE = 0.1
-"""Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
-
-
-def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
-                 ) -> list[tuple[str, str]]:
-    """
-    Return the effects that these poses cannot show, with the data to record.
-
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g.
-    testable : mapping of str to float
-        Effects that the poses distinguish from the model, and how visible they are.
-    present : tuple of str
-        Effects of the model and their rivals.
-
-    """
-    missing = []
-    known = kinds(poses_g)[0]
-    for name, effect in {**EFFECTS, **PROCESSES}.items():
-        if name in present or effect.output is not None:
-            continue
-        if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
-            continue
-        if name in ('gain', 'axis_gain') and {'gain', 'axis_gain'} & set(present):
-            continue
-        lacking = [', '.join(COLUMNS[key].names) for key in effect.needs if key not in poses_g]
-        if lacking:
-            missing.append((name, ' and '.join(lacking)))
-        elif name == 'misalignment' and not len(known):
-            missing.append((name, 'ref_x, ref_y, ref_z (known orientation)'))
-        elif name in PROCESSES:
-            continue
-        elif effect.needs:
-            missing.append((name, 'poses with a larger change of this quantity: '
-                            f'{COLUMNS[effect.needs[0]].meaning}'))
-        else:
-            missing.append((name, 'more poses in more directions'))
-    return missing
-
-
-_NEAREST = 2
-"""Number of known effects that are named as the nearest to a curve."""
-
-
-def curve_words(name: str, before: State, after: State) -> str:
-    """Return a description of an empirical curve, and of the known effects nearest to it."""
-    carrier, variable, _ = empirical_parts(name)
-    share = before.fit.equations.of_poses(before.fit.residual - after.fit.residual) * MG
-    whole, _, part = carrier.partition('.')
-    what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
-    of = f' of {part}' if part else ''
-    lines = [f'the {what}{of} changes with {VARIABLES[variable]} by up to '
-             f'{np.max(np.abs(share)):.2g} mg{_steepest(variable, before, share)}']
-    left = _left_by_known(before)
-    if left:
-        lines.append('no known effect has this form, the nearest are ' + ', '.join(
-            f'{effect} (leaves {gap:.2g} mg)' for effect, gap in left))
-    return '; '.join(lines)
-
-
-def _steepest(variable: str, before: State, share: Floats) -> str:
-    """Return where a curve is steepest, for a variable of one number."""
-    if variable in ('force', 'std'):
-        return ''
-    values = before.poses_g[variable]
-    order = np.argsort(values, kind='stable')
-    parts = np.array_split(order, 5)
-    middle = [float(np.mean(values[part])) for part in parts]
-    size = [float(np.sqrt(np.mean(share[part] ** 2))) for part in parts]
-    at = int(np.argmax(np.abs(np.diff(size))))
-    unit = COLUMNS[variable].unit
-    return f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} {unit}'
-
-
-def _left_by_known(before: State) -> list[tuple[str, float]]:
-    """Return the known effects that leave least of the residual, and what they leave [mg]."""
-    names = tuple(name for name in EFFECTS if name not in before.model.values)
-    linear = linearised(before.fit, before.model.effects, names)
-    nothing = linear.made()
-    gain, rank = linear.gains(nothing)
-    found: dict[str, float] = {}
-    for number in np.argsort(-gain):
-        if rank[number] and linear.blocks[number].effect not in found and len(found) < _NEAREST:
-            left = linear.made((int(number),)).residual
-            found[linear.blocks[number].effect] = before.gap_mg(left)
-    return list(found.items())
-
-
-_LARGEST = 3
-_NEAR = np.cos(np.radians(30.0))
-
-
-def where(effect: str, before: State, after: Floats) -> str:
-    """
-    Return a description of where an effect explains the disagreement.
-
-    Parameters
-    ----------
-    effect : str
-        The effect.
-    before : State
-        State without the effect.
-    after : (m,) array
-        Residuals of the equations with the effect.
-
-    """
-    share = (before.fit.equations.of_poses(before.fit.residual - after)) * MG
-    if effect == 'offset_step':
-        return _instant(before, share)
-    needs = effect_named(effect).needs
-    column = next((key for key in needs if key in before.poses_g and key != 'new'), None)
-    if column is None:
-        return _directions(before.fit.equations.force, share)
-    return _range(column, before, share)
-
-
-def _instant(before: State, share: Floats) -> str:
-    """Return a text about the instant of the largest change between successive poses."""
-    time = before.poses_g['time']
-    order = np.argsort(time, kind='stable')[:int(np.sum(np.isfinite(time)))]
-    time, moved = time[order], share[order]
-    count = np.arange(1, len(moved))
-    sums = np.cumsum(moved ** 2)[:-1]
-    at = int(np.argmax(np.abs(sums / count - (np.sum(moved ** 2) - sums) / (len(moved) - count))))
-    rows = before.poses_g.row[order]
-    return f'between {time[at]:.6g} and {time[at + 1]:.6g} s (rows {rows[at]} and {rows[at + 1]})'
-
-
-def _range(column: str, before: State, share: Floats) -> str:
-    """Return a text about the range of a quantity and the disagreement at both ends."""
-    known = np.isfinite(before.poses_g[column].reshape(len(share), -1)).all(axis=1)
-    values, share = before.poses_g[column][known], share[known]
-    if values.ndim > 1:
-        values = np.linalg.norm(values, axis=1)
-    order = np.argsort(values, kind='stable')
-    ends = max(1, len(order) // 5)
-    low, high = (np.sqrt(np.mean(share[part] ** 2)) for part in (order[:ends], order[-ends:]))
-    name = column.replace('_', ' ')
-    unit = COLUMNS[column].unit if column != 'std' else 'g'
-    return (f'over {name} {values[order[0]]:.4g} to {values[order[-1]]:.4g} {unit}: '
-            f'{low:.2g} mg RMS in the lowest fifth of the poses, {high:.2g} mg in the highest')
-
-
-def _directions(force: Floats, share: Floats) -> str:
-    """Return a text about the directions with the largest disagreement."""
-    signs = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)
-                      if i or j or k], float)
-    units = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    near = units @ force.T >= _NEAR
-    counts = np.sum(near, axis=1)
-    means = np.where(counts > 0, near @ share / np.maximum(counts, 1), 0.0)
-    largest = [k for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]]
-    return 'with ' + ', '.join(
-        f'{_name(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share)} poses)'
-        for k in largest)
-
-
-def _name(signs: Floats) -> str:
-    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
-                    for axis, sign in zip('xyz', signs, strict=True) if sign)
-
+_NEAR = math.cos(math.radians(8.0))
+"""A direction within 8° of a face, edge or corner has its name."""
 
 _FAR = 10.0
 """Ratio to the typical size above which there is a remark."""
@@ -212,110 +39,9 @@ _FAR = 10.0
 _FEW = 10
 """Degrees of freedom below which most effects cannot be detected."""
 
-_OTHER_SENSOR = 'this is probably another sensor'
-
-
-def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
-               untestable: tuple[tuple[str, str], ...], left_out: int) -> tuple[str, ...]:
-    """
-    Return advice for the user, one line each.
-
-    Parameters
-    ----------
-    verdict : str
-        Verdict of the refinement.
-    found : Found
-        The result of the search.
-    steps : tuple of Step
-        The added effects.
-    untestable : tuple of (str, str)
-        Effects that the data cannot show, and the data to record for them.
-    left_out : int
-        Number of poses that were left out.
-
-    """
-    lines = _other_sensor(found)
-    lines += [_separating(step) for step in steps if step.rivals]
-    lines += [line for step in steps for line in _remarks(step)]
-    if left_out:
-        poses = '1 pose was' if left_out == 1 else f'{left_out} poses were'
-        lines.append(f'{poses} left out; take {"it" if left_out == 1 else "them"} again')
-    if found.base.dof < _FEW:
-        lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
-                     f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
-                     'most effects: take 24 poses or more')
-    if verdict == 'unexplained' and _has_no_structure(found):
-        lines.append(_poor_repeatability(found))
-    elif verdict == 'unexplained':
-        nearest = f'; {", ".join(found.taken_back)} would explain only a part' if (
-            found.taken_back) else ''
-        lines.append('a gap remains that no effect testable with these data explains'
-                     f'{nearest}: check what differs between the poses, and repeat some of them')
-        columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
-        if columns:
-            lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
-    return tuple(lines)
-
-
-def _has_no_structure(found: Found) -> bool:
-    """Return whether nothing in the scatter of the poses has a form."""
-    return not found.taken_back and found.curve is None and WANDER not in found.added
-
-
-def _poor_repeatability(found: Found) -> str:
-    """Return how much more the poses scatter than their samples say, and what to do."""
-    final = found.final
-    return (f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their samples, '
-            'and the scatter has no structure: clamp the sensor, let it settle longer')
-
-
-def _other_sensor(found: Found) -> list[str]:
-    """Return a line if the changes are too large for one sensor."""
-    for name, values in found.final.model.values.items():
-        if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
-            return [f'{_OTHER_SENSOR}: its {name.removesuffix("_change")} differs from the stored '
-                    f'one by {np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much '
-                    'for one sensor; fit a new calibration from its own poses']
-    return []
-
-
-def change_words(name: str, state: State, date: str) -> str:
-    """Return a text about the change of a value since a stored calibration, with uncertainty."""
-    effect, model = effect_named(name), state.model
-    which = [parameter_names(model.effects).index(f'{name}.{part}') for part in effect.parameters]
-    deviation = float(np.sqrt(np.mean(np.diag(state.fit.covariance)[which])))
-    in_percent = name != 'offset_change'
-    scale, unit = (100.0, '%') if in_percent else (1e3, 'mg')
-    digits = max(0, -int(np.floor(np.log10(max(deviation * scale, 1e-6)))))
-    values = ', '.join(f'{value * scale:+.{digits}f}' for value in model.values[name])
-    since = f' since {date[:10]}' if date else ''
-    own = effect_named(name.removesuffix('_change')).words
-    return f'the {own} has changed by ({values}) ± {deviation * scale:.{digits}f} {unit}{since}'
-
-
-def _separating(step: Step) -> str:
-    """Return advice on how to separate an effect from its rivals."""
-    families = {effect_named(name).family for name in (step.effect, *step.rivals)
-                if name != EMPIRICAL}
-    family = families.pop() if len(families) == 1 else ''
-    return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
-            f'{TO_SEPARATE[family]}')
-
-
-def _remarks(step: Step) -> list[str]:
-    """Return a remark on values that are far larger than in common parts."""
-    if step.effect == EMPIRICAL:
-        return []
-    effect = effect_named(step.effect)
-    largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
-                  default=0.0)
-    if largest <= _FAR * effect.typical:
-        return []
-    return [f'{step.effect} is {largest:.2g} {effect.unit}, typical parts have about '
-            f'{effect.typical:.2g}: check that the sensor causes it, and not the setup']
-
-
 _LEAST_P = 1e-16
+
+_OTHER_SENSOR = 'this is probably another sensor'
 
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
@@ -361,13 +87,281 @@ def chance(p_value: float) -> str:
     return f'p < {_LEAST_P:.0e}' if p_value < _LEAST_P else f'p = {p_value:.1g}'
 
 
+def percent(probability: float) -> str:
+    """Return a probability as text; only certainty is 0 or 100 %."""
+    if 0.0 < probability < 0.005:
+        return '< 1 %'
+    return '> 99 %' if 0.995 <= probability < 1.0 else f'{100.0 * probability:.0f} %'
+
+
 def values_of(step: Step) -> list[tuple[str, str]]:
     """Return name and text of each value of a step; values in g are given in mg."""
     effect = effect_named(step.name)
     values = []
     for name, value in step.parameters.items():
-        unit, scale = value_unit(step.name, name)
-        words = (f'{value * scale:+.3g} {unit}'.replace('-', '−') if name in effect.parameters
-                 else f'{value:.5g} {unit}'.rstrip())
+        unit_name, scale = value_unit(step.name, name)
+        words = (f'{value * scale:+.3g} {unit_name}'.replace('-', '−')
+                 if name in effect.parameters else f'{value:.5g} {unit_name}'.rstrip())
         values.append((name, words))
     return values
+
+
+def sample_words(used: int, total: int) -> str:
+    """Return a warning about a sample of a long table."""
+    return (f'the refinement uses {used} of {total} poses, spread evenly over the table, to bound '
+            'its time and memory; it does not look for disturbed poses among the others; choose '
+            'rows to use others')
+
+
+def limit_words(rows: str, limit_g: float) -> str:
+    """Return where readings are clipped."""
+    return f'in {rows}: an axis reads {limit_g:.4g} g and its samples hardly scatter'
+
+
+def grid_words(step_mg: float) -> str:
+    """Return the step of a grid and the error that it causes."""
+    return (f'pose means are multiples of {step_mg:.3g} mg, which causes '
+            f'{step_mg / np.sqrt(12.0):.2g} mg RMS per axis')
+
+
+def curve_words(name: str, largest_mg: float, steepest: tuple[float, float] | None,
+                nearest: Mapping[str, float]) -> str:
+    """
+    Return a description of an empirical curve.
+
+    Parameters
+    ----------
+    name : str
+        Name of the curve.
+    largest_mg : float
+        Its largest contribution to a pose [mg].
+    steepest : (float, float) or None
+        The values of the variable between which it changes most.
+    nearest : mapping of str to float
+        What the known effects that are most similar leave of the residual [mg].
+
+    """
+    carrier, variable, _ = empirical_parts(name)
+    whole, _, part = carrier.partition('.')
+    what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
+    of = f' of {part}' if part else ''
+    words = f'the {what}{of} changes with {VARIABLES[variable]} by up to {largest_mg:.2g} mg'
+    if steepest is not None:
+        low, high = steepest
+        words += f', most between {low:.4g} and {high:.4g} {COLUMNS[variable].unit}'
+    if nearest:
+        words += '; no known effect has this form, the nearest are ' + ', '.join(
+            f'{effect} (leaves {left:.2g} mg)' for effect, left in nearest.items())
+    return words
+
+
+def instant_words(times: tuple[float, float], rows: tuple[int, int]) -> str:
+    """Return the poses before and after an instant, by their times [s] and rows."""
+    return (f'between {times[0]:.6g} and {times[1]:.6g} s (rows {rows[0]} and {rows[1]})')
+
+
+def range_words(column: str, ends: tuple[float, float], rms_mg: tuple[float, float]) -> str:
+    """Return the range of a column, and the disagreement at both ends of it [mg]."""
+    unit_name = COLUMNS[column].unit if column != 'std' else 'g'
+    return (f'over {column.replace("_", " ")} {ends[0]:.4g} to {ends[1]:.4g} {unit_name}: '
+            f'{rms_mg[0]:.2g} mg RMS in the lowest fifth of the poses, {rms_mg[1]:.2g} mg in the '
+            'highest')
+
+
+def direction_words(means: Sequence[tuple[Floats, float, int]], total: int) -> str:
+    """Return the mean disagreement around directions, from (signs, mean [mg], poses) of each."""
+    return 'with ' + ', '.join(f'{_axes(signs)} up ({mean:+.2g} mg over {count} of {total} poses)'
+                               for signs, mean, count in means)
+
+
+def change_words(name: str, values: Floats, deviation: float, date: str) -> str:
+    """Return the change of a value since a stored calibration of a date, with its uncertainty."""
+    effect = effect_named(CHANGES[name].base)
+    scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
+    digits = max(0, -int(np.floor(np.log10(max(deviation * scale, 1e-6)))))
+    shown = ', '.join(f'{value * scale:+.{digits}f}' for value in values)
+    since = f' since {date[:10]}' if date else ''
+    return (f'the {effect.words} has changed by ({shown}) ± {deviation * scale:.{digits}f} '
+            f'{unit_name}{since}')
+
+
+def plain_name(name: str) -> str:
+    """Return the name of an effect, for a change that of the effect that has changed."""
+    return CHANGES[name].base if name in CHANGES else name
+
+
+def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
+               untestable: tuple[tuple[str, str], ...], left_out: int) -> tuple[str, ...]:
+    """
+    Return advice for the user, one line each.
+
+    Parameters
+    ----------
+    verdict : str
+        Verdict of the refinement.
+    found : Found
+        The result of the search.
+    steps : tuple of Step
+        The added effects.
+    untestable : tuple of (str, str)
+        Effects that the data cannot show, and the data to record for them.
+    left_out : int
+        Number of poses that were left out.
+
+    """
+    lines = _other_sensor(found)
+    lines += [_separating(step) for step in steps if step.rivals]
+    lines += [line for step in steps for line in _remarks(step)]
+    if left_out:
+        were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
+        lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
+    if found.base.dof < _FEW:
+        lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
+                     f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
+                     'most effects: take 24 poses or more')
+    if verdict == 'unexplained':
+        lines += _unexplained(found, untestable)
+    return tuple(lines)
+
+
+def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[str]:
+    """Return what to do about a gap that remains."""
+    final, nearest = found.final, ''
+    if not found.taken_back and found.curve is None and WANDER not in found.added:
+        return [f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their '
+                'samples, and the scatter has no structure: clamp the sensor, let it settle '
+                'longer']
+    if found.taken_back:
+        nearest = f'; {", ".join(found.taken_back)} would explain only a part'
+    lines = [f'a gap remains that no effect testable with these data explains{nearest}: check '
+             'what differs between the poses, and repeat some of them']
+    columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
+    if columns:
+        lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
+    return lines
+
+
+def _other_sensor(found: Found) -> list[str]:
+    """Return a line if the changes are too large for one sensor."""
+    for name, values in found.final.model.values.items():
+        if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
+            return [f'{_OTHER_SENSOR}: its {CHANGES[name].base} differs from the stored one by '
+                    f'{np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much for '
+                    'one sensor; fit a new calibration from its own poses']
+    return []
+
+
+def _separating(step: Step) -> str:
+    """Return advice on how to separate an effect from its rivals."""
+    families = {effect_named(name).family for name in (step.effect, *step.rivals)
+                if name != EMPIRICAL}
+    family = families.pop() if len(families) == 1 else ''
+    return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
+            f'{TO_SEPARATE[family]}')
+
+
+def _remarks(step: Step) -> list[str]:
+    """Return a remark on values that are far larger than in common parts."""
+    if step.effect == EMPIRICAL:
+        return []
+    effect = effect_named(step.effect)
+    largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
+                  default=0.0)
+    if largest <= _FAR * effect.typical:
+        return []
+    return [f'{step.effect} is {largest:.2g} {effect.unit}, typical parts have about '
+            f'{effect.typical:.2g}: check that the sensor causes it, and not the setup']
+
+
+def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,
+               enough: bool) -> list[str]:
+    """
+    Return the lines about one contest.
+
+    Parameters
+    ----------
+    weights : mapping of str to float
+        Probability of the named effect, then of its rivals.
+    poses : sequence of (str, str)
+        Direction and conditions of each pose that separates them, in words.
+    expected : float
+        Expected probability of the right one after all poses of the plan.
+    enough : bool
+        Whether this is enough.
+
+    """
+    odds = ', '.join(percent(weight) for weight in weights.values())
+    what = f'to separate {versus(tuple(weights))} ({odds})'
+    end = f'the expected probability of the right one is then {percent(expected)}'
+    if poses:
+        return [f'{what}, take these poses:', *_held(poses), end]
+    if enough:
+        return [f'{what}, the same poses are enough: {end}']
+    return [f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)']
+
+
+def _held(poses: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Yield one line for each condition; conditions with the same directions share a line."""
+    directions: dict[str, list[str]] = {}
+    for direction, where in poses:
+        directions.setdefault(where, []).append(direction)
+    shared: dict[tuple[str, ...], list[str]] = {}
+    for where, held in directions.items():
+        shared.setdefault(tuple(_counted(held)), []).append(where)
+    for texts, places in shared.items():
+        where = ' and '.join(filter(None, places))
+        yield f'{where + ": " if where else ""}hold {"; ".join(texts)}'
+
+
+def _counted(texts: list[str]) -> list[str]:
+    """Return each text once, with the number of times if there are several."""
+    times = {text: texts.count(text) for text in texts}
+    return [text if count == 1 else f'{text} ({count} poses)' for text, count in times.items()]
+
+
+def versus(names: Sequence[str]) -> str:
+    """Return the words of an effect and its rivals."""
+    first, *others = (plain_name(name) for name in names)
+    return f'{first} from {", ".join(others)}'
+
+
+def condition_words(context: Mapping[str, float]) -> str:
+    """Return the context of a planned pose in words; empty if the pose can be taken at once."""
+    parts = []
+    if 'temperature' in context:
+        parts.append(f'at {context["temperature"]:.0f} °C')
+    if 'supply_voltage' in context:
+        parts.append(f'at {context["supply_voltage"]:.2f} V')
+    if 'std' in context:
+        parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+    if context.get('time', 0.0) > 0.0:
+        parts.append(f'{_duration(context["time"])} after the last pose')
+    return ' '.join(parts)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f'{seconds:.0f} s'
+    return f'{seconds / 60.0:.0f} min' if seconds < 7200.0 else f'{seconds / 3600.0:.1f} h'
+
+
+def attitude_words(up: Floats) -> str:
+    """Return a direction that points up in words: a face, edge or corner, or a tilted face."""
+    known = ATTITUDES
+    near = int(np.argmax(known @ up))
+    if known[near] @ up >= _NEAR:
+        return f'{words_of(np.sign(known[near]))} up ({_axes(known[near])})'
+    axis = int(np.argmax(np.abs(up)))
+    face = np.sign(up) * (np.arange(3) == axis)
+    flat = unit((up - up[axis] * np.eye(3)[axis])[np.newaxis])[0]
+    edges = known[known[:, axis] == 0.0]
+    raised = edges[int(np.argmax(edges @ flat))]
+    tilt = math.degrees(math.acos(min(abs(float(up[axis])), 1.0)))
+    return (f'{words_of(face)} up ({_axes(face)}), tilted by {tilt:.0f}° so that '
+            f'{words_of(np.sign(raised))} ({_axes(raised)}) rises')
+
+
+def _axes(signs: Floats) -> str:
+    """Return the axes of these signs, such as ``+x -y``."""
+    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
+                    for axis, sign in zip('xyz', signs, strict=True) if sign)

@@ -45,8 +45,7 @@ from ..effects import (
     with_vector,
 )
 from ..estimate import coverage
-from ..refine.records import percent
-from ..refine.words import chance, values_of, verdict_words
+from ..refine.words import chance, percent, values_of, verdict_words
 from ..table import Floats
 from ..text import counted, short, with_sd
 from ..units import MG

@@ -2,10 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Effects of the output: readings clipped at a limit, or on a grid.
+What a search starts from: the poses that can be used, and a model fitted to them.
 
-Both effects act on the whole reading, so they are not columns of the equations. They are detected
-in the readings themselves.
+**Long tables.** A sample of a long table bounds the time and the memory of a refinement. Nobody
+turns a sensor to thousands of poses by hand: long tables come from machines, or are samples in
+place of poses. With `MOST` equations a refinement takes 10 s and 300 MB as a rule, and about a
+minute and 900 MB in the worst case: all context, and noise that no effect explains. A pose has one
+equation, or three if its orientation is known or shared. The sample takes one pose out of each
+part of the table. The place in the part changes by the golden ratio, so that a table that repeats
+the same turns gives all of them.
+
+**Effects of the output** act on the whole reading: readings clipped at a limit, or on a grid. They
+are not columns of the equations, so they are detected in the readings themselves.
 
 **Limit.** The samples of an axis at the limit of the sensor scatter less than those of any pose
 away from the limit. Such a pose, and the poses so near the limit that some samples reach it, are
@@ -21,17 +29,32 @@ capture includes it in the noise of its poses; in other tables it is missing, an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .state import beginning, State
+from .linear import held_out, Linear, linearised, Set
 from ..calibrate import with_history
 from ..capture import rounding_left
-from ..effects import Model
-from ..estimate import judge, NotConvergedError
+from ..effects import included, Model, MODELS
+from ..estimate import estimate, Fit, judge, NotConvergedError
 from ..table import Floats, Poses
+from ..units import MG
+
+MOST = 6000
+"""Largest number of equations that a refinement uses."""
+
+_VECTORS = 3
+"""Number of equations of a pose of known or shared orientation."""
+
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+
+_CHI2_LEVEL = 1e-3
+_CHI2_RATIO = 1.3
+"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 _QUIET = 0.7
 """Largest scatter of clipped samples, relative to the smallest scatter away from the limit."""
@@ -83,18 +106,142 @@ _RELEVANT = 0.25
 
 
 @dataclass(frozen=True)
+class State:
+    """A model fitted to the poses kept."""
+
+    fit: Fit
+
+    @property
+    def model(self) -> Model:
+        """Return the fitted model, ΔR = I."""
+        return self.fit.model
+
+    @property
+    def poses_g(self) -> Poses:
+        """Return the poses kept, in g, with the column ``previous``."""
+        return self.fit.poses_g
+
+    @cached_property
+    def linear(self) -> Linear:
+        """Return the equations with all values of the model projected out, without candidates."""
+        return linearised(self.fit, self.model.effects)
+
+    @cached_property
+    def nothing(self) -> Set:
+        """Return the empty set beside the model."""
+        return self.linear.set_of()
+
+    @property
+    def residual(self) -> Floats:
+        """(m,) array, residuals of the equations with all values fitted."""
+        return self.linear.residual
+
+    @property
+    def rss(self) -> float:
+        """Sum of squared residuals."""
+        return self.linear.base_rss
+
+    @property
+    def held_out(self) -> Floats:
+        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
+        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
+
+    @property
+    def dof(self) -> int:
+        """Return the number of independent equations minus that of fitted values."""
+        return self.linear.dof
+
+    @property
+    def is_noise(self) -> bool:
+        """Return whether noise may explain the residual; True if the noise is not known."""
+        return not self.fit.noise_known or is_noise(self.rss, self.dof)
+
+    def gap_mg(self, residual: Floats) -> float:
+        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
+        of_poses = self.fit.equations.of_poses(residual)
+        if 'new' in self.poses_g:
+            of_poses = of_poses[self.poses_g['new'] > 0.0]
+        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
+
+    def mg_of_poses(self, residual: Floats) -> Floats:
+        """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
+        return self.fit.equations.of_poses(residual) * MG
+
+    @property
+    def floor_mg(self) -> float | None:
+        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
+        if not self.fit.noise_known:
+            return None
+        rows = self.fit.by_pose.rows[self.fit.equations.pose]
+        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
+        return self.gap_mg(share)
+
+
+def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
+    """Return the values of a model with one more effect, which replaces those it contains."""
+    contained = included((name,))
+    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
+
+
+def is_noise(rss: float, dof: float) -> bool:
+    """Return whether measured noise explains a weighted sum of squares."""
+    from scipy.special import chdtrc
+
+    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
+
+
+def beginning(poses_g: Poses, model: Model) -> State:
+    """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
+    return State(estimate(model, with_history(poses_g, model)))
+
+
+def fitted_state(model: Model, poses_g: Poses) -> State | None:
+    """Return the state of a model fitted to poses, or None without a sound fit."""
+    try:
+        return State(estimate(model, poses_g))
+    except NotConvergedError:
+        return None
+
+
+def sampled(poses: Poses) -> Poses:
+    """
+    Return the poses for `MOST` equations, and as many of those of a stored calibration.
+
+    Poses that share their orientation stay together, unless too many do.
+
+    """
+    most = MOST // (_VECTORS if {'reference', 'orientation'} & set(poses.columns) else 1)
+    if len(poses) <= most:
+        return poses
+    new = poses['new'] > 0.0 if 'new' in poses else np.ones(len(poses), bool)
+    parts = [part[_kept(poses.take(part), most)]
+             for part in (np.flatnonzero(new), np.flatnonzero(~new)) if len(part)]
+    return poses.take(np.sort(np.concatenate(parts)))
+
+
+def _kept(poses: Poses, most: int) -> NDArray[np.intp]:
+    """Return the indices of the sample."""
+    count = len(poses)
+    if 'orientation' in poses and count > most:
+        group = np.unique(poses['orientation'], return_inverse=True)[1]
+        groups = int(group.max()) + 1
+        kept = np.flatnonzero(np.isin(group, _spread(groups, max(most * groups // count, 1))))
+        if most // 2 <= len(kept) <= 2 * most:
+            return kept
+    return _spread(count, most)
+
+
+def _spread(count: int, wanted: int) -> NDArray[np.intp]:
+    """Return at most `wanted` different indices, one out of each part of the range."""
+    if count <= wanted:
+        return np.arange(count)
+    part = np.arange(wanted)
+    return np.unique(((part + part * _GOLDEN % 1.0) * (count / wanted)).astype(np.intp))
+
+
+@dataclass(frozen=True)
 class Clipped:
-    """
-    The limit of the sensor, and the poses at the limit.
-
-    Parameters
-    ----------
-    limit_g : float
-        The limit of the readings [g].
-    poses : (d,) array of int
-        Indices of the poses.
-
-    """
+    """The limit of the readings [g], and the (d,) indices of the poses at the limit."""
 
     limit_g: float
     poses: NDArray[np.intp]
@@ -121,15 +268,7 @@ def clipped(poses_g: Poses) -> Clipped | None:
 
 
 def grid_step(poses_g: Poses) -> float | None:
-    """
-    Return the step of a grid that causes most of the noise of the pose means.
-
-    Returns
-    -------
-    float or None
-        The step [g]; None without such a grid.
-
-    """
+    """Return the step of a grid that causes most of the noise of the pose means [g], or None."""
     clip = clipped(poses_g)
     if clip is not None:  # readings at a limit are constant, too
         poses_g = poses_g.take(np.delete(np.arange(len(poses_g)), clip.poses))
@@ -246,10 +385,9 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
 
 def _linear(base: Model) -> Model:
     """Return the base with offset, gains and cross-axis, which it may lack because of the clip."""
-    values = {name: part for name, part in base.values.items() if name != 'gain'}
-    for name in ('offset', 'axis_gain', 'cross_axis'):
-        values.setdefault(name, np.zeros(3))
-    return Model(values)
+    whole = MODELS['10'].effects
+    kept = {name: values for name, values in base.values.items() if name not in included(whole)}
+    return Model({**kept, **{name: np.zeros(3) for name in whole if name not in kept}})
 
 
 def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
@@ -281,7 +419,8 @@ def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
     step = grid_step(poses_g)
     if step is None:
         return poses_g, None
-    if _is_explained(beginning(poses_g, base)):
+    plain = beginning(poses_g, base)
+    if plain.fit.noise_known and plain.is_noise:
         return poses_g, step if _is_included(poses_g, step) else None
     on_grid = with_grid(poses_g, step)
     if poses_g.noise is None and not _is_all_noise(beginning(on_grid, base)):
@@ -300,8 +439,3 @@ def _is_included(poses_g: Poses, step: float) -> bool:
 def _is_all_noise(state: State) -> bool:
     """Return whether the residuals match the noise of the grid, neither larger nor smaller."""
     return state.is_noise and state.rss > _LEAST_OF_GRID * state.dof
-
-
-def _is_explained(state: State) -> bool:
-    """Return whether measured noise explains the residuals."""
-    return state.fit.noise_known and state.is_noise
