@@ -141,8 +141,10 @@ from accel_calib.refine.base import (
     sampled,
     unclipped,
 )
+from accel_calib.refine.curves import _grown as grown_curve
 from accel_calib.refine.curves import (
     best_curve,
+    Curve,
     is_curve,
     Process,
     process_of,
@@ -154,8 +156,9 @@ from accel_calib.refine.linear import _RARE as RARE
 from accel_calib.refine.linear import Block, Linear, linearised, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
 from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
+from accel_calib.refine.search import _is_better as is_better_than_walk
 from accel_calib.refine.search import search as search_effects
-from accel_calib.refine.sets import accepted, explored, probabilities
+from accel_calib.refine.sets import accepted, explored, Near, probabilities
 from accel_calib.refine.words import advice_for, attitude_words, values_of, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page

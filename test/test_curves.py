@@ -204,6 +204,16 @@ def test_poses_that_repeat_badly_have_no_curve():
         assert best_curve(base_of(poses), poses, ()) is None
 
 
+def test_a_curve_that_leaves_most_of_the_gap_is_not_added():
+    poses, _ = with_curve(hump)
+    along = poses.reading / np.linalg.norm(poses.reading, axis=1, keepdims=True)
+    unknown = np.random.default_rng(5).normal(size=(COUNT, 1)) * 2e-3 * along
+    poses = poses.with_columns(reading=poses.reading + unknown)
+    assert best_curve(base_of(poses), poses, ()) is not None
+    found = refine(poses, G, base='10')
+    assert (found.verdict, found.steps) == ('unexplained', ())
+
+
 def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described):
     calibration = described.calibration
     name = next(name for name in calibration.model.values if is_curve(name))

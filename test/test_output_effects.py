@@ -148,6 +148,17 @@ def test_the_stated_noise_of_means_on_a_coarse_grid_is_correct(ratio):
     assert 0.6 < np.mean(scores) < 1.4
 
 
+def test_a_grid_is_named_where_the_stated_noise_includes_it():
+    poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
+    model = fit_poses(poses, G, model='10').model
+    same, step = off_grid(poses, model)
+    assert same is poses
+    assert step == pytest.approx(8e-3, rel=1e-3)
+    few = poses.with_columns(std=np.full((40, 3), 5e-4), count=np.ones(40)).take(np.arange(9))
+    assert grid_step(few) == pytest.approx(8e-3, rel=1e-3)
+    assert off_grid(few, model) == (few, None)  # as many poses as values: no gap to explain
+
+
 def test_a_table_whose_noise_lacks_the_grid_gets_it():
     poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
     assert poses.noise is not None

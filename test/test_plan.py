@@ -106,6 +106,22 @@ def test_temperature_and_drift_are_separated_at_other_temperatures(trends, tmp_p
     assert waits == sorted(waits)
 
 
+def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
+    rng = np.random.default_rng(0)
+    time = np.arange(24) * 60.0
+    supply = 3.2 + 0.2 * (time / time[-1] + 0.1 * rng.normal(size=24))
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        'supply_ratio': np.array([0.002, 0.04, -0.04, 0.04])})
+    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.005, samples=100,
+                           context={'time': time, 'supply_voltage': supply})
+    planned = refine(poses, G, base='10').plan.poses
+    low, high = np.min(supply), np.max(supply)
+    assert planned
+    for pose in planned:
+        assert min(abs(pose.context['supply_voltage'] - each)
+                   for each in (low, (low + high) / 2.0, high)) < 1e-9
+
+
 def test_the_poses_of_the_plan_name_the_hidden_effect():
     rng = np.random.default_rng(11)
     model = model_with({'offset': np.array([0.02, -0.01, 0.03]),

@@ -10,11 +10,15 @@ from inside import (
     accepted,
     beginning,
     Block,
+    Curve,
     explored,
     fitted_state,
+    grown_curve,
+    is_better_than_walk,
     Linear,
     linearised,
     Model,
+    Near,
     Process,
     process_of,
     RARE,
@@ -151,6 +155,35 @@ def test_the_score_counts_values_shapes_choice_and_size():
         expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
 
+def test_only_sets_of_several_effects_have_smaller_ones():
+    linear = by_hand(np.ones(9), np.eye(9)[:, :2], ['supply_ratio', 'offset_drift'])
+    assert linear.fewer(linear.set_of((0,))) == []
+    assert [fewer.blocks for fewer in linear.fewer(linear.set_of((0, 1)))] == [(1,), (0,)]
+
+
+NAMES = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift', 'warm_up', 'gain_drift')
+
+
+def test_the_search_goes_on_while_the_score_rises_and_two_effects_further():
+    rng = np.random.default_rng(4)
+    columns, noise = np.linalg.qr(rng.normal(size=(60, 6)))[0], rng.normal(size=60)
+    for count in (1, 3):
+        linear = by_hand(columns[:, :count] @ np.full(count, 20.0) + noise, columns, NAMES)
+        visited = explored(linear)
+        assert sorted(visited[0].blocks) == list(range(count))
+        assert max(len(chosen.blocks) for chosen in visited) == min(count + 2, 5)
+
+
+@pytest.mark.parametrize(('count', 'cosines'), [(2, {0, 1}), (3, set())])
+def test_a_curve_of_two_cosines_is_found_where_neither_alone_is_useful(count, cosines):
+    axes, slope = np.eye(40), 0.1
+    side = math.sqrt(1.0 - slope ** 2)
+    columns = np.array([axes[0], side * axes[0] + slope * axes[1],
+                        side * axes[1] + slope * axes[2]]).T[:, :count]
+    linear = by_hand(math.sqrt(200.0) * axes[count - 1], columns, NAMES[:count])
+    assert set(grown_curve(linear).blocks) == cosines
+
+
 def test_noise_alone_is_significant_as_often_as_stated():
     names = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift')
     best = []
@@ -223,6 +256,7 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     found = white.values_of(white.set_of((0, 1)))
     np.testing.assert_allclose([found[0][0], found[1][0]], values)
     flat = Walk(process, 0.0, 0.0, 0.0).whitened(linear)
+    np.testing.assert_array_equal(flat.residual, residual)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
 
 
@@ -273,3 +307,26 @@ def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
         likely.append(walk.likelihood_ratio)
     assert likely[0] > 3.0 * SIGNIFICANT
     assert likely[1] < 0.5 * SIGNIFICANT
+
+
+@pytest.mark.parametrize(('size', 'least', 'most'), [(5.0, 5.0, 150.0), (100.0, 1e3, 1e3)])
+def test_the_variance_of_a_walk_is_bounded_where_the_noise_is_not_known(size, least, most):
+    rng = np.random.default_rng(3)
+    process = random_process(60, 6, rng)
+    along = np.sqrt(process.values) * rng.normal(size=6) * size
+    linear = by_hand(process.axes @ along + rng.normal(size=60), np.eye(60)[:, :1],
+                     ['supply_ratio'], worth=0.0)
+    ratio = walk_beside(linear, linear.set_of(), process).ratio
+    assert least * (1.0 - 1e-9) <= ratio <= most * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(('variable', 'score', 'better'), [
+    ('temperature', 19.9, False), ('temperature', 20.1, True), ('time', 49.9, False),
+    ('time', 50.1, True)])
+def test_a_curve_over_time_must_be_clearly_better_than_a_walk(variable, score, better):
+    rng = np.random.default_rng(3)
+    linear = by_hand(rng.normal(size=20), np.eye(20)[:, :1], ['supply_ratio'])
+    nothing = linear.set_of()
+    walk = Walk(random_process(20, 4, rng), 1.0, nothing.score + 20.0, 50.0)
+    curve = Curve(f'empirical-offset-{variable}-1', np.zeros(5), score, (), 0.0)
+    assert is_better_than_walk(curve, Near(linear, nothing, walk, linear, None)) == better

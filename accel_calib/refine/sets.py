@@ -86,7 +86,7 @@ def simpler(linear: Linear, chosen: Set) -> list[Set]:
 
     """
     fitted: dict[str, list[int]] = {}
-    for number, block in enumerate(linear.blocks if len(chosen.blocks) > 1 else ()):
+    for number, block in enumerate(linear.blocks):
         if block.searched and fitted_places(block.entry, block.shape):
             fitted.setdefault(block.effect, []).append(number)
     sets = []
