@@ -176,7 +176,7 @@ def test_the_search_goes_on_while_the_score_rises_and_two_effects_further():
 
 @pytest.mark.parametrize(('count', 'cosines'), [(2, {0, 1}), (3, set())])
 def test_a_curve_of_two_cosines_is_found_where_neither_alone_is_useful(count, cosines):
-    axes, slope = np.eye(40), 0.1
+    axes, slope = np.eye(40), 0.2
     side = math.sqrt(1.0 - slope ** 2)
     columns = np.array([axes[0], side * axes[0] + slope * axes[1],
                         side * axes[1] + slope * axes[2]]).T[:, :count]

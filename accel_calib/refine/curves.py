@@ -70,20 +70,10 @@ _HELD_OUT = 0.9
 
 class Curve(NamedTuple):
     """
-    A curve beside a model.
+    A curve beside a model, and the indices of the outliers beside it.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    values : (p,) array
-        Its values, with the range of the variable.
-    score : float
-        Its score, relative to no curve.
-    out : tuple of int
-        Indices of the outliers beside it.
-    p_value : float
-        Probability that noise alone makes one of all curves this good.
+    Its (p,) values include the range of the variable. The score is relative to no curve, and the
+    p-value is the probability that noise alone makes one of all curves this good.
 
     """
 
@@ -95,19 +85,7 @@ class Curve(NamedTuple):
 
 
 def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | None:
-    """
-    Return the best curve beside a model, or None if none is significant.
-
-    Parameters
-    ----------
-    state : State
-        The model.
-    poses_g : Poses
-        All poses, in g.
-    out : tuple of int
-        Indices of the outliers.
-
-    """
+    """Return the best curve beside a model, or None; `out`: indices of the outliers."""
     fit = judge(state.model, poses_g)
     plain = linearised(fit, state.model.effects)
     if plain.dof < _LEAST_DOF:
@@ -254,17 +232,7 @@ SIGNIFICANT = 10.0
 
 @dataclass(frozen=True)
 class Process:
-    """
-    The modes of a walk outside of the base.
-
-    Parameters
-    ----------
-    axes : (m, r) array
-        Orthonormal directions among the equations.
-    values : (r,) array
-        Variance along each of them, relative to the largest.
-
-    """
+    """Orthonormal modes of a walk outside of the base, (m, r), and their relative variances."""
 
     axes: Floats
     values: Floats
@@ -273,19 +241,10 @@ class Process:
 @dataclass(frozen=True)
 class Walk:
     """
-    A walk beside a set.
+    A walk beside a set, with its variance relative to the noise, and the score of both.
 
-    Parameters
-    ----------
-    process : Process
-        Its modes.
-    ratio : float
-        λ, its variance relative to the noise.
-    score : float
-        Score of the set with the walk.
-    likelihood_ratio : float
-        Twice the logarithm of the likelihood ratio against no walk, or against an offset that
-        scatters from pose to pose.
+    The likelihood ratio is twice its logarithm, against no walk, or against an offset that
+    scatters from pose to pose.
 
     """
 

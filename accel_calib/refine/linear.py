@@ -82,25 +82,7 @@ _OFFSET = Model({'offset': np.zeros(3)})
 
 
 class Block(NamedTuple):
-    """
-    The columns of one effect with one shape.
-
-    Parameters
-    ----------
-    effect : str
-        Name of the effect.
-    shape : (s,) array
-        Its shape.
-    columns : slice
-        Its columns in `Linear.columns`.
-    entry : Effect
-        Entry of the effect in the catalogue.
-    searched : int
-        Number of values of the shape that were searched in the same data.
-    tried : float
-        Number of independent shapes tried.
-
-    """
+    """Columns of an effect with one (s,) shape, its values searched, and the shapes tried."""
 
     effect: str
     shape: Floats
@@ -125,10 +107,9 @@ class Linear:
         Index of the pose of each equation.
     blocks : tuple of Block
         The candidates.
-    columns : (m, c) array
-        Columns of all blocks outside of the base, relative to `sizes`.
-    sizes : (c,) array
-        Norms of the columns before the base was projected out.
+    columns, sizes : (m, c) array, (c,) array
+        Columns of all blocks outside of the base, and their norms before it was projected out, to
+        which they are relative.
     worth : float
         ν; 0 if the noise is not known.
     dof : int
@@ -137,10 +118,9 @@ class Linear:
         Residual sum of squares of the base, to which scores are relative.
     offset : (m, 3) array
         Columns of an offset.
-    choice : float
-        What the choice of one effect among the candidates, or of a walk, costs.
-    penalty : float
-        Subtracted from all scores.
+    choice, penalty : float
+        What the choice of one effect among the candidates, or of a walk, costs; subtracted from
+        all scores.
     white : (m, r) array, (r,) array, or None
         Orthonormal directions along which the equations were whitened, and the part of each that
         was taken away.
@@ -356,14 +336,11 @@ class Set:
         Orthonormal columns that span both; those of the poses first.
     residual, rss : (m,) array, float
         The residual that they leave, and its sum of squares.
-    ranks : tuple of float
-        Number of values that each block determines beside the blocks before it.
-    parameters : float
-        Number of values, with searched shapes and equations left out.
-    charge : float
-        What is subtracted from its score apart from these values.
-    score : float
-        The criterion; 0 for the base.
+    ranks, parameters : tuple of float, float
+        Number of values that each block determines beside the blocks before it; number of values,
+        with searched shapes and equations left out.
+    charge, score : float
+        What is subtracted from the score apart from these values; the criterion, 0 for the base.
 
     """
 
@@ -392,17 +369,7 @@ def held_out(residual: Floats, own: Floats) -> Floats:
 
 
 def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str] = ()) -> Linear:
-    """
-    Return the linear problem at a model, with candidates.
-
-    Parameters
-    ----------
-    fit : Fit
-        The model at all poses; it may have more effects than the base.
-    base, names : iterable of str
-        Names of the effects of the base, and of the candidates.
-
-    """
+    """Return the linear problem at a fit, given the names of the base and of the candidates."""
     near, model = fit.equations, fit.model
     held = Model({name: values for name, values in model.values.items() if name in base})
     further = Model({name: values for name, values in model.values.items() if name not in base})

@@ -176,21 +176,7 @@ def variance_of(near: Near) -> float:
 
 @dataclass(frozen=True)
 class _Contest:
-    """
-    A named effect and its rivals, each with a fit to the poses.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The named effect, then its rivals.
-    weights : (k,) array
-        Their probabilities.
-    fits : tuple of Fit
-        The model with each of them, at the poses.
-    variance : float
-        λ.
-
-    """
+    """A named effect and its rivals: names, (k,) probabilities, a fit with each, and λ."""
 
     names: tuple[str, ...]
     weights: Floats
@@ -320,16 +306,10 @@ def _varied(contests: Sequence[_Contest]) -> tuple[str, ...]:
 @dataclass(frozen=True)
 class _Candidates:
     """
-    Poses that can be taken.
+    Poses that can be taken, with the readings that the final model predicts [g].
 
-    Parameters
-    ----------
-    poses_g : Poses
-        The poses, with the readings that the final model predicts [g].
-    up : (c, 3) array
-        Direction that points up.
-    shown : tuple of mapping of str to float
-        The varied context of each; the time is the wait after the last pose.
+    `up` is the (c, 3) direction that points up, and `shown` the varied context of each; the time
+    is the wait after the last pose.
 
     """
 

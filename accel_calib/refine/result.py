@@ -232,16 +232,7 @@ def steps_of(found: Found, start: State, date: str, *, joint: bool
     """
     Return the steps of a search, and the residuals at each stage.
 
-    Parameters
-    ----------
-    found : Found
-        The result of the search.
-    start : State
-        The base, as fitted or as stored.
-    date : str
-        Date of a stored base.
-    joint : bool
-        Whether the poses of a stored base are used, too.
+    The base `start` is as fitted, or as stored at a date; `joint`: its poses are used, too.
 
     """
     states = _sequence(found, start)
@@ -421,14 +412,8 @@ def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[s
     """
     Return the effects that these poses cannot show, with the data to record.
 
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g.
-    testable : mapping of str to float
-        Effects that the poses distinguish from the model, and how visible they are.
-    present : tuple of str
-        Effects of the model and their rivals.
+    `testable` are the effects that the poses distinguish from the model, and how visible they
+    are; `present` are the effects of the model and their rivals.
 
     """
     missing = []

@@ -106,22 +106,7 @@ class Found:
 
 
 def search(poses_g: Poses, base: Model) -> Found:
-    """
-    Search for the effects that a base model lacks.
-
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g.
-    base : Model
-        The base model, with ΔR = I.
-
-    Raises
-    ------
-    NotConvergedError
-        If the fit of the base does not converge.
-
-    """
+    """Search for the effects that a base lacks; `NotConvergedError` if its fit fails."""
     everyone = np.arange(len(poses_g))
     whole, clip = unclipped(poses_g, base)
     if clip is not None:

@@ -202,19 +202,9 @@ class Near:
 
 def probabilities(name: str, near: Near) -> dict[str, float]:
     """
-    Return the probability of a named effect and of each effect in its place.
+    Return the probability of a chosen effect, or of `WANDER`, and of each effect in its place.
 
-    Parameters
-    ----------
-    name : str
-        A chosen effect, or `WANDER`.
-    near : Near
-        The final equations and set.
-
-    Returns
-    -------
-    dict
-        Probability by name, the most probable first; they sum to 1.
+    The most probable is first; they sum to 1.
 
     """
     if name != WANDER and name not in near.names:

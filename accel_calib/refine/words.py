@@ -127,18 +127,10 @@ def grid_words(step_mg: float) -> str:
 def curve_words(name: str, largest_mg: float, steepest: tuple[float, float] | None,
                 nearest: Mapping[str, float]) -> str:
     """
-    Return a description of an empirical curve.
+    Return a description of an empirical curve, with its largest contribution to a pose.
 
-    Parameters
-    ----------
-    name : str
-        Name of the curve.
-    largest_mg : float
-        Its largest contribution to a pose [mg].
-    steepest : (float, float) or None
-        The values of the variable between which it changes most.
-    nearest : mapping of str to float
-        What the known effects that are most similar leave of the residual [mg].
+    It changes most between two values of its variable. `nearest` is what the most similar known
+    effects leave of the residual [mg].
 
     """
     carrier, variable, _ = empirical_parts(name)
@@ -195,18 +187,8 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
     """
     Return advice for the user, one line each.
 
-    Parameters
-    ----------
-    verdict : str
-        Verdict of the refinement.
-    found : Found
-        The result of the search.
-    steps : tuple of Step
-        The added effects.
-    untestable : tuple of (str, str)
-        Effects that the data cannot show, and the data to record for them.
-    left_out : int
-        Number of poses that were left out.
+    `untestable` are the effects that the data cannot show, and the data to record for them;
+    `left_out` is the number of poses that were left out.
 
     """
     lines = _other_sensor(found)
@@ -276,18 +258,10 @@ def _remarks(step: Step) -> list[str]:
 def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,
                enough: bool) -> list[str]:
     """
-    Return the lines about one contest.
+    Return the lines about one contest, with the direction and the conditions of each pose.
 
-    Parameters
-    ----------
-    weights : mapping of str to float
-        Probability of the named effect, then of its rivals.
-    poses : sequence of (str, str)
-        Direction and conditions of each pose that separates them, in words.
-    expected : float
-        Expected probability of the right one after all poses of the plan.
-    enough : bool
-        Whether this is enough.
+    `weights` are the probabilities of the named effect and of its rivals. After all poses of the
+    plan, the right one has the probability `expected`; `enough`: more poses are not needed.
 
     """
     odds = ', '.join(percent(weight) for weight in weights.values())
