@@ -32,6 +32,17 @@ def with_sd(value: float, sd: float) -> str:
     return f'{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}'
 
 
+def with_minus(text: str) -> str:
+    """Return text with the minus sign of typography."""
+    return text.replace('-', '−')
+
+
+def signed(value: float, sd: float, unit: str = '') -> str:
+    """Return ``+value ± sd unit``, with the minus sign of typography."""
+    words = with_minus(with_sd(value, sd))
+    return f'{"" if words.startswith("−") else "+"}{words} {unit}'.rstrip()
+
+
 def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '') -> str:
     """Return a table of the CSS class `kind`; the text of the cells is escaped."""
     cells = ''.join(f'<th scope="col">{escape(name)}</th>' for name in head)

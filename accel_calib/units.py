@@ -58,6 +58,11 @@ class Units:
         """Whether it is m/s², the unit of Imu messages."""
         return self.name == 'm/s2'
 
+    @property
+    def symbol(self) -> str:
+        """How people write the unit: m/s², g or native."""
+        return 'm/s²' if self.is_si else self.name
+
     def to_g(self, reading: Floats) -> Floats:
         """Convert readings from this unit to g."""
         return reading / self.per_g

@@ -10,7 +10,7 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level
 from accel_calib.finding import Finding, KINDS, ranked, without
-from accel_calib.findings import rate, Rating
+from accel_calib.findings import figures_of, rate, Rating
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
@@ -113,3 +113,26 @@ def test_findings_are_ranked_by_level_and_then_by_kind() -> None:
 def test_a_kind_that_is_not_listed_is_refused() -> None:
     with pytest.raises(ValueError, match="'surprise'"):
         Finding('surprise', 'what')
+
+
+def test_the_figures_of_a_calibration_are_those_of_its_fields() -> None:
+    effects = {**COMMON, 'quadratic': [0.004, -0.003, 0.005]}
+    poses = ac.simulate(effects, directions=random_directions(40, np.random.default_rng(4)),
+                        units='m/s2', noise=1e-4)
+    calibration = refine(poses, units_of('m/s2')).calibration
+    found = {figure.key: figure for figure in figures_of(calibration)}
+    assert found['rms_after_mg'].value == calibration.quality.rms_after_mg
+    assert found['max_before_mg'].value == 10.0 * calibration.quality.max_before_percent
+    assert found['offset.x'].value == calibration.offset[0]
+    assert found['offset.x'].unit == 'm/s²'
+    assert found['gain.xy'].sd == calibration.gain_sd[0, 1]
+    assert 'gain.yx' not in found  # the same value as gain.xy
+    row = calibration.parameters.index('quadratic.z')
+    assert found['quadratic.z'].value == 1000.0 * calibration.model.vector[row]
+    assert found['quadratic.z'].unit == 'mg/g²'
+
+
+def test_figures_that_are_not_known_are_left_out() -> None:
+    keys = [figure.key for figure in figures_of(ac.fit(poses_of().reading, units='g'))]
+    assert 'noise_floor_mg' not in keys
+    assert 'rms_after_mg' in keys

@@ -20,7 +20,14 @@ from .frame import Done, plain, rated, rating_lines, table, working
 from .inputs import intake_for, rows_between
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
-from ..findings import rate_comparison, rate_verification
+from ..findings import (
+    change_in_words,
+    GAINS,
+    in_words,
+    OFFSETS,
+    rate_comparison,
+    rate_verification,
+)
 from ..stored import read_calibration
 from ..table import check_units
 from ..text import short
@@ -173,8 +180,6 @@ def _history_lines(args: argparse.Namespace, history: History) -> Iterator[Any]:
 
 def _step_line(first: str, second: str, change: Any) -> str:
     """Return one step as a line of text."""
-    from ..report.repeats import change_in_words
-
     comparison = change.comparison
     verdict = 'agree' if comparison.agree else 'differ'
     most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
@@ -185,8 +190,6 @@ def _step_line(first: str, second: str, change: Any) -> str:
 
 def _dates_table(history: History) -> Table:
     """Return a table of offset and gain, one row per calibration and axis."""
-    from ..report.repeats import GAINS, in_words, OFFSETS
-
     made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for name in ('date', ''):
         made.add_column(name, no_wrap=True)

@@ -23,8 +23,23 @@ it must not be used. All limits are in `LIMITS`.
 """
 
 from .expected import Expected
+from .figures import (
+    change_in_words,
+    CROSS,
+    effect_figures,
+    Figure,
+    figures_of,
+    GAINS,
+    in_words,
+    linear_figures,
+    OFFSETS,
+    residual_figures,
+    scale_of,
+)
 from .limits import GOOD_MG, Limit, LIMITS
 from .verdicts import rate, rate_comparison, rate_refinement, rate_verification, Rating
 
-__all__ = ['GOOD_MG', 'LIMITS', 'Expected', 'Limit', 'Rating', 'rate', 'rate_comparison',
-           'rate_refinement', 'rate_verification']
+__all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'OFFSETS', 'Expected', 'Figure', 'Limit',
+           'Rating', 'change_in_words', 'effect_figures', 'figures_of', 'in_words',
+           'linear_figures', 'rate', 'rate_comparison', 'rate_refinement', 'rate_verification',
+           'residual_figures', 'scale_of']

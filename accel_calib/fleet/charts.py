@@ -20,8 +20,9 @@ import numpy as np
 from .overview import OfModel, table_of
 from .store import Row
 from ..compare import NAMES
+from ..findings import change_in_words, CROSS, GAINS, in_words, OFFSETS, scale_of
 from ..report.drawings import Drawing
-from ..report.repeats import CROSS, GAINS, in_words, label_dates, OFFSETS, scale_of
+from ..report.repeats import label_dates
 from ..report.style import (
     ACCENT,
     AFTER,
@@ -36,7 +37,7 @@ from ..report.style import (
     THIRD,
 )
 from ..table import Floats
-from ..text import short, with_sd
+from ..text import short
 
 Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""
@@ -266,8 +267,7 @@ def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
 
 def change_words(change: Mapping[str, Any]) -> str:
     """Return a change with its standard deviation, and whether it lasts."""
-    zero, _, _ = scale_of(change['parameter'])
-    words = in_words(change['parameter'], change['change'] + zero, change['sd'])
+    words = change_in_words(change['parameter'], change['change'], change['sd'])
     return f'{change["parameter"].replace(".", " ")} {words}, {lasting_words(change["for_good"])}'
 
 
@@ -278,9 +278,7 @@ def lasting_words(for_good: bool | None) -> str:
 
 def drift_words(drift: Mapping[str, Any]) -> str:
     """Return a drift with its standard deviation."""
-    _, factor, unit = scale_of(drift['parameter'])
-    words = with_sd(drift['per_year'] * factor, drift['sd'] * factor)
-    return f'{"" if words.startswith("-") else "+"}{words} {unit} per year'.replace('-', '−', 1)
+    return f'{change_in_words(drift["parameter"], drift["per_year"], drift["sd"])} per year'
 
 
 def _places(rows: Sequence[Row]) -> tuple[Floats, bool]:

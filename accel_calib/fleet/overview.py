@@ -33,7 +33,7 @@ from .models import alike, FEWEST
 from .store import Row
 from ..compare import NAMES
 from ..effects import LADDER
-from ..report.repeats import scale_of
+from ..findings import scale_of
 from ..table import Floats
 from ..text import counted, short
 

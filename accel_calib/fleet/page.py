@@ -36,8 +36,8 @@ from ..calibrate import FleetPrior
 from ..compare import NAMES
 from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
+from ..findings import scale_of
 from ..report.drawings import Drawing
-from ..report.repeats import scale_of
 from ..report.sheet import (
     figures,
     heading,

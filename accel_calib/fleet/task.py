@@ -31,6 +31,7 @@ from ..compare import NAMES, rotation_free
 from ..disk import write_atomically
 from ..effects import MODELS
 from ..errors import AccelCalibError, crash_words, RefusedFitError, system_error
+from ..findings import residual_figures
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
 from ..pipeline import calibrated, Outcome, Plan
@@ -229,9 +230,8 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
         'model': calibration.name, 'effects': list(calibration.model.effects),
         'refined': outcome.line, 'units': intake.units.name, 'poses': len(calibration.poses),
-        'poses_used': len(poses), 'rms_before_mg': quality.rms_before_mg,
-        'rms_after_mg': quality.rms_after_mg, 'held_out_rms_mg': quality.held_out_rms_mg,
-        'noise_floor_mg': quality.noise_floor_mg, 'coverage': quality.coverage,
+        'poses_used': len(poses), 'coverage': quality.coverage,
+        **{figure.key: figure.value for figure in residual_figures(quality)},
         'temperature': warm, 'warnings': list(calibration.warnings),
         'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
         'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(

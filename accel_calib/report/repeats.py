@@ -38,11 +38,17 @@ from .style import (
 from .. import __version__
 from ..compare import Comparison, History, Parameter
 from ..disk import write_atomically
-from ..effects import value_unit
-from ..findings import rate_comparison
+from ..findings import (
+    change_in_words,
+    CROSS,
+    GAINS,
+    in_words,
+    OFFSETS,
+    rate_comparison,
+    scale_of,
+)
 from ..table import Floats
-from ..text import short, with_sd
-from ..units import MG
+from ..text import short
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration
@@ -55,28 +61,6 @@ _BAND = 1.96
 _DAY_S = 86400.0
 _ONE_COLOUR = 0.5
 """Range of temperatures that is drawn in one colour [°C]."""
-
-OFFSETS = ('offset.x', 'offset.y', 'offset.z')
-GAINS = ('gain.x', 'gain.y', 'gain.z')
-CROSS = ('gain.xy', 'gain.xz', 'gain.yz')
-
-
-def scale_of(name: str) -> tuple[float, float, str]:
-    """Return zero, factor and unit of a parameter in figures and tables."""
-    if name in OFFSETS:
-        return 0.0, MG, 'mg'
-    if name in (*GAINS, *CROSS):
-        return 1.0 if name in GAINS else 0.0, 100.0, '%'
-    effect, _, part = name.rpartition('.')
-    unit, factor = value_unit(effect, part)
-    return 0.0, factor, unit
-
-
-def in_words(name: str, value: float, sd: float) -> str:
-    """Return a parameter as ``+value ± sd unit``."""
-    zero, factor, unit = scale_of(name)
-    words = with_sd((value - zero) * factor, sd * factor)
-    return f'{"" if words.startswith("-") else "+"}{words} {unit}'.replace('-', '−', 1)
 
 
 def named_words(name: str, value: float, sd: float) -> str:
@@ -373,12 +357,6 @@ def _changes(history: History) -> str:
 def change_words(agree: bool, rating: Rating) -> str:
     """Return whether two calibrations agree, with the rating, such as ``agree, GOOD``."""
     return f'{"agree" if agree else "differ"}, {rating.name}'
-
-
-def change_in_words(name: str, change: float, sd: float) -> str:
-    """Return the change of a parameter as ``+value ± sd unit``."""
-    zero, _, _ = scale_of(name)
-    return in_words(name, zero + change, sd)
 
 
 def _moments(history: History, sources: Sequence[Path]) -> str:

@@ -38,16 +38,16 @@ from ..effects import (
     effect_named,
     EMPIRICAL,
     empirical_parts,
-    LADDER,
     REFERENCE_TEMPERATURE,
     value_unit,
     VARIABLES,
     with_vector,
 )
 from ..estimate import coverage
+from ..findings import effect_figures, Figure, residual_figures
 from ..refine.words import chance, percent, values_of, verdict_words
 from ..table import Floats
-from ..text import counted, short, with_sd
+from ..text import counted, short, signed
 from ..units import MG
 
 if TYPE_CHECKING:
@@ -91,14 +91,9 @@ def _sentence(text: str) -> str:
 def key_numbers(calibration: Calibration, residuals: Residuals,
                 verification: Verification | None) -> str:
     """Return the residual before and after, noise floor, number of poses and coverage."""
-    figures_ = calibration.quality if verification is None else verification
-    pairs = [('before', f'{short(figures_.rms_before_mg)} mg'),
-             ('after', f'{short(figures_.rms_after_mg)} mg'),
-             ('largest after', f'{short(figures_.max_after_percent * MG / 100.0)} mg')]
-    if verification is None and calibration.quality.held_out_rms_mg is not None:
-        pairs.append(('of new poses', f'{short(calibration.quality.held_out_rms_mg)} mg'))
-    if figures_.noise_floor_mg is not None:
-        pairs.append(('noise floor', f'{short(figures_.noise_floor_mg)} mg'))
+    pairs = [(figure.label, f'{short(figure.value)} {figure.unit}')
+             for figure in residual_figures(verification or calibration.quality)
+             if figure.key != 'max_before_mg']
     pairs.append(('poses used', str(len(residuals.poses_g))))
     if len(residuals.left_out):
         pairs.append(('poses left out', str(len(residuals.left_out))))
@@ -161,7 +156,7 @@ def _offsets(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     for k, axis in enumerate(AXES):
         if deviation[k] or found[k]:
             usual = '' if native else f'±{_USUAL_OFFSET_MG[axis]:g} mg'
-            yield f'offset {axis}', _text(found[k], deviation[k], scale, unit), usual
+            yield f'offset {axis}', signed(found[k] * scale, deviation[k] * scale, unit), usual
 
 
 def _gains(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
@@ -173,9 +168,9 @@ def _gains(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     for axis, value, sd in zip(AXES, found, deviation, strict=True):
         name = 'all axes' if equal else axis
         if native:
-            yield f'gain {name}', _text(value, sd, per_g, 'native per g'), usual
+            yield f'gain {name}', signed(value * per_g, sd * per_g, 'native per g'), usual
         elif sd or abs(value - 1.0) > _SAME:
-            yield f'gain {name}', _text(value - 1.0, sd, 100.0, '%'), usual
+            yield f'gain {name}', signed((value - 1.0) * 100.0, sd * 100.0, '%'), usual
         if equal:
             return
 
@@ -185,39 +180,37 @@ def _angles(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     for (i, j), value, sd in zip(_PAIRS, found, deviation, strict=True):
         if sd or abs(value - 90.0) > _SAME:
             name = f'angle {AXES[i]} to {AXES[j]}'
-            words = _text(value - 90.0, sd, 1.0, '').rstrip()
+            words = signed(value - 90.0, sd)
             usual = f'±{_USUAL_CROSS_AXIS_PERCENT:g} %, {_USUAL_CROSS_AXIS:.1f}°'
             yield name, f'90° {words[0]} {words[1:]}°', usual
 
 
 def _other_effects(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     """Yield the values of the other effects; a curve, which has many, is one row."""
-    deviations = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
     for name in calibration.model.effects:
         if name.startswith(f'{EMPIRICAL}-'):
             carrier, variable, modes = empirical_parts(name)
             yield f'curve of {carrier} over {VARIABLES[variable]}', counted(len(modes), 'wave'), ''
-    for name, value, sd in zip(calibration.parameters, calibration.model.vector, deviations,
-                               strict=True):
-        whole, _, part = name.rpartition('.')
-        if whole in LADDER or whole.startswith(f'{EMPIRICAL}-') or not (value or sd):
+    for figure in effect_figures(calibration):
+        name, _, part = figure.key.rpartition('.')
+        if name.startswith(f'{EMPIRICAL}-') or not (figure.value or figure.sd):
             continue
-        unit, scale = value_unit(whole, part)
-        label = f'{whole.replace("_", " ")} {part}'
-        if part not in effect_named(whole).parameters:
-            yield label, f'{value * scale:.5g} {unit}'.rstrip(), ''
-            continue
-        typical = effect_named(whole).typical
-        if unit.startswith('g') and 0.0 < typical * scale < _SMALL:
-            unit, scale = f'µ{unit}', scale * MG ** 2
-        yield (label, _text(value, sd, scale, unit),
-               f'±{short(typical * scale)} {unit}' if typical else '')
+        label = f'{name.replace("_", " ")} {part}'
+        if part in effect_named(name).parameters:
+            yield label, *_with_typical(figure, name, part)
+        else:
+            yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
 
 
-def _text(value: float, sd: float, scale: float, unit: str) -> str:
-    """Return ``+value ± sd unit``."""
-    words = with_sd(value * scale, sd * scale).replace('-', '−')
-    return f'{"" if words.startswith("−") else "+"}{words} {unit}'.rstrip()
+def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str]:
+    """Return the value of an effect, and its typical size; small ones in millionths."""
+    unit, scale = value_unit(effect, parameter)
+    typical = effect_named(effect).typical * scale
+    factor = 1.0
+    if unit.startswith('g') and 0.0 < typical < _SMALL:
+        unit, factor = f'µ{unit}', MG ** 2
+    return (signed(figure.value * factor, figure.sd * factor, unit),
+            f'±{short(typical * factor)} {unit}' if typical else '')
 
 
 def covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> str:
@@ -267,13 +260,13 @@ def poses(residuals: Residuals, calibration: Calibration) -> str:
 def _pose_rows(residuals: Residuals, calibration: Calibration
                ) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the head of the table of poses, and each row with its number."""
-    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[calibration.units.name]
     kept = residuals.poses_g
     optional = [key for key in ('label', 'time', 'temperature') if key in kept]
     names = {'label': 'label', 'time': 'time [s]', 'temperature': '°C'}
-    head = ['row', *(names[key] for key in optional), *(f'{axis} [{unit}]' for axis in AXES),
+    head = ['row', *(names[key] for key in optional),
+            *(f'{axis} [{calibration.units.symbol}]' for axis in AXES),
             'before [mg]', 'after [mg]', *(['note'] if residuals.reasons else [])]
-    signed, rows = residuals.signed, []
+    rows = []
     since = since_first(kept) if 'time' in kept else None
     for k, reading in enumerate(calibration.units.from_g(kept.reading)):
         context = [str(kept[key][k]) if key == 'label' else
@@ -281,8 +274,8 @@ def _pose_rows(residuals: Residuals, calibration: Calibration
                    f'{kept[key][k]:.1f}' for key in optional]
         rows.append((int(kept.row[k]), [
             str(kept.row[k]), *context, *(f'{part:.6g}' for part in reading),
-            milli(residuals.before_mg[k], signed=signed),
-            milli(residuals.after_mg[k], signed=signed)]))
+            milli(residuals.before_mg[k], signed=residuals.signed),
+            milli(residuals.after_mg[k], signed=residuals.signed)]))
     for row, reading in zip(residuals.left_out.row, residuals.left_out.reading, strict=True):
         rows.append((int(row), [str(row), *('' for _ in optional),
                                 *(f'{part:.6g}' for part in reading), '', '', 'left out: '

@@ -301,8 +301,9 @@ def _launch(calibration: Calibration, stored: str) -> str:
 def _python(calibration: Calibration, stored: str) -> str:
     known = ''.join(f', {key}={key}' for key in calibration.model.needs if key in COLUMNS
                     and key in ('time', 'temperature', 'supply_voltage', 'rate'))
-    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native units'}[calibration.units.name]
-    force = 'g' if calibration.units.is_native else unit
+    unit, force = calibration.units.symbol, calibration.units.symbol
+    if calibration.units.is_native:
+        unit, force = 'native units', 'g'
     return ('import accel_calib as ac\n\n'
             f'calibration = ac.load({stored!r})\n'
             f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')

@@ -1,0 +1,127 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The figures of a result: one table of names, units, values and standard deviations.
+
+Every surface shows these figures: terminal, pages, live page, JSON and Parquet. `figures_of` has
+all of a calibration: its residuals [mg], V and W in the unit of the readings, and the values of
+the other effects in the units of the catalogue.
+
+The parameters of `accel_calib.compare` do not depend on the axes of the model. `scale_of` states
+how they are shown: offsets in mg, gains minus 1 and cross-axis gains in %. For native units, 1 g
+is the mean of the sensitivities.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibrate import Calibration, Quality, Verification
+from ..effects import AXES, effect_named, LADDER, value_unit
+from ..text import signed
+from ..units import MG
+
+OFFSETS = ('offset.x', 'offset.y', 'offset.z')
+GAINS = ('gain.x', 'gain.y', 'gain.z')
+CROSS = ('gain.xy', 'gain.xz', 'gain.yz')
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1))
+"""Order of the entries of W."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """
+    A figure of a result.
+
+    Parameters
+    ----------
+    key : str
+        Name, which is unique in the result.
+    label : str
+        Name for people.
+    unit : str
+        Unit of the value; may be empty.
+    value, sd : float
+        Value, and its standard deviation; 0 if it has none.
+
+    """
+
+    key: str
+    label: str
+    unit: str
+    value: float
+    sd: float = 0.0
+
+
+def figures_of(calibration: Calibration) -> tuple[Figure, ...]:
+    """Return all figures of a calibration; those that are not known are left out."""
+    return (*residual_figures(calibration.quality), *linear_figures(calibration),
+            *effect_figures(calibration))
+
+
+def residual_figures(found: Quality | Verification) -> Iterator[Figure]:
+    """Yield the residuals and the noise floor [mg], as far as they are known."""
+    held_out = found.held_out_rms_mg if isinstance(found, Quality) else None
+    for key, label, value in (
+            ('rms_before_mg', 'before', found.rms_before_mg),
+            ('max_before_mg', 'largest before', found.max_before_percent * MG / 100.0),
+            ('rms_after_mg', 'after', found.rms_after_mg),
+            ('max_after_mg', 'largest after', found.max_after_percent * MG / 100.0),
+            ('held_out_rms_mg', 'of new poses', held_out),
+            ('noise_floor_mg', 'noise floor', found.noise_floor_mg)):
+        if value is not None:
+            yield Figure(key, label, 'mg', value)
+
+
+def linear_figures(calibration: Calibration) -> Iterator[Figure]:
+    """Yield the entries of V and W that the model has; equal off-diagonal ones only once."""
+    unit, gain, gain_sd = calibration.units.symbol, calibration.gain, calibration.gain_sd
+    for axis, offset, sd in zip(AXES, calibration.offset, calibration.offset_sd, strict=True):
+        yield Figure(f'offset.{axis}', f'offset {axis}', unit, float(offset), float(sd))
+    per_g = 'per g' if calibration.units.is_native else ''
+    for i, j in _ENTRIES:
+        value, sd = float(gain[i, j]), float(gain_sd[i, j])
+        mirrored = i > j and value == gain[j, i]
+        if (sd > 0.0 or value) and not mirrored:
+            name = AXES[i] if i == j else f'{AXES[i]}{AXES[j]}'
+            yield Figure(f'gain.{name}', f'gain {name}', per_g, value, sd)
+
+
+def effect_figures(calibration: Calibration) -> Iterator[Figure]:
+    """Yield the values of the effects beyond V and W; shapes at their usual value are left out."""
+    variances = np.maximum(np.diag(calibration.covariance), 0.0)
+    deviations = dict(zip(calibration.parameters, np.sqrt(variances).tolist(), strict=True))
+    for effect, values in calibration.model.values.items():
+        shown = {} if effect in LADDER else effect_named(effect).shown(values)
+        for name, value in shown.items():
+            unit, scale = value_unit(effect, name)
+            key = f'{effect}.{name}'
+            yield Figure(key, f'{effect} {name}', unit, value * scale, deviations[key] * scale)
+
+
+def scale_of(name: str) -> tuple[float, float, str]:
+    """Return zero, factor and unit of a parameter in figures and tables."""
+    if name in OFFSETS:
+        return 0.0, MG, 'mg'
+    if name in (*GAINS, *CROSS):
+        return 1.0 if name in GAINS else 0.0, 100.0, '%'
+    effect, _, part = name.rpartition('.')
+    unit, factor = value_unit(effect, part)
+    return 0.0, factor, unit
+
+
+def in_words(name: str, value: float, sd: float) -> str:
+    """Return a parameter as ``+value ± sd unit``."""
+    zero, _, _ = scale_of(name)
+    return change_in_words(name, value - zero, sd)
+
+
+def change_in_words(name: str, change: float, sd: float) -> str:
+    """Return the change of a parameter as ``+value ± sd unit``."""
+    _, factor, unit = scale_of(name)
+    return signed(change * factor, sd * factor, unit)
