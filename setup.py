@@ -23,7 +23,7 @@ setup(
     project_urls={'Repository': URL, 'Bug Tracker': f'{URL}/issues'},
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'live/page/*']},
+    package_data={NAME: ['py.typed', 'live/page/*', 'report/page/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from html import escape
+from itertools import repeat
 import math
 
 _ZERO = 1e-12
@@ -32,6 +33,26 @@ def with_sd(value: float, sd: float) -> str:
     return f'{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}'
 
 
+def milli(value: float, *, signed: bool) -> str:
+    """Return a residual [mg] with as many decimals as a person compares."""
+    size = abs(value)
+    decimals = 0 if size >= 1000.0 else 1 if size >= 9.95 else 2 if size >= 0.0995 else 3
+    return with_minus(f'{round(value, decimals) + 0.0:{"+" if signed else ""}.{decimals}f}')
+
+
+def percentage(share: float) -> str:
+    """Return a share as a whole number of percent."""
+    return f'{share:.0%}'.replace('%', ' %')
+
+
+def power_of_ten(value: float, sd: float) -> str:
+    """Return ``value ± sd`` of a positive value, with a power of ten if it is large or small."""
+    power = math.floor(math.log10(value))
+    if -3 <= power <= 3:
+        return with_sd(value, sd)
+    return f'({with_sd(value / 10.0 ** power, sd / 10.0 ** power)})e{power}'
+
+
 def with_minus(text: str) -> str:
     """Return text with the minus sign of typography."""
     return text.replace('-', '−')
@@ -43,11 +64,13 @@ def signed(value: float, sd: float, unit: str = '') -> str:
     return f'{"" if words.startswith("−") else "+"}{words} {unit}'.rstrip()
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '') -> str:
-    """Return a table of the CSS class `kind`; the text of the cells is escaped."""
+def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '',
+          poses: Sequence[int] = ()) -> str:
+    """Return a table of the CSS class `kind`; `poses` are rows of poses, for a script."""
     cells = ''.join(f'<th scope="col">{escape(name)}</th>' for name in head)
-    lines = ''.join('<tr>' + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
-                    for row in rows)
+    openings = [f'<tr data-row="{row}">' for row in poses] or repeat('<tr>')
+    lines = ''.join(opening + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
+                    for opening, row in zip(openings, rows))
     opening = f'<table class="{kind}">' if kind else '<table>'
     return (f'{opening}\n<thead><tr>{cells}</tr></thead>\n'
             f'<tbody>\n{lines}</tbody>\n</table>\n')

@@ -44,7 +44,7 @@ import accel_calib as ac  # noqa: E402
 from accel_calib import fleet, pipeline  # noqa: E402
 from accel_calib.fleet import Input, Options, Store, Summary  # noqa: E402
 from accel_calib.fleet.overview import not_agreeing  # noqa: E402
-from accel_calib.fleet.store import Row  # noqa: E402
+from accel_calib.fleet.task import Row  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402

@@ -80,12 +80,11 @@ from accel_calib.estimate import distinct, kinds, noise_of, originals, unseen_mi
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
-from accel_calib.fleet.models import alike, estimated, priors_of
 from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects
 from accel_calib.fleet.page import write_fleet_page
 from accel_calib.fleet.run import mapped
-from accel_calib.fleet.sensors import drift_of, merge_sensor
-from accel_calib.fleet.store import schema, write_parquet
+from accel_calib.fleet.sensors import alike, drift_of, estimated, merge_sensor, priors_of
+from accel_calib.fleet.task import schema, write_parquet
 from accel_calib.geometry import (
     OVER_THE_SPHERE,
     quaternion_of,
@@ -161,11 +160,10 @@ from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, Near, probabilities
 from accel_calib.refine.words import advice_for, attitude_words, values_of, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
-from accel_calib.report.page import calibration_page
+from accel_calib.report.page import calibration_page, linear_figures
 from accel_calib.report.page import page as refinement_page
 from accel_calib.report.repeats import comparison_page
-from accel_calib.report.residuals import milli, residuals_of, residuals_of_refinement
-from accel_calib.report.sections import linear_figures
+from accel_calib.report.residuals import residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import snippets
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store

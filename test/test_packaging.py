@@ -124,6 +124,15 @@ def test_all_shipped_files_exist(setup_py: dict[str, Any]) -> None:
     assert not [path for path in shipped if not (ROOT / path).is_file()]
 
 
+def test_every_file_that_is_not_code_is_installed(setup_py: dict[str, Any]) -> None:
+    package = ROOT / 'accel_calib'
+    patterns = setup_py['package_data']['accel_calib']
+    installed = {path for pattern in patterns for path in package.glob(pattern)}
+    assert {package / 'report' / 'page' / name for name in ('style.css', 'script.js')} < installed
+    assert installed == {path for path in package.rglob('*') if path.is_file()
+                         and path.suffix not in ('.py', '.pyc')}
+
+
 def test_every_folder_with_code_is_a_package(setup_py: dict[str, Any]) -> None:
     folders = {path.parent for path in (ROOT / 'accel_calib').rglob('*.py')}
     assert {'.'.join(path.relative_to(ROOT).parts) for path in folders} == set(

@@ -15,12 +15,12 @@ from accel_calib.errors import InputError
 from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, rate_comparison, rate_verification, Rating
 from accel_calib.report import write_history_page
+from accel_calib.text import milli
 from inside import (
     calibration_page,
     comparison_page,
     linear_figures,
     main,
-    milli,
     refinement_page,
     residuals_of,
     residuals_of_refinement,

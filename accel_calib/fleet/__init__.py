@@ -4,15 +4,15 @@
 """
 Calibrations of many recordings on Dask: rows in a Parquet data set, grouped by sensor.
 
-`inputs` finds the recordings, and `identity` names their sensors. `task` calibrates one recording
-on a worker. `store` writes the results, so that each is there once. `sensors` compares the
-calibrations of each sensor over time. `run` submits the tasks.
+`inputs` finds the recordings and names their sensors. `task` calibrates one recording on a worker,
+and stores the result once. `sensors` compares the calibrations of each sensor over time, and
+computes typical values. `overview` has the statistics over the fleet that `page` shows with the
+figures of `charts`. `run` submits the tasks.
 
 """
 
 from .inputs import Input, recordings
 from .run import cluster, run, Summary
-from .store import Store
-from .task import Options, STATUS
+from .task import Options, STATUS, Store
 
 __all__ = ['STATUS', 'Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings', 'run']

@@ -13,39 +13,41 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from .overview import OfModel, table_of
-from .store import Row
+from .task import Row
 from ..compare import NAMES
 from ..findings import change_in_words, CROSS, GAINS, in_words, OFFSETS, scale_of
-from ..report.drawings import Drawing
-from ..report.repeats import label_dates
-from ..report.style import (
+from ..report.charts import (
     ACCENT,
     AFTER,
+    BAND,
     BEFORE,
-    Chart,
+    Drawing,
+    EDGE,
     FAINT,
     legend_below,
     Mark,
+    Marks,
     new_figure,
-    PAPER,
     styled,
     THIRD,
 )
+from ..report.repeats import label_dates, places_of, spoken
 from ..table import Floats
 from ..text import short
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""
 
 _GROUPS = (('offset', 'Zero-g offset', OFFSETS), ('gain', 'Gain minus 1', GAINS),
            ('cross', 'Cross-axis gain', CROSS))
-_BAND = 1.96
-_DAY_S = 86400.0
 _PARTS = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles of the drift of a fleet."""
 
@@ -68,47 +70,24 @@ _COLOURS = (AFTER, THIRD, BEFORE)
 
 
 def of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
-    """
-    Yield histograms of each value over the sensors of a model, with the odd sensors.
-
-    Parameters
-    ----------
-    prefix : str
-        Prefix of the names of the figures, unique on the page.
-    known : OfModel
-        The sensors.
-    odd : sequence of Odd
-        The odd sensors, the farthest first.
-
-    """
+    """Yield histograms of each value over the sensors of a model, with the odd sensors."""
+    table = np.array(list(known.values.values()))
     for key, words, names in _GROUPS:
+        hover = {}
+        with styled():
+            figure = new_figure(3.6, f'{words} [{scale_of(names[0])[2]}]')
+            panels = figure.subplots(3, 1)
+            for panel, name in zip(panels, names, strict=True):
+                own = [each for each in odd if each[1] == name]
+                _draw_histogram(panel, name, table[:, NAMES.index(name)], own)
+                if own:
+                    hover[name] = tuple(Mark(0, odd_words(known, each)) for each in own)
+            panels[1].set_ylabel('sensors')
         yield Drawing(f'{prefix}_{key}', f'{words} over the sensors; triangles: odd sensors',
-                      _draw_values(words, names, known, odd))
-
-
-def _draw_values(title: str, names: Sequence[str], known: OfModel, odd: Sequence[Odd]) -> Chart:
-    hover, table = {}, np.array(list(known.values.values()))
-    with styled():
-        figure = _titled(3.6, f'{title} [{scale_of(names[0])[2]}]')
-        panels = figure.subplots(3, 1)
-        for panel, name in zip(panels, names, strict=True):
-            own = [each for each in odd if each[1] == name]
-            _draw_histogram(panel, name, table[:, NAMES.index(name)], own)
-            if own:
-                hover[name] = tuple(Mark(0, odd_words(known, each)) for each in own)
-        panels[1].set_ylabel('sensors')
-    return Chart(figure, hover)
-
-
-def _titled(height: float, title: str) -> Any:
-    """Return a figure of this height [inch] with a title, in which $ is no mathematics."""
-    figure = new_figure(height)
-    figure.suptitle(title, x=0.02, ha='left', fontsize=10.5, parse_math=False)
-    return figure
+                      figure, hover)
 
 
 def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -> None:
-    """Draw the histogram of a value, and its odd sensors, at the edge if they are far away."""
     zero, factor, _ = scale_of(name)
     values = (column - zero) * factor
     low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
@@ -120,13 +99,18 @@ def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -
     panel.axvline(middle, color=BEFORE, linewidth=1.2)
     panel.text(0.01, 0.95, name.partition('.')[2], transform=panel.transAxes, va='top')
     panel.locator_params(axis='y', integer=True, nbins=3)
-    if not odd:
-        return
+    if odd:
+        _draw_odd(panel, name, odd, middle, reach, 0.12 * max(float(np.max(heights)), 1.0))
+
+
+def _draw_odd(panel: Any, name: str, odd: Sequence[Odd], middle: float, reach: float,
+              height: float) -> None:
+    """Mark the odd sensors, at the edge if they are farther than `reach` from the middle."""
+    zero, factor, _ = scale_of(name)
     at = (np.array([each[2] for each in odd]) - zero) * factor
     places = np.clip(at, middle - reach, middle + reach)
-    height = 0.12 * max(float(np.max(heights)), 1.0)
     panel.plot(places, np.full(len(at), height), 'v', color=ACCENT, gid=name, markersize=7.0,
-               markeredgecolor=PAPER, markeredgewidth=0.4, clip_on=False)
+               clip_on=False, **EDGE)
     for k, (place, value, each) in enumerate(zip(places[:_NAMED], at, odd, strict=False)):
         beyond = '' if place == value else f' {short(value)} →' if value > place else (
             f' ← {short(value)}')
@@ -139,7 +123,7 @@ def odd_words(known: OfModel, odd: Odd) -> str:
     """Return an odd sensor with its value."""
     sensor, name, value, far = odd
     sd = float(known.deviations[sensor][NAMES.index(name)])
-    return (f'{sensor}: {name.replace(".", " ")} {in_words(name, value, sd)}, {far:.0f} spreads '
+    return (f'{sensor}: {spoken(name)} {in_words(name, value, sd)}, {far:.0f} spreads '
             'from the median')
 
 
@@ -149,17 +133,7 @@ def _short_name(name: str) -> str:
 
 
 def of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
-    """
-    Yield the drift of all sensors of a model together, as bands of quantiles by month.
-
-    Parameters
-    ----------
-    prefix : str
-        Prefix of the names of the figures, unique on the page.
-    known : OfModel
-        The sensors.
-
-    """
+    """Yield the drift of all sensors of a model together, as bands of quantiles by month."""
     months, found = known.months.quantiles(_PARTS)
     if len(months) < _FEWEST_MONTHS:
         return
@@ -171,9 +145,9 @@ def of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
                       _draw_months(words, names, days, found))
 
 
-def _draw_months(title: str, names: Sequence[str], days: Floats, found: Floats) -> Chart:
+def _draw_months(title: str, names: Sequence[str], days: Floats, found: Floats) -> Figure:
     with styled():
-        figure = _titled(3.9, f'{title} minus its median [{scale_of(names[0])[2]}]')
+        figure = new_figure(3.9, f'{title} minus its median [{scale_of(names[0])[2]}]')
         panels = figure.subplots(3, 1, sharex=True)
         for panel, name in zip(panels, names, strict=True):
             column = found[:, :, NAMES.index(name)] * scale_of(name)[1]
@@ -186,54 +160,47 @@ def _draw_months(title: str, names: Sequence[str], days: Floats, found: Floats) 
             panel.set_ylabel(name.partition('.')[2])
         label_dates(panels[-1], days, dated=True)
         panels[-1].set_xlabel('month of the recording')
-    return Chart(figure)
+    return figure
 
 
 def of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]
               ) -> Drawing:
     """
-    Draw the calibrations of one sensor over time, with bands and its changes.
+    Draw the newest calibrations of one sensor over time, with bands and its changes.
 
     Parameters
     ----------
     name : str
-        Name of the figure, unique on the page.
+        Name of the figure.
     sensor : str
         Name of the sensor.
     rows : sequence of dict
-        Rows of its calibrations, in order of date; the newest are drawn.
+        Rows of its calibrations, in order of date.
     changes : sequence of mapping
         Its changes, as in `accel_calib.fleet.sensors`.
 
     """
     shown = rows[-_NEWEST:]
-    keys = [row['key'] for row in shown]
-    marked = [change for change in changes if change['key'] in keys]
-    title = f'{sensor}: calibrations over time with 95 % band'
-    return Drawing(name, title, _draw_sensor(sensor, shown, marked))
-
-
-def _draw_sensor(sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]) -> Chart:
-    values, deviations = table_of(rows)
-    groups = [group for group in _GROUPS if group[0] != 'cross' or np.any(
-        deviations[:, [NAMES.index(name) for name in CROSS]])]
-    at, dated = _places(rows)
+    places = {row['key']: place for place, row in enumerate(shown)}
+    marked = [(places[change['key']], change) for change in changes if change['key'] in places]
+    values, deviations = table_of(shown)
+    cross = np.any(deviations[:, [NAMES.index(name) for name in CROSS]])
+    groups = [names for _, _, names in _GROUPS if cross or names is not CROSS]
+    at, dated = places_of([_stamp(row['date']) for row in shown])
     with styled():
-        figure = _titled(0.9 + 1.15 * len(groups), _short_name(sensor))
+        figure = new_figure(0.9 + 1.15 * len(groups), _short_name(sensor))
         panels = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
-        for panel, (_, _, names) in zip(panels, groups, strict=True):
+        for panel, names in zip(panels, groups, strict=True):
             columns = [NAMES.index(name) for name in names]
             _draw_group(panel, names, at, values[:, columns], deviations[:, columns])
-            for change in changes:
-                place = at[[row['key'] for row in rows].index(change['key'])]
-                panel.axvline(place, color=ACCENT, linewidth=1.4, linestyle='-'
+            for place, change in marked:
+                panel.axvline(at[place], color=ACCENT, linewidth=1.4, linestyle='-'
                               if change['for_good'] else (0, (2, 3)))
-        hover = _mark_changes(panels[0], rows, at, changes)
+        hover = _mark_changes(panels[0], shown, at, marked)
         label_dates(panels[-1], at, dated=dated)
         panels[-1].set_xlabel('date of the recording' if dated else 'calibration')
-        handles, labels = panels[0].get_legend_handles_labels()
-        legend_below(figure, 3, handles, labels)
-    return Chart(figure, hover)
+        legend_below(figure, 3, *panels[0].get_legend_handles_labels())
+    return Drawing(name, f'{sensor}: calibrations over time with 95 % band', figure, hover)
 
 
 def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, deviations: Floats
@@ -243,7 +210,7 @@ def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, de
     for k, name in enumerate(names):
         _, factor, unit = scale_of(name)
         middle = (values[:, k] - np.median(values[:, k])) * factor
-        band = _BAND * deviations[:, k] * factor
+        band = BAND * deviations[:, k] * factor
         panel.fill_between(at, middle - band, middle + band, color=_COLOURS[k], alpha=0.18,
                            linewidth=0.0)
         panel.plot(at, middle, color=_COLOURS[k], linewidth=1.2, label='xyz'[k],
@@ -253,22 +220,21 @@ def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, de
 
 
 def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
-                  changes: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Mark, ...]]:
+                  changes: Sequence[tuple[int, Mapping[str, Any]]]) -> dict[str, Marks]:
     """Mark the recordings with changes; return the texts of the marks."""
     if not changes:
         return {}
-    by_key = {row['key']: k for k, row in enumerate(rows)}
-    places = [by_key[change['key']] for change in changes]
+    places = [place for place, _ in changes]
     panel.plot(at[places], np.full(len(places), panel.get_ylim()[1]), 'v', color=ACCENT,
-               gid='changes', clip_on=False, markeredgecolor=PAPER, markeredgewidth=0.4)
+               gid='changes', clip_on=False, **EDGE)
     return {'changes': tuple(Mark(0, f'{rows[place]["recording"]}: {change_words(change)}')
-                             for place, change in zip(places, changes, strict=True))}
+                             for place, change in changes)}
 
 
 def change_words(change: Mapping[str, Any]) -> str:
     """Return a change with its standard deviation, and whether it lasts."""
     words = change_in_words(change['parameter'], change['change'], change['sd'])
-    return f'{change["parameter"].replace(".", " ")} {words}, {lasting_words(change["for_good"])}'
+    return f'{spoken(change["parameter"])} {words}, {lasting_words(change["for_good"])}'
 
 
 def lasting_words(for_good: bool | None) -> str:
@@ -281,18 +247,9 @@ def drift_words(drift: Mapping[str, Any]) -> str:
     return f'{change_in_words(drift["parameter"], drift["per_year"], drift["sd"])} per year'
 
 
-def _places(rows: Sequence[Row]) -> tuple[Floats, bool]:
-    """Return the place of each calibration, and whether it is a date."""
-    days = [_day(row['date']) for row in rows]
-    dated = [day for day in days if day is not None]
-    if len(dated) == len(days) and max(dated) > min(dated):
-        return np.array(dated), True
-    return np.arange(1.0, len(days) + 1.0), False
-
-
-def _day(date: str | None) -> float | None:
-    """Return a date as days since 1970; None without a date."""
+def _stamp(date: str | None) -> float | None:
+    """Return a date as seconds since 1970; None without a date."""
     if not date:
         return None
     when = datetime.fromisoformat(date.replace('Z', '+00:00'))
-    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp() / _DAY_S
+    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp()

@@ -199,20 +199,7 @@ def on_disk(path: str) -> Iterator[Path]:
 
 
 def content_hash(path: Path) -> str:
-    """
-    Return a hash of the content of a file, or of all files of a folder with their names.
-
-    Parameters
-    ----------
-    path : Path
-        The recording.
-
-    Returns
-    -------
-    str
-        128 bits as hexadecimal text.
-
-    """
+    """Return a hash of a file, or of all files of a folder with their names: 128 bits, in hex."""
     made = hashlib.blake2b(digest_size=16)
     if path.is_file():
         _add(made, path)
@@ -247,22 +234,11 @@ _DATE_FOLDER = re.compile(r'(19|20)\d\d([-_.]?\d\d){0,2}([-_T]?\d{2,6})?|\d{1,2}
 
 def sensor_of(found: Input, name: str, pattern: str = '') -> str:
     """
-    Return the name of the sensor of a recording.
+    Return the name of the sensor of a recording, whose name in the file can be empty.
 
-    Parameters
-    ----------
-    found : Input
-        The recording.
-    name : str
-        Name of the sensor in the file; empty if it has none.
-    pattern : str
-        Regular expression for the path, whose groups are the name; empty: the folder below the
-        one that was passed and the name in the file.
-
-    Raises
-    ------
-    InputError
-        If the path does not match the pattern.
+    The groups of the regular expression `pattern` in the path are the name. Without a pattern, it
+    is the folder below the one that was passed and the name in the file. InputError is raised if
+    the path does not match.
 
     """
     if pattern:
@@ -296,21 +272,10 @@ def as_folder(sensor: str) -> str:
 
 def date_of(found: Input, poses: Poses | None, modified_s: float | None) -> tuple[str, str]:
     """
-    Return the date of a recording in ISO 8601, and where it comes from.
+    Return the date of a recording in ISO 8601, UTC, and where it comes from.
 
-    Parameters
-    ----------
-    found : Input
-        The recording.
-    poses : Poses or None
-        Its poses.
-    modified_s : float or None
-        Time of the last change of the file [s since 1970].
-
-    Returns
-    -------
-    str, str
-        The date in UTC, and ``stamps``, ``path`` or ``file``; both are empty if it is not known.
+    It comes from the ``stamps`` of the poses, the ``path``, or the last change of the ``file``
+    [s since 1970]. Both texts are empty if it is not known.
 
     """
     if poses is not None and 'time' in poses and len(poses):

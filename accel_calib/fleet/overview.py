@@ -29,8 +29,8 @@ from itertools import groupby
 
 import numpy as np
 
-from .models import alike, FEWEST
-from .store import Row
+from .sensors import alike, FEWEST
+from .task import Row
 from ..compare import NAMES
 from ..effects import LADDER
 from ..findings import scale_of
@@ -53,15 +53,7 @@ _SEED = 1
 
 
 class Months:
-    """
-    The differences of calibrations from the median of their sensor, by month.
-
-    Parameters
-    ----------
-    rng : Generator
-        Chooses the differences that are kept.
-
-    """
+    """The differences of calibrations from the median of their sensor, a sample by month."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -175,19 +167,17 @@ def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
 def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] | None = None
                 ) -> list[tuple[str, str, float, float]]:
     """
-    Return the sensors that are far from the others.
+    Return the sensors of one model that are far from the others, the farthest first.
 
     Parameters
     ----------
-    values : mapping of str to (9,) array
-        Values by sensor, of one model.
-    deviations : mapping of str to (9,) array, optional
-        Their standard deviations; by default 0.
+    values, deviations : mapping of str to (9,) array
+        Values by sensor, and their standard deviations; by default 0.
 
     Returns
     -------
     list of (str, str, float, float)
-        Sensor, name of the value, the value, and its distance in spreads; the farthest first.
+        Sensor, name of the value, the value, and its distance in spreads.
 
     """
     from scipy.special import stdtrit

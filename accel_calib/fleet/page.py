@@ -28,16 +28,16 @@ from .charts import (
     of_sensor,
     of_values,
 )
-from .models import alike
 from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
-from .store import Row, Store
+from .sensors import alike
+from .task import Row, Store
 from .. import __version__
 from ..calibrate import FleetPrior
 from ..compare import NAMES
-from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..findings import scale_of
-from ..report.drawings import Drawing
+from ..report.charts import Drawing, has_matplotlib
+from ..report.repeats import spoken
 from ..report.sheet import (
     figures,
     heading,
@@ -46,14 +46,17 @@ from ..report.sheet import (
     scroll_table,
     section,
     sheet,
+    write_sheet,
 )
-from ..report.style import has_matplotlib
 from ..text import counted, short
 
 PAGE = 'fleet.html'
 
 _MOST = 200
 """Largest number of lines of a table."""
+
+_LONG = 20
+"""Number of lines above which a table scrolls."""
 
 _MOST_MODELS = 6
 """Largest number of models of sensors with figures."""
@@ -71,27 +74,10 @@ _COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advi
 
 def write_fleet_page(store: Store, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
-    """
-    Write the page.
-
-    Parameters
-    ----------
-    store : Store
-        The results.
-    sensors : sequence of dict
-        The rows of all sensors.
-    priors : mapping of str to FleetPrior
-        Typical values by model of sensor.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. An earlier file is then unchanged.
-
-    """
+    """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
     known = overview(store.all_rows(_COLUMNS))
-    text = sheet('Fleet', _body(store, known, sensors, priors), script=False)
-    write_atomically(store.folder / PAGE, lambda file: file.write(text))
+    write_sheet(store.folder / PAGE, sheet('Fleet', _body(store, known, sensors, priors),
+                                           script=False))
 
 
 def _body(store: Store, known: Overview, sensors: Sequence[Row],
@@ -149,7 +135,7 @@ def _distribution(values: Mapping[str, object]) -> str:
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
-        rows.append((f'{name.replace(".", " ")} [{unit}]', *map(short, parts)))
+        rows.append((f'{spoken(name)} [{unit}]', *map(short, parts)))
     return scroll_table((counted(len(values), 'sensor'), 'smallest', '10 %', 'median', '90 %',
                          'largest'), rows, 'whole-cells', 'Distribution')
 
@@ -179,7 +165,7 @@ def _changes(sensors: Sequence[Row]) -> str:
         'uncertainty. A change is for good if the next calibration differs from the values before '
         'it, too.'), scroll_table(
         ('sensor', 'first recording after it', 'change', 'lasts'), rows[:_MOST], '',
-        'Sensors that changed', long=len(rows) > 20), _not_shown(len(rows) - _MOST, 'line'))
+        'Sensors that changed', long=len(rows) > _LONG), _not_shown(len(rows) - _MOST, 'line'))
 
 
 def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
@@ -190,7 +176,7 @@ def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
         words, _, _ = change_words(change).rpartition(', ')
         yield sensor, f'{date} {path}'.strip(), words, lasting_words(change['for_good'])
     if drift and drift['p_value'] < _DRIFTS:
-        yield sensor, '', f'{drift["parameter"].replace(".", " ")} {drift_words(drift)}', 'drift'
+        yield sensor, '', f'{spoken(drift["parameter"])} {drift_words(drift)}', 'drift'
     elif not row['changes']:
         yield sensor, '', 'no step or drift that is significant alone', ''
 
@@ -201,7 +187,9 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
     if not has_matplotlib():
         return ''
     by_name = {row['sensor']: row for row in sensors if row['calibrations'] > 1}
-    changed = [row['sensor'] for row in _by_weight(differ)]
+    for_good_first = sorted(differ, key=lambda row: not any(
+        change['for_good'] for change in row['changes']))
+    changed = [row['sensor'] for row in for_good_first]
     newest = sorted(by_name, key=lambda name: by_name[name]['last'] or '', reverse=True)
     chosen: dict[str, None] = {}
     for names, most in ((changed, _MOST_CHANGED), (odd, _MOST_ODD), (newest, _NEWEST)):
@@ -210,24 +198,15 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
             most))
     significant = {row['sensor'] for row in differ}
     folders = {unquote(folder): folder for folder in store.sensors()}
-    drawn = [_drawn(store.of_sensor(folders[name]), f'sensor{number}', by_name[name],
-                    changed=name in significant) for number, name in enumerate(chosen)]
+    drawn = [of_sensor(f'sensor{number}', name, alike(store.of_sensor(folders[name])),
+                       by_name[name]['changes'] if name in significant else [])
+             for number, name in enumerate(chosen)]
     return section('Sensors over time', paragraph(
         'Difference of each calibration from the median of its sensor, with 95 % band. '
         'Line: the sensor changed for good at this recording. Dotted line: only this calibration '
         'differs, or it is the newest one. Sensors that changed, odd sensors, and the newest '
         'recordings.'), _figures(drawn),
         _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawn else ''
-
-
-def _by_weight(sensors: Iterable[Row]) -> list[Row]:
-    """Return sensors that changed for good first, and otherwise in their order."""
-    return sorted(sensors, key=lambda row: not any(each['for_good'] for each in row['changes']))
-
-
-def _drawn(rows: Sequence[Row], name: str, sensor: Row, *, changed: bool) -> Drawing:
-    """Return the figure of one sensor; its changes are marked if they are significant."""
-    return of_sensor(name, sensor['sensor'], alike(rows), sensor['changes'] if changed else [])
 
 
 def _errors(known: Overview) -> str:
@@ -237,7 +216,7 @@ def _errors(known: Overview) -> str:
     rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
     count = sum(known.counts[status] for status in ('error', 'unread'))
     return scroll_table(('recording', 'error', 'what to do'), rows, '', 'Errors',
-                        long=len(rows) > 20) + _not_shown(count - len(rows), 'recording')
+                        long=len(rows) > _LONG) + _not_shown(count - len(rows), 'recording')
 
 
 def _figures(drawn: Iterable[Drawing]) -> str:

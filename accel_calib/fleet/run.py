@@ -20,11 +20,16 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
-from .models import PRIOR_COLUMNS, PRIOR_FILE, priors_of
 from .page import write_fleet_page
-from .sensors import merge_sensor, read_sensors, write_sensors
-from .store import Row, Store
-from .task import calibrate_recording, Done, Options, unread_row
+from .sensors import (
+    merge_sensor,
+    PRIOR_COLUMNS,
+    PRIOR_FILE,
+    priors_of,
+    read_sensors,
+    write_sensors,
+)
+from .task import calibrate_recording, Done, Options, Row, Store, unread_row
 from ..calibrate import FleetPrior
 from ..errors import InputError
 from ..logs import Progress
@@ -164,13 +169,19 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
-        priors = priors_of(store.all_rows(PRIOR_COLUMNS))
-        if priors:
-            write_priors(store.folder / PRIOR_FILE, priors)
-        else:
-            (store.folder / PRIOR_FILE).unlink(missing_ok=True)
+        priors = _stored_priors(store)
         write_fleet_page(store, sensors, priors)
         return Summary(counts, sensors, priors)
+
+
+def _stored_priors(store: Store) -> dict[str, FleetPrior]:
+    """Write the typical values by model of sensor, and return them."""
+    priors, path = priors_of(store.all_rows(PRIOR_COLUMNS)), store.folder / PRIOR_FILE
+    if priors:
+        write_priors(path, priors)
+    else:
+        path.unlink(missing_ok=True)
+    return priors
 
 
 def _merge(client: Client, store: Store) -> list[Row]:
@@ -194,7 +205,7 @@ def _of_dead(item: Input, options: Options, error: Exception) -> Done:
 
     if not isinstance(error, KilledWorker):
         raise error
-    return Done('', 'unread', unread_row(item, options, InputError(
+    return Done('unread', unread_row(item, options, InputError(
         'the workers that calibrated this recording died, expected them to finish',
         'give the workers more memory, and run again')))
 

@@ -2,34 +2,51 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibrations of one sensor over time: whether they agree, and where it changed for good.
+The calibrations of single sensors over time, and the typical values of a model of sensor.
 
-A sensor has many steps from one calibration to the next, and a fleet many sensors. A step counts
-as a change only if its probability, times the number of steps, is below the level of
+**Calibrations that are compared.** A calibration is compared as if its effects were known to be
+right. A search in few poses sometimes names another effect than in the other recordings, and
+offset and gain then differ by much more than their uncertainty. Only calibrations with the same
+effects are therefore compared, those with the most frequent effects of the sensor.
+
+**Changes.** A sensor has many steps from one calibration to the next, and a fleet many sensors. A
+step counts as a change only if its probability, times the number of steps, is below the level of
 `accel_calib.compare`. The change is for good if the calibration after the next one differs, too;
 otherwise the calibration after the step is the odd one.
 
-A sensor that drifts steadily differs at every step. A step is therefore a change only if it
-remains significant when the drift is subtracted. The drift of a value is here the median of its
-rates over the steps, which few large steps do not move. At last a line with a step at each lasting
-change is fitted to each value, and the row has the most significant slope.
+**Drift.** A sensor that drifts steadily differs at every step. A step is therefore a change only
+if it remains significant when the drift is subtracted. The drift of a value is here the median of
+its rates over the steps, which few large steps do not move. At last a line with a step at each
+lasting change is fitted to each value, and the row has the most significant slope.
+
+**Typical values.** Each sensor has the values x of model 10 (the mean over its calibrations) with
+the covariance C. Over the fleet, x is distributed about m with P + C. `estimated` computes m and P
+by expectation maximisation. The distribution over sensors is Student's t, so that a few sensors
+unlike the others have little weight.
+
+The correlations of few sensors are mostly chance, and would make some combinations of values seem
+certain. They are reduced by n / (n + `_CHANCE`). The mean of n sensors is uncertain itself, which
+adds P / n to the covariance for another sensor. At last P is enlarged, if necessary, until half of
+the sensors are within the distance that contains half of a normal distribution.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
 
 import numpy as np
 
-from .models import alike
-from .store import Row, Store, write_parquet
-from ..calibrate import Calibration
+from .task import Row, Store, write_parquet
+from ..calibrate import Calibration, FleetPrior
 from ..compare import History, history_of, LEVEL
+from ..effects import LADDER, MODELS, parameter_names
 from ..errors import AccelCalibError
+from ..estimate import Prior
 from ..stored import read_calibration
 from ..table import Floats
 
@@ -43,6 +60,45 @@ _FILE = 'sensors.parquet'
 _YEAR_S = 365.25 * 86400.0
 _FEWEST_STEPS = 3
 """Smallest number of steps that distinguish a drift from a change."""
+
+FEWEST = 5
+"""Smallest number of sensors of a model whose typical values are computed."""
+
+PRIOR_FILE = 'fleet.yaml'
+
+PRIOR_COLUMNS = ('sensor_model', 'prior_values', 'prior_covariance')
+"""Columns of the rows of recordings that `priors_of` needs, beside the sensor."""
+
+_CHANCE = 50.0
+
+_DOF = 4.0
+"""Degrees of freedom of the distribution over sensors; few give odd sensors little weight."""
+
+_STEPS = 200
+_CONVERGED = 1e-8
+_NAMES = parameter_names(MODELS['10'].effects)
+_LEAST_SPREAD_G = 1e-5
+"""Smallest spread over sensors [g], far below that of any sensors."""
+
+
+def alike(rows: Iterable[Row]) -> list[Row]:
+    """
+    Return the rows of a sensor whose values can be compared, in the same order.
+
+    Left out are recordings without a calibration, those whose poses do not determine offset, gain
+    and cross-axis gain, and those without the most frequent effects. Models 4, 7 and 10 are alike,
+    because `accel_calib.compare` compares them with the uncertainty of the largest one.
+
+    """
+    good = [row for row in rows if row['calibration'] and row['determined']]
+    most = next((kind for kind, _ in Counter(map(_kind, good)).most_common(1)), None)
+    return [row for row in good if _kind(row) == most]
+
+
+def _kind(row: Row) -> frozenset[str]:
+    """Return the effects of a calibration; none if it has only those of models 4, 7 and 10."""
+    effects = frozenset(row['effects'])
+    return effects if effects - {*LADDER} else frozenset()
 
 
 def sensors_schema() -> pa.Schema:
@@ -64,24 +120,10 @@ def sensors_schema() -> pa.Schema:
 
 def merge_sensor(name: str, store: Store) -> Row:
     """
-    Merge the pending rows of a sensor, and compare its calibrations; it runs on a worker.
+    Merge the pending rows of a sensor, compare its calibrations, and return the row of the sensor.
 
-    Parameters
-    ----------
-    name : str
-        Folder of the sensor.
-    store : Store
-        The results.
-
-    Returns
-    -------
-    dict
-        The row of the sensor.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be read or written.
+    It runs on a worker. `name` is the folder of the sensor. OSError is raised if a file cannot be
+    read or written.
 
     """
     store.merge(name)
@@ -133,18 +175,10 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
 @dataclass(frozen=True)
 class _Steady:
     """
-    The values of a sensor with their steady drift.
+    The (t, n) values of a sensor with their standard deviations [g], and their steady drift.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the values.
-    at : (n,) array
-        Times of the calibrations [year], or their numbers without dates.
-    values, deviations : (t, n) array
-        Values and their standard deviations [g].
-    rates : (t,) array
-        Median change per unit of `at`; 0 with fewer than `_FEWEST_STEPS` steps.
+    `at` are the (n,) times of the calibrations [year], or their numbers without dates. `rates` are
+    the (t,) median changes per unit of `at`; 0 with fewer than `_FEWEST_STEPS` steps.
 
     """
 
@@ -202,10 +236,11 @@ def years_of(history: History) -> Floats | None:
 
 def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row | None:
     """
-    Return the most significant drift of a value over the dates.
+    Return the most significant drift of a value over the dates; None without enough dates.
 
     A line, with a step at each lasting change, is fitted with the stated standard deviations. If
     the values scatter more about it, the standard deviation of the slope is enlarged accordingly.
+    The probability is that some value drifts so much by chance; the drift is per year [g].
 
     Parameters
     ----------
@@ -214,12 +249,6 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
     changes : mapping of int to bool or None
         Whether a change is for good, by the index of the first calibration after it. If it is not
         for good, this calibration is left out.
-
-    Returns
-    -------
-    dict or None
-        Name of the value, its drift per year with the standard deviation [g], and the probability
-        that some value drifts so much by chance. None without enough dates.
 
     """
     from scipy.special import stdtr
@@ -263,3 +292,79 @@ def read_sensors(store: Store) -> list[Row]:
 
     path = store.folder / _FILE
     return pq.ParquetFile(path).read().to_pylist() if path.exists() else []
+
+
+# ----------------------------------------------------------------------------- typical values
+
+def priors_of(rows: Iterable[Row]) -> dict[str, FleetPrior]:
+    """
+    Return the typical values of the models with at least `FEWEST` sensors.
+
+    The rows of recordings have ``sensor`` and `PRIOR_COLUMNS`; rows without values are left out.
+
+    """
+    size, sums = len(_NAMES), dict[tuple[str, str], list[Any]]()
+    for row in rows:
+        if row['prior_values']:
+            known = sums.setdefault((row['sensor_model'] or '', row['sensor']), [0, 0.0, 0.0])
+            known[0] += 1
+            known[1] = known[1] + np.array(row['prior_values'])
+            known[2] = known[2] + np.array(row['prior_covariance']).reshape(size, size)
+    found = {}
+    for model in sorted({model for model, _ in sums}):
+        chosen = [each for (name, _), each in sums.items() if name == model]
+        if len(chosen) >= FEWEST:
+            values = np.array([total / count for count, total, _ in chosen])
+            covariances = np.array([total / count ** 2 for count, _, total in chosen])
+            found[model] = FleetPrior(model, len(chosen), estimated(values, covariances))
+    return found
+
+
+def estimated(values: Floats, covariances: Floats) -> Prior:
+    """
+    Return mean and covariance for another sensor of the fleet.
+
+    Parameters
+    ----------
+    values : (n, p) array
+        Values of n sensors.
+    covariances : (n, p, p) array
+        Their covariances.
+
+    """
+    from scipy.special import chdtri
+
+    count, size = values.shape
+    mean = np.median(values, axis=0)
+    spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
+    covariance: Floats = np.diag(spread ** 2)
+    for _ in range(_STEPS):
+        before = covariance
+        mean, covariance = _step(values, covariances, mean, covariance)
+        if np.max(np.abs(covariance - before)) <= _CONVERGED * np.max(covariance):
+            break
+    share = count / (count + _CHANCE)
+    shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))
+    shrunk = (shrunk + _LEAST_SPREAD_G ** 2 * np.eye(size)) * (1.0 + 1.0 / count)
+    median = float(np.median(_squared(values - mean, shrunk + covariances)))
+    return Prior(mean, shrunk * max(median / chdtri(size, 0.5), 1.0))
+
+
+def _squared(away: Floats, covariances: Floats) -> Floats:
+    """Return the (n,) squared distances, per (n, p, p) covariance."""
+    solved = np.linalg.solve(covariances, away[:, :, np.newaxis])[:, :, 0]
+    return np.einsum('np,np->n', away, solved)
+
+
+def _step(values: Floats, covariances: Floats, mean: Floats, covariance: Floats
+          ) -> tuple[Floats, Floats]:
+    """Return mean and covariance after a step of expectation maximisation."""
+    away = values - mean
+    gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
+    likely = np.einsum('npq,nq->np', gain, away)
+    weight = (_DOF + values.shape[1]) / (_DOF + _squared(away, covariance + covariances))
+    left = covariance - gain @ covariance
+    centre = mean + weight @ likely / np.sum(weight)
+    off = mean + likely - centre
+    spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(left, axis=0)
+    return centre, (spread + spread.T) / (2.0 * len(values))

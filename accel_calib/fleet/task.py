@@ -2,35 +2,43 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One recording to one row: capture, fit, refine, rate.
+One recording to one row, and the rows on a disk: a Parquet data set with each result once.
 
-`calibrated_row` runs on a worker. It needs bounded memory: a log is read in blocks, and the row
-has a bounded size. Errors that belong to the recording are part of the row. Errors of the store,
-such as a full disk, are raised: they concern all recordings.
+`calibrate_recording` runs on a worker: capture, fit, refine, rate. It needs bounded memory: a log
+is read in blocks, and the row has a bounded size. Errors that belong to the recording are part of
+the row. Errors of the store, such as a full disk, are raised: they concern all recordings.
+
+A worker writes a row to ``pending/<sensor>/<key>.json``. `Store.merge` adds the rows of a sensor
+to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending rows
+when all that depends on them is written. Each step replaces files atomically, and the rows are
+merged by content. So a run can stop anywhere, and the next run merges the same rows again.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+import errno
+import fcntl
 import hashlib
 import json
 import os
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
+from urllib.parse import unquote
 
 import numpy as np
 
 from .inputs import as_folder, content_hash, date_of, Input, matched, on_disk, sensor_of, UNKNOWN
-from .store import Row, Store
 from .. import __version__
 from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
 from ..disk import write_atomically
 from ..effects import MODELS
-from ..errors import AccelCalibError, crash_words, RefusedFitError, system_error
+from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError, system_error
 from ..findings import residual_figures
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
@@ -38,6 +46,22 @@ from ..pipeline import calibrated, Outcome, Plan
 from ..stored import write_calibration
 from ..stored.exports import export
 from ..table import Poses
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Row = dict[str, Any]
+
+UNREAD = '~unread'
+"""Folder of the rows of recordings that could not be read; no sensor has this folder."""
+
+_DATA = 'data.parquet'
+_TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
+          'error', 'advice', 'rating', 'rating_reason', 'model', 'refined', 'units', 'calibration')
+_COUNTS = ('poses', 'poses_used')
+_NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg', 'coverage',
+            'temperature', 'seconds',
+            *(column for name in NAMES for column in (name, f'{name}.sd')))
 
 RESULTS = 2
 """Version of the rows. Another version makes all recordings be calibrated again."""
@@ -47,6 +71,172 @@ STATUS = ('ok', 'error', 'unread', 'skipped')
 
 _WHOLE_MODEL = '10'
 
+
+def schema() -> pa.Schema:
+    """Return the columns of a row; the sensor is the name of its folder."""
+    import pyarrow as pa
+
+    texts, numbers = pa.list_(pa.string()), pa.list_(pa.float64())
+    parameter = pa.struct([('name', pa.string()), ('value', pa.float64()), ('sd', pa.float64())])
+    return pa.schema([
+        *((name, pa.string()) for name in _TEXTS), *((name, pa.int64()) for name in _COUNTS),
+        *((name, pa.float64()) for name in _NUMBERS), ('determined', pa.bool_()),
+        ('effects', texts), ('warnings', texts),
+        ('parameters', pa.list_(parameter)), ('prior_values', numbers),
+        ('prior_covariance', numbers)])
+
+
+@dataclass(frozen=True)
+class Store:
+    """
+    The folder of the results.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder; all workers must see it under this name.
+
+    """
+
+    folder: Path
+
+    @property
+    def rows(self) -> Path:
+        """Return the folder of the Parquet data set."""
+        return self.folder / 'recordings'
+
+    @property
+    def pending(self) -> Path:
+        """Return the folder of the rows that are not in the data set yet."""
+        return self.folder / 'pending'
+
+    def has(self, key: str) -> bool:
+        """Return whether the result with this key is in the data set."""
+        return self._mark(key).exists()
+
+    def add(self, row: Row) -> None:
+        """Write a row, to be merged into the data set; raise OSError if it fails."""
+        folder = self.pending / as_folder(row['sensor'])
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / f'{row["key"]}.json',
+                         lambda file: json.dump(row, file, allow_nan=True))
+
+    def waiting(self) -> list[str]:
+        """Return the folders of sensors with pending rows, in order."""
+        if not self.pending.is_dir():
+            return []
+        return sorted(each.name for each in self.pending.iterdir() if each.is_dir())
+
+    def merge(self, name: str) -> None:
+        """
+        Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written. The next `merge` completes it.
+
+        """
+        folder = self.pending / name
+        paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
+        new = [json.loads(path.read_text(encoding='utf-8')) for path in paths]
+        old = self.of_sensor(name)
+        rows, replaced = _merged(old, new)
+        if new:
+            self._write(name, rows)
+        for key in replaced:
+            self._mark(key).unlink(missing_ok=True)
+        for row in new:
+            mark = self._mark(row['key'])
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            mark.touch()
+
+    def finish(self, name: str) -> None:
+        """Remove the pending rows of a sensor that are in the data set."""
+        folder = self.pending / name
+        for path in folder.iterdir():  # with temporary files of killed workers
+            if path.suffix != '.json' or self.has(path.stem):
+                path.unlink(missing_ok=True)
+        if not any(folder.iterdir()):  # a worker of a killed program may still write
+            folder.rmdir()
+
+    def replace_unread(self, rows: list[Row]) -> None:
+        """Replace the rows of the recordings that could not be read."""
+        if rows or (self.rows / f'sensor={UNREAD}').exists():
+            self._write(UNREAD, rows)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Make the folder, and hold it for this program; raise InputError if another has it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / 'lock').open('w') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as err:
+                if err.errno not in (errno.EAGAIN, errno.EACCES):
+                    raise
+                raise InputError(f'another program writes to {self.folder}, expected no other',
+                                 'wait for it, or choose another folder') from err
+            yield
+
+    def of_sensor(self, name: str) -> list[Row]:
+        """Return the rows of a sensor by the name of its folder."""
+        import pyarrow.parquet as pq
+
+        path = self.rows / f'sensor={name}' / _DATA
+        return pq.ParquetFile(path).read().to_pylist() if path.exists() else []
+
+    def sensors(self) -> list[str]:
+        """Return the folders of all sensors in the data set, in order."""
+        if not self.rows.is_dir():
+            return []
+        names = (each.name.partition('=')[2] for each in self.rows.iterdir()
+                 if each.name.startswith('sensor='))
+        return sorted(name for name in names if name != UNREAD)
+
+    def all_rows(self, columns: Iterable[str] | None = None) -> Iterator[Row]:
+        """Yield all rows with their sensor, one sensor at a time."""
+        import pyarrow.parquet as pq
+
+        chosen = None if columns is None else list(columns)
+        for name in (*self.sensors(), UNREAD):
+            path = self.rows / f'sensor={name}' / _DATA
+            if not path.exists():
+                continue
+            for row in pq.ParquetFile(path).read(chosen).to_pylist():
+                yield {**row, 'sensor': unquote(name)}
+
+    def _write(self, name: str, rows: list[Row]) -> None:
+        """Replace the Parquet file of a sensor, completely or not at all."""
+        folder = self.rows / f'sensor={name}'
+        folder.mkdir(parents=True, exist_ok=True)
+        write_parquet(folder / _DATA, rows, schema())
+
+    def _mark(self, key: str) -> Path:
+        return self.folder / 'done' / key[:2] / key
+
+
+def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
+    """Write rows as Parquet, completely or not at all; raise OSError if it fails."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.Table.from_pylist(rows, columns)
+    write_atomically(path, lambda file: pq.write_table(table, file.buffer))
+
+
+def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
+    """Return the rows in order of date, and the keys of old rows that new ones replace."""
+    newest = {row['content']: row for row in new}
+    kept = [row for row in old if row['content'] not in newest]
+    keys = {row['key'] for row in newest.values()}
+    replaced = [row['key'] for row in (*old, *new)
+                if row['content'] in newest and row['key'] not in keys]
+    return sorted((*kept, *newest.values()),
+                  key=lambda row: (row['date'] or '', row['recording'])), replaced
+
+
+# ----------------------------------------------------------------------------- one recording
 
 @dataclass(frozen=True)
 class Options:
@@ -78,62 +268,27 @@ class Options:
 
 @dataclass(frozen=True)
 class Done:
-    """
-    What a worker returns to the program: little, whatever the recording.
+    """What a worker returns: one of `STATUS`, and the row of an unread recording."""
 
-    Parameters
-    ----------
-    key : str
-        Key of the result; empty if the recording could not be read.
-    status : str
-        What happened, one of `STATUS`.
-    row : dict or None
-        The row, if it is not in the store: for a recording that could not be read.
-
-    """
-
-    key: str
     status: str
     row: Row | None = None
 
 
 def calibrate_recording(found: Input, options: Options, store: Store) -> Done:
-    """
-    Calibrate one recording, and add the result to the store.
-
-    Parameters
-    ----------
-    found : Input
-        The recording.
-    options : Options
-        How to calibrate it.
-    store : Store
-        Where results are written.
-
-    Returns
-    -------
-    Done
-        What happened.
-
-    Raises
-    ------
-    OSError
-        If the result cannot be written.
-
-    """
+    """Calibrate one recording, and add the result to the store; raise OSError if it fails."""
     begin = time.perf_counter()
     try:
         with on_disk(found.path) as path:
             content = content_hash(path)
             key = key_of(content, found, options)
             if store.has(key):
-                return Done(key, 'skipped')
+                return Done('skipped')
             row, calibration = _result(found, path, options)
     except (OSError, EOFError) as err:
         error = system_error(err if isinstance(err, OSError) else OSError(str(err)))
-        return Done('', 'unread', unread_row(found, options, error))
+        return Done('unread', unread_row(found, options, error))
     except AccelCalibError as err:  # an address without its package, or a missing match
-        return Done('', 'unread', unread_row(found, options, err))
+        return Done('unread', unread_row(found, options, err))
     row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
     if calibration is not None:
         name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
@@ -142,7 +297,7 @@ def calibrate_recording(found: Input, options: Options, store: Store) -> Done:
         row['calibration'] = name
         row['warnings'] += _exported(calibration, store.folder / name, options.exports)
     store.add(row)
-    return Done(key, row['status'])
+    return Done(row['status'])
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

@@ -31,7 +31,7 @@ from urllib.parse import urlsplit
 from . import messages
 from .link import check_installed, not_bound, reachable
 from .viewer import STUCK_S, TooManyError, Viewer
-from ..report.sheet import SCRIPT
+from ..report.sheet import part_of_page
 from ..session import Answer
 from ..stored.exports import Exported, FORMATS
 
@@ -68,10 +68,12 @@ def policy_hash(script: str) -> str:
     return f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'"
 
 
-_REPORT_POLICY = (
-    f"default-src 'none'; script-src {policy_hash(SCRIPT)}; style-src 'unsafe-inline'; "
-    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'")
-"""Policy of the calibration page: its own script alone, and styles inside of it."""
+def _report_policy() -> str:
+    """Return the policy of the calibration page: its own script alone, and styles inside of it."""
+    return (f"default-src 'none'; script-src {policy_hash(part_of_page('script.js'))}; style-src "
+            "'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
+            "frame-ancestors 'self'")
+
 
 _NO_TOKEN = 'this link has no token, so it only shows; open the link with the token, which the ' \
             'program printed at its start'
@@ -320,7 +322,7 @@ class PageServer:
         if not success:
             return web.Response(status=404, text=f'{text}\n')
         return web.Response(text=text, content_type='text/html',
-                            headers={'Content-Security-Policy': _REPORT_POLICY})
+                            headers={'Content-Security-Policy': _report_policy()})
 
     async def _export(self, request: web.Request, name: str) -> web.Response:
         """Return an export as a download."""

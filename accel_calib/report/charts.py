@@ -2,61 +2,248 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The figures over the sphere, against a variable, and before and after.
+The style of all figures, and the figures of the residuals of poses.
 
-**Sphere map.** Figures of residuals over the sphere: two hemispheres in Lambert's equal-area
-projection.
+**Style.** A figure has half the width of the page: a phone shows one column, a desktop two
+columns, with the same text size. The colours are from Okabe and Ito's palette and from RdBu, which
+people with colour blindness can distinguish. matplotlib is imported only when a figure is drawn.
 
-A direction u is at the radius √(1 - |u_z|) from the pole. Equal areas of the sphere have equal
-areas on the map.
-
-**Residual against a variable.** Figures of residuals against a variable, such as force along an
-axis or time.
+**Sphere map.** Two hemispheres in Lambert's equal-area projection. A direction u is at the radius
+√(1 - |u_z|) from the pole. Equal areas of the sphere have equal areas on the map.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .residuals import Variable
-from .style import (
-    ACCENT,
-    AFTER,
-    BEFORE,
-    Chart,
-    DISC,
-    DIVERGING,
-    FAINT,
-    INK,
-    legend_below,
-    Mark,
-    new_figure,
-    PAPER,
-    residual_label,
-    RIM,
-    SEQUENTIAL,
-    styled,
-)
+from .residuals import recorded, Residuals, Variable, variables_of
+from ..errors import InputError
 from ..estimate import uncovered
 from ..table import Floats
+from ..text import milli, percentage, short, with_minus
 
-_HEIGHT_INCHES = 3.3
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BEFORE = '#8c8c8c'
+AFTER = '#0072b2'
+ACCENT = '#d55e00'
+INK = '#222222'
+FAINT = '#d9d9d9'
+DIVERGING = 'RdBu_r'
+SEQUENTIAL = 'Blues'
+THERMAL = 'coolwarm'
+DISC = '#fafafa'
+RIM = '#888888'
+AXIS = '#666666'
+GRID = '#e6e6e6'
+PAPER = '#ffffff'
+THIRD = '#009e73'
+
+HEIGHT_INCHES = 3.3
+WIDTH_INCHES = 4.8
+
+BAND = 1.96
+"""Half the width of a band, in standard deviations: 95 %."""
+
+EDGE: Any = {'markeredgecolor': PAPER, 'markeredgewidth': 0.4}
+"""Edge of a filled marker."""
+
+_PNG_DPI = 160
+_LEGEND_INCHES, _LEGEND_ROW_INCHES = 0.12, 0.18
+"""Height of the frame and of a row of a legend."""
+
+_STYLE: Any = {
+    'font.family': ['sans-serif'], 'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Arial'],
+    'font.size': 10.0, 'axes.titlesize': 10.5, 'axes.labelsize': 10.0,
+    'axes.edgecolor': AXIS, 'axes.labelcolor': INK, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.axisbelow': True, 'text.color': INK, 'xtick.color': INK,
+    'ytick.color': INK, 'xtick.labelsize': 9.0, 'ytick.labelsize': 9.0, 'legend.frameon': False,
+    'legend.fontsize': 9.0, 'grid.color': GRID, 'svg.fonttype': 'none',
+    'svg.hashsalt': 'accel_calib', 'axes.unicode_minus': True,
+}
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The row of a pose, or 0, and the text that the page shows for its marker."""
+
+    row: int
+    words: str
+
+
+Marks = tuple[Mark, ...]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """
+    A figure of a page.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file, without suffix; unique on the page.
+    title : str
+        Description for those who do not see the figure.
+    figure : Figure
+        The figure.
+    hover : mapping of str to tuple of Mark
+        For each named group of markers, one text per marker, in the order in which they are
+        drawn.
+
+    """
+
+    name: str
+    title: str
+    figure: Figure
+    hover: Mapping[str, Marks] = field(default_factory=dict)
+
+
+def has_matplotlib() -> bool:
+    """Return whether figures can be drawn."""
+    return find_spec('matplotlib') is not None
+
+
+def check_matplotlib() -> None:
+    """Raise InputError if matplotlib is not installed."""
+    if not has_matplotlib():
+        raise InputError('matplotlib is not installed, but figures need it',
+                         'run pip install matplotlib')
+
+
+def styled() -> Any:
+    """Return the context manager for drawing and saving figures."""
+    from matplotlib import rc_context
+
+    return rc_context(_STYLE)
+
+
+def new_figure(height_inches: float, title: str = '', width_inches: float = WIDTH_INCHES
+               ) -> Figure:
+    """Return an empty figure with a title, in which $ is no mathematics."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_inches, height_inches), layout='constrained')
+    if title:
+        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5, parse_math=False)
+    return figure
+
+
+def legend_below(figure: Figure, columns: int, *entries: Any) -> None:
+    """Draw a legend below the panels; the location 'outside' needs matplotlib 3.7."""
+    legend = figure.legend(*entries, loc='lower center', ncols=columns)
+    rows = -(-len(legend.get_texts()) // columns)
+    part = (_LEGEND_INCHES + _LEGEND_ROW_INCHES * rows) / figure.get_figheight()
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, part, 1.0, 1.0 - part))
+
+
+def add_bar(figure: Figure, drawn: Any, panels: Iterable[Any], label: str, **options: Any) -> None:
+    """Add a bar with the colours of what is drawn."""
+    bar: Any = figure.colorbar(drawn, ax=list(panels), aspect=40, **options)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure to a file; the suffix sets the format."""
+    with styled():
+        figure.savefig(path, dpi=_PNG_DPI, facecolor='white')
+
+
+# ----------------------------------------------------------------------------- residuals
+
 _INK_PER_POSE = 3500.0
 """Total area of the markers [points²]; markers are larger for fewer poses."""
 
-HALVES = ('down', 'up')
+_HALVES = ('down', 'up')
 """Names of the markers of the hemispheres -z and +z."""
-
 
 _LEAST_MG = 1e-3
 """Smallest residual of a logarithmic axis [mg]."""
 
+_ROOM = 1.08
+_FEW_DIRECTIONS = 6
+_LEAST_LIMIT_MG = 1e-9
 
-def equal_area(force: Floats) -> Floats:
+
+def limit_mg(*residuals: Residuals) -> float:
+    """Return the end of a scale for residuals [mg]."""
+    largest = max(float(np.max(np.abs(found.after_mg))) for found in residuals)
+    return max(largest, _LEAST_LIMIT_MG) * _ROOM
+
+
+def are_spread(force: Floats) -> bool:
+    """Return whether the poses have enough different directions for a map."""
+    return len(np.unique(np.round(force, 1), axis=0)) >= _FEW_DIRECTIONS
+
+
+def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Drawing]:
+    """Yield figures of the final residuals, over the sphere and against the context."""
+    limit = limit_mg(residuals)
+    title = f'Remaining residual: {short(residuals.rms_mg)} mg RMS'
+    if are_spread(residuals.force):
+        yield sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
+    poses_g = residuals.poses_g
+    variables = (recorded(poses_g) or variables_of('quadratic', poses_g, residuals.force))[:3]
+    yield against(residuals, variables, f'{prefix}_variables', title, limit, AFTER)
+
+
+def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, more: str = ''
+               ) -> Drawing:
+    """Draw residuals over the sphere; `limit` is the end of the colour scale [mg]."""
+    force, values, signed = residuals.force, residuals.after_mg, residuals.signed
+    marks, hover = _marks(residuals, values), dict[str, Marks]()
+    with styled():
+        figure, discs = _two_discs(title)
+        for disc, up in zip(discs, (True, False), strict=True):
+            here = np.flatnonzero((force[:, 2] >= 0.0) == up)
+            here = here[np.argsort(np.abs(values[here]))]
+            drawn = disc.scatter(*_equal_area(force[here]).T, c=values[here],
+                                 s=min(_INK_PER_POSE / max(len(force), 12), 130.0),
+                                 cmap=DIVERGING if signed else SEQUENTIAL,
+                                 vmin=-limit if signed else 0.0, vmax=limit,
+                                 edgecolors=INK, linewidths=0.5, zorder=3)
+            drawn.set_gid(_HALVES[up])
+            hover[_HALVES[up]] = tuple(marks[k] for k in here)
+            hover |= _draw_left_out(disc, residuals, up=up)
+        add_bar(figure, drawn, discs, _label(signed=signed), orientation='horizontal',
+                shrink=0.8, pad=0.03)
+    return Drawing(name, f'{title}{more}', figure, hover)
+
+
+def _two_discs(title: str) -> tuple[Figure, Any]:
+    """Return a new figure, and its discs of the hemispheres +z and -z."""
+    figure = new_figure(HEIGHT_INCHES, title)
+    discs = figure.subplots(1, 2)
+    for disc, up in zip(discs, (True, False), strict=True):
+        _draw_disc(disc, up=up)
+    return figure, discs
+
+
+def _draw_disc(disc: Any, *, up: bool) -> None:
+    """Draw the map of the hemisphere +z or -z with the sensor axes."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    disc.fill(np.cos(angle), np.sin(angle), facecolor=DISC, edgecolor=RIM, zorder=0)
+    middle = np.sqrt(1.0 - np.sqrt(0.5))
+    disc.plot(middle * np.cos(angle), middle * np.sin(angle), color=FAINT, linewidth=0.8, zorder=1)
+    disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
+    for name, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
+        disc.text(1.13 * x, 1.12 * y, with_minus(name), ha='center', va='center', fontsize=8.5)
+    disc.text(-1.22, 1.08, '+z up' if up else '−z up', fontsize=9.5)
+    disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
+    disc.axis('off')
+
+
+def _equal_area(force: Floats) -> Floats:
     """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     flat = unit[:, :2]
@@ -65,211 +252,105 @@ def equal_area(force: Floats) -> Floats:
     return flat / np.where(across > 0.0, across, 1.0) * radius
 
 
-def draw_map(title: str, force: Floats, residual_mg: Floats, limit_mg: float, *,
-             signed: bool, left_out: Floats, rows: tuple[int, ...],
-             marks: tuple[Mark, ...]) -> Chart:
-    """
-    Draw residuals over the sphere.
-
-    Parameters
-    ----------
-    title : str
-        Title of the figure.
-    force : (n, 3) array
-        Direction of up in each pose, in the sensor axes.
-    residual_mg : (n,) array
-        Residual of each pose [mg].
-    limit_mg : float
-        Residual at the end of the colour scale [mg].
-    signed : bool
-        Whether the residuals are signed.
-    left_out : (d, 3) array
-        Directions of the poses left out.
-    rows : tuple of int
-        Rows of the poses left out.
-    marks : tuple of Mark
-        Text of each pose.
-
-    """
-    hover = {}
-    with styled():
-        figure, discs = _two_discs(title)
-        for disc, up in zip(discs, (True, False), strict=True):
-            here = np.flatnonzero((force[:, 2] >= 0.0) == up)
-            here = here[np.argsort(np.abs(residual_mg[here]))]
-            drawn = _draw_poses(disc, force[here], residual_mg[here], limit_mg, signed,
-                                _INK_PER_POSE / max(len(force), 12))
-            drawn.set_gid(HALVES[up])
-            hover[HALVES[up]] = tuple(marks[k] for k in here)
-            hover.update(_draw_left_out(disc, left_out, rows, up=up))
-        bar = figure.colorbar(drawn, ax=list(discs), orientation='horizontal', aspect=40,
-                              shrink=0.8, pad=0.03)
-        bar.set_label(residual_label(signed=signed))
-        bar.outline.set_visible(False)
-    return Chart(figure, hover)
-
-
-def draw_disc(disc: Any, *, up: bool) -> None:
-    """Draw the map of the hemisphere +z or -z with the sensor axes."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    disc.fill(np.cos(angle), np.sin(angle), facecolor=DISC, edgecolor=RIM, zorder=0)
-    middle = np.sqrt(1.0 - np.sqrt(0.5))
-    disc.plot(middle * np.cos(angle), middle * np.sin(angle), color=FAINT, linewidth=0.8, zorder=1)
-    disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
-    for name, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
-        disc.text(1.13 * x, 1.12 * y, name.replace('-', '−'), ha='center', va='center',
-                  fontsize=8.5)
-    disc.text(-1.22, 1.08, '+z up' if up else '−z up', fontsize=9.5)
-    disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
-    disc.axis('off')
-
-
-def _draw_poses(disc: Any, force: Floats, residual_mg: Floats, limit_mg: float, signed: bool,
-                area: float) -> Any:
-    return disc.scatter(*equal_area(force).T, c=residual_mg, s=min(area, 130.0),
-                        cmap=DIVERGING if signed else SEQUENTIAL,
-                        vmin=-limit_mg if signed else 0.0, vmax=limit_mg,
-                        edgecolors=INK, linewidths=0.5, zorder=3)
-
-
-def _draw_left_out(disc: Any, left_out: Floats, rows: tuple[int, ...], *, up: bool
-                   ) -> dict[str, tuple[Mark, ...]]:
+def _draw_left_out(disc: Any, residuals: Residuals, *, up: bool) -> dict[str, Marks]:
     """Draw the poses left out as hollow squares with their rows, and return their texts."""
-    here = np.flatnonzero((left_out[:, 2] >= 0.0) == up)
-    places = equal_area(left_out[here])
+    here = (residuals.left_out_force[:, 2] >= 0.0) == up
+    places, rows = _equal_area(residuals.left_out_force[here]), residuals.left_out.row[here]
+    name = f'out_{_HALVES[up]}'
     disc.plot(*places.T, linestyle='none', marker='s', markersize=8, fillstyle='none',
-              color=ACCENT, zorder=4, gid=f'out_{HALVES[up]}')
-    for place, k in zip(places, here, strict=True):
-        disc.annotate(str(rows[k]), place, (5, 4), textcoords='offset points', fontsize=8.5,
+              color=ACCENT, zorder=4, gid=name)
+    for place, row in zip(places, rows, strict=True):
+        disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
                       color=ACCENT, zorder=4)
-    return {f'out_{HALVES[up]}': tuple(Mark(rows[k], f'row {rows[k]}, left out') for k in here)}
+    return {name: tuple(Mark(int(row), f'row {row}, left out') for row in rows)}
 
 
-def draw_against(title: str, variables: Sequence[Variable], residual_mg: Floats,
-                 limit_mg: float, *, signed: bool, colour: str, marks: tuple[Mark, ...]) -> Chart:
-    """
-    Draw residuals against variables, with one panel per variable.
-
-    Parameters
-    ----------
-    title : str
-        Title of the figure.
-    variables : sequence of Variable
-        Variable of each panel.
-    residual_mg : (n,) array
-        Residual of each pose [mg].
-    limit_mg : float
-        Limit of the residual axis [mg].
-    signed : bool
-        Whether the residuals are signed.
-    colour : str
-        Colour of the poses.
-    marks : tuple of Mark
-        Text of each pose.
-
-    """
+def against(residuals: Residuals, variables: Sequence[Variable], name: str, title: str,
+            limit: float, colour: str) -> Drawing:
+    """Draw residuals against variables, one panel per variable; `limit` is of the axis [mg]."""
+    values, signed, marks = residuals.after_mg, residuals.signed, _marks(residuals)
     with styled():
-        figure = new_figure(1.0 + 1.45 * len(variables) + (0.8 if len(variables) == 1 else 0.0))
+        figure = new_figure(
+            1.0 + 1.45 * len(variables) + (0.8 if len(variables) == 1 else 0.0), title)
         panels = figure.subplots(len(variables), 1, sharey=True, squeeze=False)[:, 0]
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-        size = float(np.clip(5.5 - len(residual_mg) / 80.0, 2.5, 5.5))
+        size = float(np.clip(5.5 - len(values) / 80.0, 2.5, 5.5))
         for k, (panel, variable) in enumerate(zip(panels, variables, strict=True)):
             panel.grid(visible=True)
             panel.axhline(0.0, color=ACCENT, linewidth=1.0)
-            panel.plot(variable.values, residual_mg, 'o', color=colour, markersize=size,
-                       markeredgecolor=PAPER, markeredgewidth=0.4, gid=f'panel{k}')
+            panel.plot(variable.values, values, 'o', color=colour, markersize=size,
+                       gid=f'panel{k}', **EDGE)
             panel.set_xlabel(variable.label)
             if variable.unit_range:
                 panel.set(xlim=(-1.06, 1.06), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
-            panel.set_ylim(-limit_mg if signed else -0.04 * limit_mg, limit_mg)
-        figure.supylabel(residual_label(signed=signed), fontsize=10.0)
-    return Chart(figure, {f'panel{k}': marks for k in range(len(variables))})
+            panel.set_ylim(-limit if signed else -0.04 * limit, limit)
+        figure.supylabel(_label(signed=signed), fontsize=10.0)
+    along = ' and '.join(variable.label for variable in variables)
+    return Drawing(name, f'{title}, against {along}', figure,
+                   {f'panel{k}': marks for k in range(len(variables))})
 
 
-def draw_coverage(title: str, force: Floats, next_pose: Floats | None,
-                  marks: tuple[Mark, ...]) -> Chart:
-    """
-    Draw the poses over the sphere, and the directions that no pose covers.
-
-    Parameters
-    ----------
-    title : str
-        Title of the figure.
-    force : (n, 3) array
-        Direction of up in each pose, in the sensor axes.
-    next_pose : (3,) array or None
-        Direction of the next pose.
-    marks : tuple of Mark
-        Text of each pose.
-
-    """
+def of_coverage(residuals: Residuals, share: float, next_pose: Floats | None) -> Drawing:
+    """Draw the poses over the sphere, the directions that they do not cover, and the next pose."""
+    title = f'{percentage(share)} of the sphere is within 45° of a pose'
+    force, marks, hover = residuals.force, _marks(residuals), dict[str, Marks]()
     open_ = uncovered(force)
-    hover = {}
     with styled():
         figure, discs = _two_discs(title)
         for disc, up in zip(discs, (True, False), strict=True):
-            disc.plot(*equal_area(open_[(open_[:, 2] >= 0.0) == up]).T, 'x', color=ACCENT,
+            disc.plot(*_equal_area(open_[(open_[:, 2] >= 0.0) == up]).T, 'x', color=ACCENT,
                       markersize=3.5, label='not covered', zorder=2)
             here = np.flatnonzero((force[:, 2] >= 0.0) == up)
-            disc.plot(*equal_area(force[here]).T, 'o', color=AFTER, markeredgecolor=PAPER,
-                      markersize=7, label='pose', zorder=3, gid=HALVES[up])
-            hover[HALVES[up]] = tuple(marks[k] for k in here)
+            disc.plot(*_equal_area(force[here]).T, 'o', color=AFTER, markeredgecolor=PAPER,
+                      markersize=7, label='pose', zorder=3, gid=_HALVES[up])
+            hover[_HALVES[up]] = tuple(marks[k] for k in here)
             if next_pose is not None:
                 there = next_pose[np.newaxis][[(next_pose[2] >= 0.0) == up]]
-                disc.plot(*equal_area(there).T, '*', color=ACCENT, markersize=14,
+                disc.plot(*_equal_area(there).T, '*', color=ACCENT, markersize=14,
                           label='next pose', zorder=4)
         legend_below(figure, 3, *discs[0].get_legend_handles_labels())
-    return Chart(figure, hover)
+    return Drawing('coverage', title, figure, hover)
 
 
-def _two_discs(title: str) -> tuple[Any, Any]:
-    """Return a new figure, and its discs of the hemispheres +z and -z."""
-    figure = new_figure(_HEIGHT_INCHES)
-    figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-    discs = figure.subplots(1, 2)
-    for disc, up in zip(discs, (True, False), strict=True):
-        draw_disc(disc, up=up)
-    return figure, discs
-
-
-def draw_before_after(title: str, rows: Sequence[int], before_mg: Floats, after_mg: Floats,
-                      floor_mg: float | None, marks: tuple[tuple[Mark, ...], tuple[Mark, ...]],
-                      *, signed: bool) -> Chart:
-    """
-    Draw the size of the residual of each pose without and with the calibration.
-
-    Parameters
-    ----------
-    title : str
-        Title of the figure.
-    rows : sequence of int
-        Row of each pose.
-    before_mg, after_mg : (n,) array
-        Residuals without and with the calibration [mg].
-    floor_mg : float or None
-        Noise floor [mg], if it is known.
-    marks : tuple of two tuples of Mark
-        Text of each pose, before and after.
-    signed : bool
-        Whether only |force| is known.
-
-    """
+def of_before_after(residuals: Residuals, floor_mg: float | None) -> Drawing:
+    """Draw the size of the residual of each pose without and with the calibration."""
+    before = float(np.sqrt(np.mean(residuals.before_mg ** 2)))
+    title = f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
+    hover, signed = dict[str, Marks](), residuals.signed
     with styled():
-        figure = new_figure(_HEIGHT_INCHES)
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-        panel = figure.subplots()
+        figure = new_figure(HEIGHT_INCHES, title)
+        panel: Any = figure.subplots()
         panel.grid(visible=True, axis='y')
-        for name, values, colour in (('before', before_mg, BEFORE), ('after', after_mg, AFTER)):
-            panel.plot(rows, np.maximum(np.abs(values), _LEAST_MG), 'o', color=colour, gid=name,
-                       label=name, markeredgecolor=PAPER, markeredgewidth=0.4,
+        for name, values, colour in (('before', residuals.before_mg, BEFORE),
+                                     ('after', residuals.after_mg, AFTER)):
+            panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), _LEAST_MG), 'o',
+                       color=colour, gid=name, label=name, **EDGE,
                        markersize=float(np.clip(7.0 - len(values) / 60.0, 3.0, 7.0)))
+            hover[name] = _marks(residuals, values)
         if floor_mg:
             panel.axhline(floor_mg, color=ACCENT, linestyle=(0, (5, 3)), label='noise floor')
         panel.set_yscale('log')
         panel.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
         panel.locator_params(axis='x', integer=True)
         panel.margins(y=0.1)
-        panel.set(xlabel='row of the pose', ylabel='size of |force| − 1 g [mg]' if signed else
-                  residual_label(signed=False))
+        panel.set(xlabel='row of the pose',
+                  ylabel='size of |force| − 1 g [mg]' if signed else _label(signed=False))
         legend_below(figure, 3)
-    return Chart(figure, {'before': marks[0], 'after': marks[1]})
+    return Drawing('before_after', title, figure, hover)
+
+
+def _label(*, signed: bool) -> str:
+    """Return the label of the axis of residuals."""
+    return '|force| − 1 g [mg]' if signed else 'size of the vector error [mg]'
+
+
+def _marks(residuals: Residuals, values: Floats | None = None) -> Marks:
+    """Return row, residual and temperature of each pose, such as ``row 11, +0.4 mg, 31 °C``."""
+    poses = residuals.poses_g
+    warm, marks = poses.columns.get('temperature'), []
+    values = residuals.after_mg if values is None else values
+    for k, (row, value) in enumerate(zip(poses.row, values, strict=True)):
+        words = f'row {row}, {milli(value, signed=residuals.signed)} mg'
+        if warm is not None and np.isfinite(warm[k]):
+            words += with_minus(f', {warm[k]:.0f} °C')
+        marks.append(Mark(int(row), words))
+    return tuple(marks)

@@ -17,13 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from .drawings import Drawing
-from .sheet import figures, heading, listing, numbers, paragraph, scroll_table, section, sheet
-from .style import ACCENT, AFTER, Chart, Mark, new_figure, styled, THIRD
+from .charts import ACCENT, AFTER, Drawing, Mark, Marks, new_figure, styled, THIRD
+from .sheet import (
+    figures,
+    heading,
+    how_to_read,
+    listing,
+    numbers,
+    paragraph,
+    scroll_table,
+    section,
+    sheet,
+    write_sheet,
+)
 from .. import __version__
-from ..disk import write_atomically
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
-from ..text import with_sd
+from ..text import power_of_ten, with_sd
 from ..units import is_native
 
 _COLOURS = {'x': AFTER, 'y': ACCENT, 'z': THIRD}
@@ -49,7 +58,16 @@ _HOW_TO_READ = (
 
 def write_noise_page(path: Path, found: NoiseFigures, source: str) -> None:
     """
-    Write the page.
+    Write the page of the noise of a recording.
+
+    Parameters
+    ----------
+    path : Path
+        File of the page.
+    found : NoiseFigures
+        The figures.
+    source : str
+        Name of the recording.
 
     Raises
     ------
@@ -57,58 +75,46 @@ def write_noise_page(path: Path, found: NoiseFigures, source: str) -> None:
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    text = noise_page(found, source)
-    write_atomically(path, lambda file: file.write(text))
+    write_sheet(path, _page(found, source))
 
 
-def noise_page(found: NoiseFigures, source: str) -> str:
-    """Return the page of these figures as HTML; `source` is the name of the recording."""
+def _page(found: NoiseFigures, source: str) -> str:
     title = f'Noise of {Path(source).name or source}'
     about = [source, f'accel_calib {__version__}']
-    body = [heading(title, about), _rest(found), figures(noise_drawings(found), 'pair'),
+    drawn = (_allan(found.of(kind)) for kind in found.kinds)
+    body = [heading(title, about), _rest(found), figures(drawn, 'pair'),
             *(_table(found, kind) for kind in found.kinds),
             section('Notes', listing(found.notes)),
             section('Not seen', listing(need_lines(found))),
             section('For Kalibr and VINS', listing(kalibr_lines(found))),
-            section('How to read this', listing(_HOW_TO_READ), kind='reading')]
+            how_to_read(_HOW_TO_READ)]
     return sheet(title, body)
 
 
-def noise_drawings(found: NoiseFigures) -> list[Drawing]:
-    """Return the figure of the Allan deviation of each sensor."""
-    return [Drawing(f'allan_{kind}', _described(found.of(kind), kind),
-                    draw_allan(f'{_NAMES[kind]}: Allan deviation', found.of(kind)))
-            for kind in found.kinds]
-
-
-def _described(axes: Sequence[AxisNoise], kind: str) -> str:
-    """Return the text for those who do not see the figure."""
-    unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
-    parts = [f'{axis.axis} from {axis.deviation[0] * scale:.3g} to '
-             f'{np.min(axis.deviation) * scale:.3g} {unit} at '
-             f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
-    return f'Allan deviation of the {kind} over τ: {", ".join(parts)}'
-
-
-def draw_allan(title: str, axes: Sequence[AxisNoise]) -> Chart:
+def _allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
-    unit, scale = shown_unit(axes[0].kind, 'bias_instability', axes[0].unit)
-    hover = {}
+    kind, hover = axes[0].kind, {}
+    unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
     with styled():
-        figure = new_figure(_HEIGHT_INCHES)
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
-        panel = figure.subplots()
+        figure = new_figure(_HEIGHT_INCHES, f'{_NAMES[kind]}: Allan deviation')
+        panel: Any = figure.subplots()
         panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
                   ylabel=f'Allan deviation [{unit}]')
         panel.grid(visible=True)
         for axis in axes:
             hover[f'curve_{axis.axis}'] = _draw_axis(panel, axis, unit, scale)
-        _set_limits(panel, axes, scale)
+        # Wide bands at long τ must not compress the curves.
+        every = np.concatenate([axis.deviation for axis in axes]) * scale
+        panel.set_ylim(0.5 * float(np.min(every)), 2.0 * float(np.max(every)))
         panel.legend(ncols=len(axes))
-    return Chart(figure, hover)
+    ends = [f'{axis.axis} from {axis.deviation[0] * scale:.3g} to '
+            f'{np.min(axis.deviation) * scale:.3g} {unit} at '
+            f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
+    return Drawing(f'allan_{kind}', f'Allan deviation of the {kind} over τ: {", ".join(ends)}',
+                   figure, hover)
 
 
-def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> tuple[Mark, ...]:
+def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> Marks:
     """Draw one axis, and return the texts of its markers."""
     colour = _COLOURS[axis.axis]
     panel.fill_between(axis.tau, axis.low * scale, axis.high * scale, color=colour, alpha=0.2,
@@ -119,12 +125,6 @@ def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> tuple[Ma
                color=colour, markersize=4.0, label=axis.axis, gid=f'curve_{axis.axis}')
     return tuple(Mark(0, f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
                  for tau, value in zip(axis.tau, axis.deviation, strict=True))
-
-
-def _set_limits(panel: Any, axes: Sequence[AxisNoise], scale: float) -> None:
-    """Keep the wide bands at long τ from compressing the curves."""
-    every = np.concatenate([axis.deviation for axis in axes]) * scale
-    panel.set_ylim(0.5 * float(np.min(every)), 2.0 * float(np.max(every)))
 
 
 def _rest(found: NoiseFigures) -> str:
@@ -177,13 +177,5 @@ def kalibr_lines(found: NoiseFigures) -> list[str]:
     for (kind, figure), unit in _KALIBR.items():
         value, sd = found.common(kind, figure)
         if np.isfinite(value) and not is_native(found.of(kind)[0].unit):
-            lines.append(f'{kind}_{figure}: {_scientific(value, sd)} {unit}')
+            lines.append(f'{kind}_{figure}: {power_of_ten(value, sd)} {unit}')
     return [*lines, f'update_rate: {found.rate:.6g} Hz'] if lines else []
-
-
-def _scientific(value: float, sd: float) -> str:
-    """Return value ± sd with a common power of ten."""
-    power = int(np.floor(np.log10(value)))
-    if -3 <= power <= 3:
-        return with_sd(value, sd)
-    return f'({with_sd(value / 10.0**power, sd / 10.0**power)})e{power}'

@@ -4,31 +4,67 @@
 """
 The pages of one calibration: of `fit`, `calibrate`, `verify` and `refine`.
 
-All begin with the verdict and the calibration. Sections about effects follow where some were
-sections.
+All begin with the verdict and the calibration. Sections about effects follow if some were searched
+for: the ladder, one section per step, and the effects that the data cannot show.
+
+**Values.** Three figures by axis do not depend on the convention of the model: V, the sensitivity
+of each sensing axis (the length of the rows of W), and the angles between the sensing axes. Their
+standard deviations follow from the covariance of the calibration.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import sections
-from .residuals import Residuals, residuals_of
-from .sheet import heading, listing, section, sheet
+from .charts import of_before_after, of_coverage, of_remainder
+from .drawings import ladder, of_curve, of_step
+from .residuals import Residuals, residuals_of, residuals_of_refinement, since_first
+from .sheet import (
+    block,
+    code,
+    figures,
+    heading,
+    HINT,
+    how_to_read,
+    listing,
+    numbers,
+    paragraph,
+    rated_sheet,
+    scroll_table,
+    section,
+    snippets,
+    verdict_box,
+    write_sheet,
+)
 from .. import __version__
-from ..disk import write_atomically
-from ..findings import rate_refinement
-from ..refine.words import verdict_words
+from ..calibrate import Calibration, mounting_figures, outlook
+from ..effects import (
+    AXES,
+    effect_named,
+    EMPIRICAL,
+    empirical_parts,
+    REFERENCE_TEMPERATURE,
+    value_unit,
+    VARIABLES,
+    with_vector,
+)
+from ..estimate import coverage
+from ..findings import effect_figures, Figure, rate_refinement, residual_figures
+from ..refine.words import chance, percent, values_of, verdict_words
+from ..table import Floats
+from ..text import counted, milli, percentage, short, signed, with_minus
+from ..units import MG
 
 if TYPE_CHECKING:
-    from ..calibrate import Calibration, Verification
+    from ..calibrate import Verification
     from ..findings import Rating
-    from ..refine import Refinement
+    from ..refine import Refinement, Step
     from ..table import Poses
 
 STORED = 'calibration.yaml'
@@ -47,11 +83,41 @@ _HOW_TO_READ_STEPS = (
     'p is the probability that noise alone makes one of all candidates this good.',
     'Rivals are effects that these poses cannot distinguish from the named effect.',
 )
+_STEP = 1e-6
+_SAME = 1e-9
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+_USUAL_OFFSET_MG = {'x': 50.0, 'y': 50.0, 'z': 80.0}
+_USUAL_GAIN_PERCENT = 3.0
+_USUAL_CROSS_AXIS_PERCENT = 2.0
+_USUAL_CROSS_AXIS = float(np.degrees(_USUAL_CROSS_AXIS_PERCENT / 100.0))
+_SOURCE = (
+    'Usual: the initial tolerances of a common part, the MPU-6050 (data sheet PS-MPU-6000A, '
+    'revision 3.4, section 6.2). For other effects: the typical size in the catalogue of effects.')
+
+_SMALL = 1e-3
+"""Typical size below which a value is given in millionths."""
+
+_LONG_TABLE = 25
+"""Number of poses above which their table scrolls."""
+
+_NOT_USED = 'The calibration of this page does not contain these effects.'
+
+_SAME_RESIDUAL = 0.01
 
 
 def write_page(path: Path, result: Refinement, source: str) -> None:
     """
     Write the page of a refinement.
+
+    Parameters
+    ----------
+    path : Path
+        File of the page.
+    result : Refinement
+        The refinement.
+    source : str
+        Name of the file of the poses.
 
     Raises
     ------
@@ -59,22 +125,11 @@ def write_page(path: Path, result: Refinement, source: str) -> None:
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    text = page(result, source)
-    write_atomically(path, lambda file: file.write(text))
+    write_sheet(path, page(result, source))
 
 
 def page(result: Refinement, source: str) -> str:
-    """
-    Return the page of a refinement as HTML.
-
-    Parameters
-    ----------
-    result : Refinement
-        The refinement.
-    source : str
-        Name of the file of the poses.
-
-    """
+    """Return the page of a refinement as HTML."""
     return calibration_page(result.calibration, rate_refinement(result), source,
                             refinement=result)
 
@@ -92,9 +147,8 @@ def write_calibration_page(path: Path, calibration: Calibration, rating: Rating,
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    text = calibration_page(calibration, rating, source, refinement=refinement,
-                            verification=verification, stored=stored, notes=notes)
-    write_atomically(path, lambda file: file.write(text))
+    write_sheet(path, calibration_page(calibration, rating, source, refinement=refinement,
+                                       verification=verification, stored=stored, notes=notes))
 
 
 def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
@@ -122,21 +176,30 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
         How the log was read.
 
     """
-    poses = None if verification is None else verification[1]
-    used = refinement if _is_refined(calibration, refinement) else None
+    checked, poses = verification or (None, None)
     residuals = residuals_of(calibration, poses)
-    what = 'Calibration' if verification is None else 'Check of the calibration'
+    used = refinement if _is_refined(calibration, refinement) else None
+    what = 'Calibration' if checked is None else 'Check of the calibration'
     name = calibration.sensor or Path(source).name
     title = f'{what} of {name}' if name else what
     about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
              f'fitted {calibration.date}' if calibration.date else '',
              f'accel_calib {__version__}']
-    more = '' if used is None else verdict_words(used)
-    body = [heading(title, about), sections.verdict_box(rating, more),
-            *_body(calibration, residuals, refinement, verification, stored),
+    body = [heading(title, about),
+            verdict_box(rating, '' if used is None else verdict_words(used)),
+            _key_numbers(calibration, residuals, checked), _values(calibration),
+            _covered(calibration, residuals, plan=refinement is None and checked is None),
+            section('Before and after', figures([of_before_after(
+                residuals, (checked or calibration.quality).noise_floor_mg)], 'wide')),
+            *_remarks(calibration, residuals, used),
+            section('What remains', figures(of_remainder(residuals), 'pair')),
+            *([] if refinement is None else _search(refinement, residuals, used=used is not None)),
+            _pose_table(residuals, calibration),
+            '' if used is not None and used.refusal else section('Use it', *(
+                block(title, text) for title, text in snippets(calibration, stored))),
             section('How the log was read', listing(notes)),
-            _how_to_read(steps=refinement is not None)]
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body)
+            how_to_read((*_HOW_TO_READ, *(_HOW_TO_READ_STEPS if refinement else ())))]
+    return rated_sheet(title, rating, body)
 
 
 def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool:
@@ -148,29 +211,232 @@ def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool
         np.array_equal(own[name], refined[name]) for name in own)
 
 
-def _body(calibration: Calibration, residuals: Residuals, refinement: Refinement | None,
-          verification: tuple[Verification, Poses] | None, stored: str) -> Iterator[str]:
-    """Yield the sections after the verdict."""
-    checked = None if verification is None else verification[0]
-    floor_mg = (calibration.quality if checked is None else checked).noise_floor_mg
-    refined = _is_refined(calibration, refinement)
-    refusal = sections.refusal(refinement) if refinement is not None and refined else ()
-    advice = refinement.advice if refinement is not None and refined else ()
-    yield sections.key_numbers(calibration, residuals, checked)
-    yield sections.values(calibration)
-    yield sections.covered(calibration, residuals, plan=refinement is None and checked is None)
-    yield sections.before_after(residuals, floor_mg)
-    yield sections.warnings((*refusal, *calibration.warnings), residuals, advice)
-    yield sections.remainder(residuals)
-    if refinement is not None:
-        yield from sections.steps(refinement, used=refined)
-        yield sections.refined_remainder(refinement, residuals)
-        yield sections.not_testable(refinement)
-    yield sections.poses(residuals, calibration)
-    if not refusal:
-        yield sections.use(calibration, stored)
+# ----------------------------------------------------------------------------- the calibration
+
+def _key_numbers(calibration: Calibration, residuals: Residuals, checked: Verification | None
+                 ) -> str:
+    """Return the residual before and after, noise floor, number of poses and coverage."""
+    pairs = [(figure.label, f'{short(figure.value)} {figure.unit}')
+             for figure in residual_figures(checked or calibration.quality)
+             if figure.key != 'max_before_mg']
+    pairs.append(('poses used', str(len(residuals.poses_g))))
+    if len(residuals.left_out):
+        pairs.append(('poses left out', str(len(residuals.left_out))))
+    return numbers([*pairs, ('coverage', percentage(coverage(residuals.force)))])
 
 
-def _how_to_read(*, steps: bool) -> str:
-    lines = (*_HOW_TO_READ, *(_HOW_TO_READ_STEPS if steps else ()))
-    return section('How to read this', listing(lines), kind='reading')
+def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> str:
+    """Return the section about coverage; with the next pose if `plan` is set."""
+    direction, words = None, ''
+    linear = all(effect_named(name).linear for name in calibration.model.effects)
+    if plan and linear and calibration.model.effects:
+        asked = outlook(calibration, 'auto').next_pose
+        direction, words = asked.direction, f'Next pose: {asked.words}.'.replace('..', '.')
+    return section('Coverage of the sphere', figures(
+        [of_coverage(residuals, coverage(residuals.force), direction)], 'wide'),
+        paragraph(words), HINT)
+
+
+def _remarks(calibration: Calibration, residuals: Residuals, used: Refinement | None
+             ) -> Iterator[str]:
+    """Yield the sections with warnings, advice and the poses left out."""
+    refusal, advice = ((), ()) if used is None else (_refusal(used), used.advice)
+    yield section('Warnings', listing((*refusal, *calibration.warnings)))
+    yield section('What to do', listing(advice))
+    yield section('Poses left out', listing(
+        f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())))
+
+
+def _values(calibration: Calibration) -> str:
+    """Return the section with the values of the calibration."""
+    rows = [*_linear_rows(calibration), *_effect_rows(calibration)]
+    if calibration.is_levelled:
+        found = mounting_figures(calibration.rotation, calibration.sensor)
+        rows += [(f'mounting, {name}', with_minus(f'{np.degrees(found[name]):+.2f}°'), '')
+                 for name in ('roll', 'pitch', 'yaw')]
+    if not rows:
+        return ''
+    thermal = any('temperature' in name for name in calibration.model.effects)
+    note = f'The values hold at {REFERENCE_TEMPERATURE:g} °C.' if thermal else ''
+    words = f'{calibration.name}: {calibration.reason}'.replace('ideal: ideal', 'ideal')
+    return section('The calibration', paragraph(f'Model {words}'),
+                   scroll_table(('', 'value ± deviation', 'usual'), rows,
+                                'whole-cells values', 'Values of the calibration'),
+                   paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'))
+
+
+def linear_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
+    """Return V [g], the sensitivities of the axes, and their angles [°], (9,), of model values."""
+    mat_w, vec_v = with_vector(effects, vec).linear_part
+    length = np.linalg.norm(mat_w, axis=1)
+    rows = mat_w / length[:, np.newaxis]
+    cosines = np.array([rows[i] @ rows[j] for i, j in _PAIRS])
+    return np.concatenate([vec_v, length, np.degrees(np.arccos(cosines))])
+
+
+def _with_deviations(calibration: Calibration) -> tuple[Floats, Floats]:
+    """Return `linear_figures` of a calibration and their standard deviations."""
+    effects, vec = calibration.model.effects, calibration.model.vector
+    slope = np.array([(linear_figures(vec + step, effects) - linear_figures(vec - step, effects))
+                      / (2.0 * _STEP) for step in _STEP * np.eye(len(vec))]).reshape(-1, 9)
+    variance = np.einsum('pi,pq,qi->i', slope, calibration.covariance, slope)
+    deviation = np.sqrt(np.maximum(variance, 0.0))
+    return linear_figures(vec, effects), np.where(deviation > _SAME, deviation, 0.0)
+
+
+def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield offsets, sensitivities (one row if they are equal) and angles with usual values."""
+    found, deviation = (part.reshape(3, 3) for part in _with_deviations(calibration))
+    native, per_g = calibration.units.is_native, calibration.units.per_g
+    scale, unit = (per_g, 'native') if native else (MG, 'mg')
+    for axis, value, sd in zip(AXES, found[0], deviation[0], strict=True):
+        if sd or value:
+            usual = '' if native else f'±{_USUAL_OFFSET_MG[axis]:g} mg'
+            yield f'offset {axis}', signed(value * scale, sd * scale, unit), usual
+    equal = np.ptp(found[1]) < _SAME
+    for axis, value, sd in zip(AXES[:1] if equal else AXES, found[1], deviation[1], strict=False):
+        name = 'gain all axes' if equal else f'gain {axis}'
+        if native:
+            yield name, signed(value * per_g, sd * per_g, 'native per g'), ''
+        elif sd or abs(value - 1.0) > _SAME:
+            yield (name, signed((value - 1.0) * 100.0, sd * 100.0, '%'),
+                   f'±{_USUAL_GAIN_PERCENT:g} %')
+    for (i, j), value, sd in zip(_PAIRS, found[2], deviation[2], strict=True):
+        if sd or abs(value - 90.0) > _SAME:
+            words = signed(value - 90.0, sd)
+            yield (f'angle {AXES[i]} to {AXES[j]}', f'90° {words[0]} {words[1:]}°',
+                   f'±{_USUAL_CROSS_AXIS_PERCENT:g} %, {_USUAL_CROSS_AXIS:.1f}°')
+
+
+def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield the values of the other effects; a curve, which has many, is one row."""
+    for name in calibration.model.effects:
+        if name.startswith(f'{EMPIRICAL}-'):
+            carrier, variable, modes = empirical_parts(name)
+            yield f'curve of {carrier} over {VARIABLES[variable]}', counted(len(modes), 'wave'), ''
+    for figure in effect_figures(calibration):
+        name, _, part = figure.key.rpartition('.')
+        if name.startswith(f'{EMPIRICAL}-') or not (figure.value or figure.sd):
+            continue
+        label = f'{name.replace("_", " ")} {part}'
+        if part in effect_named(name).parameters:
+            yield label, *_with_typical(figure, name, part)
+        else:
+            yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
+
+
+def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str]:
+    """Return the value of an effect, and its typical size; small ones in millionths."""
+    unit, scale = value_unit(effect, parameter)
+    typical, factor = effect_named(effect).typical * scale, 1.0
+    if unit.startswith('g') and 0.0 < typical < _SMALL:
+        unit, factor = f'µ{unit}', MG ** 2
+    return (signed(figure.value * factor, figure.sd * factor, unit),
+            f'±{short(typical * factor)} {unit}' if typical else '')
+
+
+def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
+    """Return the section with the table of all poses, in order of rows."""
+    head, rows = _pose_rows(residuals, calibration)
+    return section('Poses', paragraph(f'{counted(len(rows), "pose")}, with the residual before '
+                                      'and after.'),
+                   scroll_table(head, [cells for _, cells in rows], 'whole-cells', 'Poses',
+                                long=len(rows) > _LONG_TABLE, poses=[row for row, _ in rows]))
+
+
+def _pose_rows(residuals: Residuals, calibration: Calibration
+               ) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the head of the table of poses, and each row with its number."""
+    kept = residuals.poses_g
+    optional = [key for key in ('label', 'time', 'temperature') if key in kept]
+    names = {'label': 'label', 'time': 'time [s]', 'temperature': '°C'}
+    head = ['row', *(names[key] for key in optional),
+            *(f'{axis} [{calibration.units.symbol}]' for axis in AXES),
+            'before [mg]', 'after [mg]', *(['note'] if residuals.reasons else [])]
+    rows = []
+    since = since_first(kept) if 'time' in kept else None
+    for k, reading in enumerate(calibration.units.from_g(kept.reading)):
+        context = [str(kept[key][k]) if key == 'label' else
+                   f'{since[k]:.1f}' if key == 'time' and since is not None else
+                   f'{kept[key][k]:.1f}' for key in optional]
+        rows.append((int(kept.row[k]), [
+            str(kept.row[k]), *context, *(f'{part:.6g}' for part in reading),
+            milli(residuals.before_mg[k], signed=residuals.signed),
+            milli(residuals.after_mg[k], signed=residuals.signed)]))
+    for row, reading in zip(residuals.left_out.row, residuals.left_out.reading, strict=True):
+        rows.append((int(row), [str(row), *('' for _ in optional),
+                                *(f'{part:.6g}' for part in reading), '', '', 'left out: '
+                                + residuals.reasons[int(row)]]))
+    return head, sorted(rows, key=lambda each: each[0])
+
+
+# ----------------------------------------------------------------------------- the search
+
+def _search(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:
+    """
+    Yield the sections about a search for effects.
+
+    What the refinement leaves is shown if the calibration of the page leaves something else. They
+    differ for effects that a calibration cannot correct, such as a slow change of the offset, and
+    for poses of known or shared orientation, whose residual is the vector error.
+
+    """
+    if result.steps:
+        note = '' if used else ' '.join((_NOT_USED, *_refusal(result)))
+        yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
+                      figures([ladder(result)], 'wide'), _overview(result))
+    for number, step in enumerate(result.steps, 1):
+        yield _step(result, number, step)
+    left = residuals_of_refinement(result)
+    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
+        yield section('What remains after the refinement',
+                      figures(of_remainder(left, 'refined'), 'pair'))
+    rows = [(f'{effect_named(name).words} ({name})', needs)
+            for name, needs in result.not_testable]
+    yield section('What these data cannot show', scroll_table(
+        ('effect', 'to see it, record'), rows, '', 'Effects that cannot be tested')
+        if rows else '')
+
+
+def _step(result: Refinement, number: int, step: Step) -> str:
+    """Return the section of a step, from 1."""
+    shown = values_of(step)
+    table = '' if not shown else scroll_table(
+        [name for name, _ in shown], [[value for _, value in shown]], 'whole-cells',
+        f'Values of step {number}')
+    curve = figures([of_curve(result, number - 1)], 'wide') if step.curve else ''
+    title = f'{number}. {effect_named(step.name).words.capitalize()}'
+    return section(title, f'<p>{_story(step)}</p>\n', table,
+                   figures(of_step(result, number - 1), 'pair'), curve)
+
+
+def _overview(result: Refinement) -> str:
+    """Return the table of steps."""
+    head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
+    rows = [(str(number), step.effect,
+             f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
+             f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
+             chance(step.p_value), ', '.join(step.likely_rivals) or 'none')
+            for number, step in enumerate(result.steps, 1)]
+    return scroll_table(head, rows, 'whole-but-last', 'Steps')
+
+
+def _story(step: Step) -> str:
+    """Return a text about the location of the disagreement, and the effect on the residual."""
+    rivals = ', '.join(f'{code(name)} ({percent(step.probabilities[name])})'
+                       for name in step.rivals)
+    return (f'{code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
+            f'{escape(step.where)}. With this effect the residual decreases from '
+            f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
+            f'and the held-out residual from {short(step.held_out_before_mg)} to '
+            f'{short(step.held_out_after_mg)} mg; '
+            f'<span class="whole">{escape(chance(step.p_value))}</span>.'
+            + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
+
+
+def _refusal(result: Refinement) -> tuple[str, ...]:
+    """Return the reason why the calibration must not be used, if there is one."""
+    if not result.refusal:
+        return ()
+    found, advice = result.refusal
+    return (f'the refined calibration must not be used: {found}; {advice}',)

@@ -17,27 +17,40 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .drawings import Drawing
-from .sections import verdict_box
-from .sheet import figures, heading, HINT, listing, scroll_table, section, sheet
-from .style import (
+from .charts import (
     ACCENT,
+    add_bar,
     AFTER,
+    BAND,
     BEFORE,
-    Chart,
+    Drawing,
+    EDGE,
     FAINT,
+    HEIGHT_INCHES,
     INK,
     legend_below,
     Mark,
+    Marks,
     new_figure,
     PAPER,
     styled,
     THERMAL,
     THIRD,
 )
+from .sheet import (
+    figures,
+    heading,
+    HINT,
+    how_to_read,
+    listing,
+    rated_sheet,
+    scroll_table,
+    section,
+    verdict_box,
+    write_sheet,
+)
 from .. import __version__
 from ..compare import Comparison, History, Parameter
-from ..disk import write_atomically
 from ..findings import (
     change_in_words,
     CROSS,
@@ -48,114 +61,101 @@ from ..findings import (
     scale_of,
 )
 from ..table import Floats
-from ..text import short
+from ..text import short, with_minus
 
 if TYPE_CHECKING:
     from ..calibrate import Calibration
     from ..findings import Rating
 
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
-_BAND = 1.96
-"""Half the width of a band, in standard deviations: 95 %."""
 
 _DAY_S = 86400.0
 _ONE_COLOUR = 0.5
 """Range of temperatures that is drawn in one colour [°C]."""
 
 
-def named_words(name: str, value: float, sd: float) -> str:
+def spoken(name: str) -> str:
+    """Return the name of a parameter in words, such as ``offset x``."""
+    return name.replace('.', ' ')
+
+
+def _named_words(name: str, value: float, sd: float) -> str:
     """Return a parameter with its name, such as ``offset x +20.3 ± 0.1 mg``."""
-    return f'{name.replace(".", " ")} {in_words(name, value, sd)}'
+    return f'{spoken(name)} {in_words(name, value, sd)}'
 
 
-def of_parameters(comparison: Comparison, labels: Sequence[str]) -> tuple[Drawing, ...]:
-    """
-    Draw the difference of each parameter of each run from the mean of all runs.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison.
-    labels : sequence of str
-        Name of each run.
-
-    """
-    groups = (('offsets', 'Zero-g offset', OFFSETS), ('gains', 'Gain and cross-axis',
-                                                      (*GAINS, *CROSS)))
-    drawn = []
-    for key, words, names in groups:
+def of_parameters(comparison: Comparison, labels: Sequence[str]) -> Iterator[Drawing]:
+    """Yield the difference of each parameter of each run, named by `labels`, from the mean."""
+    for key, words, names in (('offsets', 'Zero-g offset', OFFSETS),
+                              ('gains', 'Gain and cross-axis', (*GAINS, *CROSS))):
         found = [each for each in comparison.parameters if each.name in names]
-        title = f'{words}: difference of each run from the mean, with 95 % band'
-        drawn.append(Drawing(key, title, _draw_parameters(title, found, labels)))
-    return tuple(drawn)
+        with styled():
+            figure = new_figure(HEIGHT_INCHES, f'{words} minus the mean of the runs')
+            hover = _draw_parameters(figure.subplots(), found, labels)
+            if len(labels) <= len(_COLOURS):
+                legend_below(figure, 2)
+        yield Drawing(key, f'{words}: difference of each run from the mean, with 95 % band',
+                      figure, hover)
 
 
-def _draw_parameters(title: str, found: Sequence[Parameter], labels: Sequence[str]) -> Chart:
+def _draw_parameters(panel: Any, found: Sequence[Parameter], labels: Sequence[str]
+                     ) -> dict[str, Marks]:
+    """Draw the differences of all runs, and return the texts of their markers."""
     hover = {}
-    with styled():
-        figure = new_figure(3.3)
-        figure.suptitle(title.partition(':')[0] + ' minus the mean of the runs', x=0.02, ha='left',
-                        fontsize=10.5)
-        panel = figure.subplots()
-        panel.grid(visible=True, axis='y')
-        panel.axhline(0.0, color=FAINT, linewidth=1.2)
-        for run, label in enumerate(labels):
-            at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
-            factor = np.array([scale_of(each.name)[1] for each in found])
-            change = np.array([each.values[run] - np.mean(each.values) for each in found])
-            band = _BAND * np.array([each.stated_sd[run] for each in found])
-            colour = _COLOURS[run % len(_COLOURS)]
-            panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
-            panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label,
-                       markeredgecolor=PAPER, markeredgewidth=0.4)
-            hover[f'run{run}'] = tuple(Mark(0, f'{label}, ' + named_words(
-                each.name, each.values[run], each.stated_sd[run])) for each in found)
-        panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
-        panel.set_ylabel(scale_of(found[0].name)[2])
-        if len(labels) <= len(_COLOURS):
-            legend_below(figure, 2)
-    return Chart(figure, hover)
+    panel.grid(visible=True, axis='y')
+    panel.axhline(0.0, color=FAINT, linewidth=1.2)
+    factor = np.array([scale_of(each.name)[1] for each in found])
+    for run, label in enumerate(labels):
+        at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
+        change = np.array([each.values[run] - np.mean(each.values) for each in found])
+        band = BAND * np.array([each.stated_sd[run] for each in found])
+        colour = _COLOURS[run % len(_COLOURS)]
+        panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
+        panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label, **EDGE)
+        hover[f'run{run}'] = tuple(Mark(0, f'{label}, ' + _named_words(
+            each.name, each.values[run], each.stated_sd[run])) for each in found)
+    panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
+    panel.set_ylabel(scale_of(found[0].name)[2])
+    return hover
 
 
-def of_history(history: History) -> tuple[Drawing, ...]:
-    """Draw offset, gain and cross-axis over the dates, with bands."""
-    groups = (('history_offset', 'Zero-g offset', OFFSETS),
-              ('history_gain', 'Gain minus 1', GAINS),
-              ('history_cross_axis', 'Cross-axis gain', CROSS))
-    drawn = []
-    for key, words, names in groups:
+def of_history(history: History) -> Iterator[Drawing]:
+    """Yield offset, gain and cross-axis over the dates, with bands."""
+    for key, words, names in (('history_offset', 'Zero-g offset', OFFSETS),
+                              ('history_gain', 'Gain minus 1', GAINS),
+                              ('history_cross_axis', 'Cross-axis gain', CROSS)):
         found = [each for each in history.parameters if each.name in names and (
-            key != 'history_cross_axis' or np.any(each.stated_sd))]
+            names is not CROSS or np.any(each.stated_sd))]
         if found:
-            title = f'{words} over the dates, with 95 % band'
-            drawn.append(Drawing(key, title, _draw_history(title, history, found)))
-    return tuple(drawn)
+            yield _over_dates(key, f'{words} over the dates, with 95 % band', history, found)
 
 
-def _draw_history(title: str, history: History, found: Sequence[Parameter]) -> Chart:
-    at, dated = _positions(history)
-    warm = _temperatures(history)
-    hover = {}
+def _over_dates(key: str, title: str, history: History, found: Sequence[Parameter]) -> Drawing:
+    at, dated = places_of([None if moment.when is None else moment.when.timestamp()
+                           for moment in history.moments])
+    warm, hover = _temperatures(history), {}
     with styled():
-        figure = new_figure(0.9 + 1.25 * len(found))
-        figure.suptitle(title, x=0.02, ha='left', fontsize=10.5)
+        figure = new_figure(0.9 + 1.25 * len(found), title)
         panels = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
         for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
             drawn = _draw_line(panel, each, at, warm)
             drawn.set_gid(f'panel{k}')
             hover[f'panel{k}'] = _marks(history, each)
         if warm is not None:
-            bar = figure.colorbar(drawn, ax=list(panels), aspect=40, pad=0.02)
-            bar.set_label('temperature [°C]')
-            bar.outline.set_visible(False)
+            add_bar(figure, drawn, panels, 'temperature [°C]', pad=0.02)
         label_dates(panels[-1], at, dated=dated)
-    return Chart(figure, hover)
+    return Drawing(key, title, figure, hover)
 
 
-def _positions(history: History) -> tuple[Floats, bool]:
-    """Return the place of each calibration, and whether it is a date."""
-    days = np.array([np.nan if moment.when is None else moment.when.timestamp() / _DAY_S
-                     for moment in history.moments])
+def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
+    """
+    Return the place of each calibration, and whether it is a date.
+
+    The places are days since 1970 if all of the stamps [s since 1970] are known and differ,
+    otherwise numbers from 1.
+
+    """
+    days = np.array([np.nan if stamp is None else stamp / _DAY_S for stamp in stamps])
     dated = bool(np.all(np.isfinite(days))) and float(np.ptp(days)) > 0.0
     return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
 
@@ -170,7 +170,7 @@ def _temperatures(history: History) -> Floats | None:
 
 def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> Any:
     zero, factor, unit = scale_of(each.name)
-    values, band = (each.values - zero) * factor, _BAND * each.stated_sd * factor
+    values, band = (each.values - zero) * factor, BAND * each.stated_sd * factor
     panel.grid(visible=True)
     panel.fill_between(at, values - band, values + band, color=AFTER, alpha=0.18, linewidth=0.0)
     panel.plot(at, values, color=FAINT, linewidth=1.2)
@@ -178,18 +178,17 @@ def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> 
     panel.set_ylabel(f'{each.name.partition(".")[2]} [{unit}]')
     if warm is None:
         return panel.plot(at, values, 'o', color=AFTER, markeredgecolor=PAPER)[0]
-    limits = {'vmin': np.nanmin(warm), 'vmax': np.nanmax(warm)}
     colours = np.where(np.isfinite(warm), warm, np.nanmean(warm))
     return panel.scatter(at, values, c=colours, cmap=THERMAL, edgecolors=INK, linewidths=0.5,
-                         zorder=3, **limits)
+                         zorder=3, vmin=np.nanmin(warm), vmax=np.nanmax(warm))
 
 
-def _marks(history: History, each: Parameter) -> tuple[Mark, ...]:
+def _marks(history: History, each: Parameter) -> Marks:
     """Return date, value and temperature of each calibration."""
     marks = []
     for label, moment, value, sd in zip(history.labels, history.moments, each.values,
                                         each.stated_sd, strict=True):
-        words = f'{label}, {named_words(each.name, value, sd)}'
+        words = f'{label}, {_named_words(each.name, value, sd)}'
         if moment.temperature is not None:
             words += f', {moment.temperature:.0f} °C'
         marks.append(Mark(0, words))
@@ -245,8 +244,7 @@ def write_comparison_page(path: Path, comparison: Comparison, rating: Rating,
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    text = comparison_page(comparison, rating, sources, calibrations)
-    write_atomically(path, lambda file: file.write(text))
+    write_sheet(path, comparison_page(comparison, rating, sources, calibrations))
 
 
 def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Path],
@@ -260,8 +258,8 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
             section('Parameters', figures(of_parameters(comparison, labels),
                                           'pair'), HINT, _parameters(comparison)),
             section('Notes', listing(_notes(comparison))),
-            section('How to read this', listing(_HOW_TO_READ), kind='reading')]
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body)
+            how_to_read(_HOW_TO_READ)]
+    return rated_sheet(title, rating, body)
 
 
 def _of_sensor(calibrations: Sequence[Calibration]) -> str:
@@ -285,8 +283,8 @@ def _parameters(comparison: Comparison) -> str:
     for each in comparison.parameters:
         zero, factor, unit = scale_of(each.name)
         stated = float(np.sqrt(np.mean(each.stated_sd ** 2)))
-        mean = short((each.values.mean() - zero) * factor).replace('-', '−')
-        rows.append((each.name.replace('.', ' '), f'{mean} {unit}',
+        mean = with_minus(short((each.values.mean() - zero) * factor))
+        rows.append((spoken(each.name), f'{mean} {unit}',
                      short(each.spread * factor), short(stated * factor),
                      '' if each.ratio is None else f'{each.ratio:.2f}'))
     return scroll_table(('', 'mean', 'spread', 'stated', 'ratio'), rows, 'whole-cells',
@@ -322,8 +320,7 @@ def write_history_page(path: Path, history: History, sources: Sequence[Path],
         If the file cannot be written. An earlier file is then unchanged.
 
     """
-    text = history_page(history, sources, calibrations)
-    write_atomically(path, lambda file: file.write(text))
+    write_sheet(path, history_page(history, sources, calibrations))
 
 
 def history_page(history: History, sources: Sequence[Path],
@@ -337,8 +334,8 @@ def history_page(history: History, sources: Sequence[Path],
             section('Changes', _changes(history)),
             section('Calibrations', _moments(history, sources)),
             section('Notes', listing(history.notes)),
-            section('How to read this', listing(_HOW_TO_READ), kind='reading')]
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body)
+            how_to_read(_HOW_TO_READ)]
+    return rated_sheet(title, rating, body)
 
 
 def _changes(history: History) -> str:
@@ -346,7 +343,7 @@ def _changes(history: History) -> str:
     head = ('from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]')
     rows = [(first, second, change_words(change.comparison.agree, rate_comparison(
         change.comparison)), f'{change.comparison.p_value:.2g}',
-             f'{change.parameter.replace(".", " ")} ' + change_in_words(
+             f'{spoken(change.parameter)} ' + change_in_words(
                  change.parameter, change.change, change.sd),
              short(change.comparison.runs[1].rms_mg))
             for first, second, change in zip(history.labels, history.labels[1:], history.changes,
@@ -362,7 +359,7 @@ def change_words(agree: bool, rating: Rating) -> str:
 def _moments(history: History, sources: Sequence[Path]) -> str:
     """Return a table of the calibrations with their parameters."""
     head = ('', 'date', 'file', 'model', '°C', 'residual [mg]',
-            *(each.name.replace('.', ' ') for each in history.parameters))
+            *(spoken(each.name) for each in history.parameters))
     rows = []
     for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
         warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'

@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .style import Mark
 from ..calibrate import Calibration, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
 from ..geometry import unit
@@ -19,9 +18,18 @@ from ..table import Floats, Poses
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement
+    from ..refine import Refinement, Stage
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
+
+_LABELS = {
+    'temperature': ('temperature [°C]', 1.0),
+    'temperature_of_offset': ('temperature that acts on the offset [°C]', 1.0),
+    'temperature_of_gain': ('temperature that acts on the gain [°C]', 1.0),
+    'temperature_rate': ('rate of temperature [°C/min]', 60.0),
+    'supply_voltage': ('supply [V]', 1.0), 'std': ('standard deviation of the samples [mg]', MG),
+    'rate': ('angular rate [rad/s]', 1.0), 'force': ('force along the axis [g]', 1.0)}
+"""Label and factor of each variable."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +78,9 @@ def variables_of(effect: str, poses_g: Poses, force: Floats, shape: Floats | Non
         return [Variable(f'from the previous pose, {axis}', known[key][:, k], True)
                 for k, axis in enumerate(AXES)]
     if key is None:
-        return [Variable(f'force along {axis} [g]', force[:, k], True)
-                for k, axis in enumerate(AXES) if k in _axes_of(effect)]
+        axes = sorted({term.axis for term in found.terms}) or [0, 1, 2]
+        return [Variable(f'force along {AXES[k]} [g]', force[:, k], True) for k in axes]
     return [variable_of(key, known[key])]
-
-
-def _axes_of(effect: str) -> list[int]:
-    """Return the axes of an effect of the force: those of its terms."""
-    return sorted({term.axis for term in effect_named(effect).terms}) or [0, 1, 2]
 
 
 def with_thermal(poses_g: Poses, lagged: str, shape: Floats) -> Poses:
@@ -94,16 +97,6 @@ def recorded(poses_g: Poses) -> list[Variable]:
     """Return the variables of the context that change between poses."""
     found = [variable_of(key, poses_g[key]) for key in _CONTEXT if key in poses_g]
     return [variable for variable in found if np.ptp(variable.values) > 0.0]
-
-
-_LABELS = {
-    'temperature': ('temperature [°C]', 1.0),
-    'temperature_of_offset': ('temperature that acts on the offset [°C]', 1.0),
-    'temperature_of_gain': ('temperature that acts on the gain [°C]', 1.0),
-    'temperature_rate': ('rate of temperature [°C/min]', 60.0),
-    'supply_voltage': ('supply [V]', 1.0), 'std': ('standard deviation of the samples [mg]', MG),
-    'rate': ('angular rate [rad/s]', 1.0), 'force': ('force along the axis [g]', 1.0)}
-"""Label and factor of each variable."""
 
 
 def variable_of(key: str, values: Floats) -> Variable:
@@ -169,30 +162,9 @@ class Residuals:
         """RMS of the residuals with the calibration [mg]."""
         return float(np.sqrt(np.mean(self.after_mg ** 2)))
 
-    def marks(self, residual_mg: Floats) -> tuple[Mark, ...]:
-        """Return the text of each pose with this residual."""
-        return marks_of(self.poses_g, residual_mg, signed=self.signed)
-
-
-def marks_of(poses: Poses, residual_mg: Floats, *, signed: bool) -> tuple[Mark, ...]:
-    """Return row, residual and temperature of each pose, such as ``row 11, +0.4 mg, 31 °C``."""
-    warm = poses.columns.get('temperature')
-    marks = []
-    for k, (row, residual) in enumerate(zip(poses.row, residual_mg, strict=True)):
-        words = f'row {row}, {milli(residual, signed=signed)} mg'
-        if warm is not None and np.isfinite(warm[k]):
-            words += f', {warm[k]:.0f} °C'.replace('-', '−')
-        marks.append(Mark(int(row), words))
-    return tuple(marks)
-
-
-def milli(value: float, *, signed: bool) -> str:
-    """Return a residual with as many decimals as a person compares."""
-    size = abs(value)
-    decimals = 0 if size >= 1000.0 else 1 if size >= 9.95 else 2 if size >= 0.0995 else 3
-    rounded = round(value, decimals) + 0.0
-    sign = '+' if signed else ''
-    return f'{rounded:{sign}.{decimals}f}'.replace('-', '−')
+    def at(self, stage: Stage) -> Residuals:
+        """Return the residuals at a stage of the refinement of these poses."""
+        return replace(self, after_mg=stage.residual_mg)
 
 
 def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residuals:
