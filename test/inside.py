@@ -95,7 +95,6 @@ from accel_calib.geometry import (
 from accel_calib.intake import poses_of
 from accel_calib.live import server, sources, viewer
 from accel_calib.live.host import Host
-from accel_calib.live.link import qr_code, reachable
 from accel_calib.live.messages import CALIBRATION_ALONE
 from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
 from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
@@ -111,6 +110,7 @@ from accel_calib.logs import (
     open_bag,
     text,
 )
+from accel_calib.live.viewer import qr_code, reachable
 from accel_calib.logs.ardupilot import read_dataflash
 from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest

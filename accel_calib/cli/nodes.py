@@ -17,7 +17,6 @@ from .frame import console, Done, Output, table
 from .inputs import log_options
 from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
-from ..live.link import check_installed, qr_code
 
 if TYPE_CHECKING:
     from ..ros.demo import Outcome
@@ -45,11 +44,12 @@ def run_simulator(args: argparse.Namespace) -> Done:
 
 def run_live(args: argparse.Namespace) -> Done:
     """Serve the live page without ROS until the user ends it."""
-    check_installed()
     from ..live.host import Host
     from ..live.sources import open_source
+    from ..live.viewer import check_installed, qr_code
     from ..session import CalibratorSettings
 
+    check_installed()
     output = Output()
     with (open_source(args.source, log_options(args), baud=args.baud,
                       speed=args.speed) as source, ended() as is_over):
@@ -78,9 +78,10 @@ def run_demo(args: argparse.Namespace) -> Done:
                          NEEDS_ROS) from err
     output = console(args)
     if args.web:
-        check_installed()
+        from ..live.viewer import check_installed
         from ..session import WEB_PORT
 
+        check_installed()
         with ended() as is_over:
             demonstrate_page(WEB_PORT, output.print, is_over)
         return Done()

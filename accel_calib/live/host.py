@@ -16,12 +16,12 @@ the server in its thread, and they pass the work on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 import math
 from queue import Empty, SimpleQueue
 from time import monotonic, time
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,6 +51,9 @@ from ..session import (
 from ..stored.exports import export, Exported
 from ..table import Floats
 
+if TYPE_CHECKING:
+    from .sources import Source
+
 Show = Callable[[messages.Message], object]
 """Function that shows a message to all viewers."""
 
@@ -63,10 +66,8 @@ class Exchange:
 
     Parameters
     ----------
-    session : Session
-        The session.
-    worker : Worker
-        Its worker.
+    session, worker : Session, Worker
+        The session, and its worker.
     call_soon : callable
         Function that lets the thread of the session call a function.
     log : callable
@@ -224,62 +225,18 @@ _TICK = 1.0
 """Interval between two checks of the stream [s]."""
 
 
-class Samples(Protocol):
-    """
-    Where the samples come from; `sources.open_source` makes it.
-
-    Attributes
-    ----------
-    name : str
-        The port or the recording.
-    sensor : str
-        Name of the sensor, as a frame_id; empty if it is not known.
-    blocks : iterable of (n, 9) array
-        The samples as they arrive, as in `accel_calib.capture.StillDetector.push`. A block can be
-        empty, and comes after a short time at the latest, because the page waits meanwhile.
-    problem : callable
-        Function that returns why no samples come at present; empty if nothing is wrong.
-
-    """
-
-    @property
-    def name(self) -> str:
-        """Return the port or the recording."""
-
-    @property
-    def sensor(self) -> str:
-        """Return the name of the sensor, as a frame_id; empty if it is not known."""
-
-    @property
-    def blocks(self) -> Iterable[Floats]:
-        """Return the samples as they arrive."""
-
-    @property
-    def problem(self) -> Callable[[], str]:
-        """Return the function that returns why no samples come at present."""
-
-
 class Host:
     """
     A session, its page, and the samples of a source.
 
     Parameters
     ----------
-    source : Samples
+    source : Source
         Where the samples come from.
     settings : CalibratorSettings
         The parameters; ``web_host`` and ``web_port`` are those of the page.
     log : callable
         Function that prints a log line.
-
-    Attributes
-    ----------
-    server : PageServer
-        The server of the page.
-    session : Session
-        The session.
-    exchange : Exchange
-        What the page shows of it.
 
     Raises
     ------
@@ -288,7 +245,7 @@ class Host:
 
     """
 
-    def __init__(self, source: Samples, settings: CalibratorSettings,
+    def __init__(self, source: Source, settings: CalibratorSettings,
                  log: Callable[[Log], object]) -> None:
         self._source, self._print, self._filter = source, log, LogFilter()
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -309,15 +266,7 @@ class Host:
         self.exchange.show = self.server.show
 
     def run(self, is_over: Callable[[], bool]) -> None:
-        """
-        Serve until it is over.
-
-        Parameters
-        ----------
-        is_over : callable
-            Function that returns whether to end; it is called about 20 times per second.
-
-        """
+        """Serve until `is_over`, which is called about 20 times per second, returns true."""
         self._handle_events()
         for block in self._blocks():
             if is_over():

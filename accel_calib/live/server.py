@@ -29,8 +29,7 @@ from typing import Any, Protocol, TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from . import messages
-from .link import check_installed, not_bound, reachable
-from .viewer import STUCK_S, TooManyError, Viewer
+from .viewer import check_installed, not_bound, reachable, STUCK_S, TooManyError, Viewer
 from ..report.sheet import part_of_page
 from ..session import Answer
 from ..stored.exports import Exported, FORMATS
@@ -145,15 +144,7 @@ class PageServer:
     # In any thread
 
     def start(self) -> None:
-        """
-        Start serving.
-
-        Raises
-        ------
-        InputError
-            If the address or port cannot be used.
-
-        """
+        """Start serving; raise InputError if the address or port cannot be used."""
         started: Future[None] = Future()
         self._thread = Thread(target=lambda: asyncio.run(self._serve(started)), daemon=True,
                               name='accel_calib_page')
@@ -380,10 +371,8 @@ class PageServer:
         """
         Admit a viewer that has said hello, and set why it only looks.
 
-        Raises
-        ------
-        TooManyError
-            If there are too many viewers, and none without the token if this one has it.
+        TooManyError is raised if there are too many viewers, and none without the token if this
+        one has it.
 
         """
         viewer.why = '' if self._is_token(token) else _WRONG_TOKEN if token else _NO_TOKEN

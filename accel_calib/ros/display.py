@@ -158,7 +158,7 @@ class Page:
         if not settings.web_port:
             return
         from ..live.host import Exchange
-        from ..live.link import qr_code
+        from ..live.viewer import qr_code
         from ..live.messages import PERIOD
         from ..live.server import PageServer
         exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
