@@ -1,12 +1,15 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: recordings, a sensor, the command line, and tasks of a session."""
+"""Helpers of several tests: recordings, sensors, the command line, and tasks of a session."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 import json
 from pathlib import Path
 from typing import Any
 
+from accel_calib.calibrate import Calibration
 from accel_calib.geometry import unit
 from accel_calib.session import Step, Task
 from accel_calib.table import Floats
@@ -33,6 +36,17 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
                        for name in names})
+
+
+def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,
+                 **columns: Any) -> Calibration:
+    """Return a calibration with further effects of this variance, and columns of its poses."""
+    model = Model({**calibration.model.values, **{name: np.array(part, float) for name, part in
+                                                  values.items()}}, calibration.rotation)
+    covariance, size = variance * np.eye(len(model.vector)), len(calibration.covariance)
+    covariance[:size, :size] = calibration.covariance
+    return replace(calibration, model=model, covariance=covariance,
+                   poses=calibration.poses.with_columns(**columns))
 
 
 def random_directions(count: int, rng: np.random.Generator) -> Floats:

@@ -12,7 +12,7 @@ from typing import Any
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 
 from faults.sample import FACTOR  # noqa: E402
-from long_run import long_run, trend  # noqa: E402
+from long_run import long_run  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
@@ -63,16 +63,3 @@ def test_the_node_reports_no_defect(run: Any) -> None:
     assert 'correcting with model' in run.log
     assert 'Traceback' not in run.log
     assert 'unexpected error' not in run.log
-
-
-def test_trend_is_found_beside_the_pattern_of_a_round() -> None:
-    rng = np.random.default_rng(4)
-    hours = np.arange(60) / 60.0
-    pattern = np.tile([0.0, 5.0, -3.0, 9.0, 1.0], 12)
-    slope, error = trend(hours, 100.0 + pattern + 2.0 * hours + 0.1 * rng.normal(size=60), 5)
-    assert 0.03 < error < 0.06
-    assert abs(slope - 2.0) < 3.0 * error
-
-
-def test_trend_of_too_few_values_is_not_known() -> None:
-    assert np.isnan(trend(np.arange(6.0), np.arange(6.0), 5)).all()

@@ -125,15 +125,6 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         assert node.poll() is None
 
 
-def test_the_token_is_not_sent_to_viewers(bench: Any, viewer: Viewer) -> None:
-    bench.spin(lambda: viewer.of('state'))
-    other = Viewer(viewer.base)
-    bench.spin(lambda: other.of('state'))
-    other.close()
-    assert viewer.token not in str(other.got)
-    assert not other.of('welcome')[0]['may']
-
-
 def test_the_managed_node_serves_the_page_while_it_is_configured(
         bench: Any, stored: Callable[..., Path]) -> None:
     node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())

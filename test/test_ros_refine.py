@@ -4,7 +4,6 @@
 """The node finds an effect that its calibration lacks, and corrects it."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 import time
 from typing import Any
@@ -12,10 +11,11 @@ from typing import Any
 from accel_calib.calibrate import Calibration
 from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
-from inside import Model, spread_directions
+from inside import spread_directions
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, Temperature
+from shared import with_effects
 from visualization_msgs.msg import MarkerArray
 
 Readings = Callable[..., Any]
@@ -85,16 +85,10 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
 
 def with_effect(path: Path, name: str, values: list[float]) -> Calibration:
     """Add an effect of the temperature, seen from 15 to 35 °C, to a stored calibration."""
-    found = read_calibration(path)
-    count = len(found.poses)
-    poses = found.poses.with_columns(temperature=25.0 + 10.0 * np.cos(np.arange(count) * 2.0),
-                                     time=np.arange(count) * 100.0)
-    model = Model({**found.model.values, name: np.array(values)})
-    covariance = np.zeros((len(model.vector),) * 2)
-    size = len(found.covariance)
-    covariance[:size, :size] = found.covariance
-    covariance[size:, size:] = 1e-14 * np.eye(len(model.vector) - size)
-    write_calibration(path, replace(found, model=model, poses=poses, covariance=covariance))
+    found, turn = read_calibration(path), np.arange(20)
+    write_calibration(path, with_effects(
+        found, {name: values}, 1e-14, temperature=25.0 + 10.0 * np.cos(turn * 2.0),
+        time=turn * 100.0))
     return read_calibration(path)
 
 
@@ -144,13 +138,3 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
                                   temperature=np.array(warm[30:]))
     if 'lag' in calibration.model.terms.effects[-1].shape:
         assert np.abs(begun_now - expected[30:]).max() > 0.02
-
-
-def test_refinement_of_too_few_poses_is_refused(bench: Any, readings: Readings) -> None:
-    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
-    bench.calibrator(sensor='arm', passthrough=True)
-    bench.feed(readings([[0, 0, 1], [1, 0, 0]]))
-    bench.spin(lambda: markers and sum(m.ns == 'poses' for m in markers[-1].markers) >= 2)
-    answer = bench.call('refine')
-    assert not answer.success
-    assert 'expected at least 4' in answer.message

@@ -15,20 +15,18 @@ import subprocess
 import sys
 from typing import Any
 
-from accel_calib.logs import read_poses, write_table
+from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from diagnostic_msgs.srv import SelfTest
 from faults.sample import FACTOR, sample
-from inside import CALIBRATOR, spread_directions
+from inside import CALIBRATOR
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).parent.parent
-KILLS = 4
 BUSY = 10 if FACTOR > 1 else 4
 TROUBLE = ('Traceback', 'FATAL', 'ERROR', 'Fatal Python error', 'Failed to')
 """What no node may print at its end: of Python, of the log, and of the layers below."""
@@ -113,43 +111,18 @@ def test_a_managed_node_is_cleaned_up_while_messages_and_requests_arrive(bench: 
     assert not [word for word in TROUBLE if word in printed], printed
 
 
-def test_files_are_complete_after_a_kill_at_any_moment(
-        bench: Any, readings: Callable[..., Any]) -> None:
-    bench.without_shared_memory()
-    turned = readings(spread_directions(12))
-    pauses = np.random.default_rng(5).uniform(0.1, 0.9, KILLS)
-    table = bench.home / 'accel_calib' / 'arm_poses.csv'
-    stored = bench.home / 'accel_calib' / 'arm.yaml'
-    fewest = 0
-    for pause in pauses:
-        node = bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=10, passthrough=True)
-        bench.feed(turned[:round(pause * len(turned))])
-        bench.end(node, signal.SIGKILL)
-        bench.join_anew()
-        if table.exists():
-            assert len(read_poses(table)) >= fewest
-            fewest = len(read_poses(table))
-        if stored.exists():
-            assert read_calibration(stored).sensor == 'arm'
-    assert fewest >= 4
-
-
-@pytest.mark.parametrize(('given', 'words'), sample([
-    ('gravity:=900.0', 'gravity'), ('still_window:=wide', 'still_window'),
-    ('model:=11', 'expected one of auto'), ('max_dwell:=1.5', 'contradict each other')], 1))
-def test_bad_parameters_get_one_line_and_status_2(bench: Any, given: str, words: str) -> None:
-    node = bench.start('calibrator', **dict([given.split(':=')]))
+@pytest.mark.parametrize(('name', 'given', 'words'), sample([
+    ('calibrator', {'gravity': 900.0}, 'gravity'),
+    ('calibrator', {'still_window': 'wide'}, 'still_window'),
+    ('calibrator', {'max_dwell': 1.5}, 'contradict each other'),
+    ('simulator', {'effects': ['nonsense=1']}, 'nonsense')], 1))
+def test_bad_parameters_get_one_line_and_status_2(
+        bench: Any, name: str, given: dict[str, Any], words: str) -> None:
+    node = bench.start(name, **given)
     printed = node.communicate(timeout=60)[0]
     assert node.returncode == 2
     assert words in printed
     assert len(printed.strip().splitlines()) == 1, printed
-
-
-def test_effect_that_is_not_in_the_catalogue_ends_the_simulator(bench: Any) -> None:
-    node = bench.start('simulator', effects=['nonsense=1'])
-    printed = node.communicate(timeout=60)[0]
-    assert node.returncode == 2
-    assert 'nonsense' in printed.strip().splitlines()[0]
 
 
 def test_without_ros_there_is_one_line_and_status_2(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a robot in the field meets: wrong stamps, several drivers, few poses, a given mounting."""
+"""What a robot in the field meets: transforms, several drivers, QoS, a preview, signals."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from geometry_msgs.msg import Vector3
 from inside import CALIBRATOR, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
-import yaml
 
 GRAVITY = 9.80665
-CONE = np.radians(10.0)
 NODE = 'calibrator'
 
 Readings = Callable[..., Any]
@@ -59,72 +58,9 @@ def rest(bench: Any, still: list[Bool], reading: Any) -> Callable[[], Imu]:
     return lambda: bench.imu(now())
 
 
-def cone(count: int = 8) -> Any:
-    """Return directions within 10° of the z axis."""
-    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    tilt = np.where(np.arange(count) % 2, CONE, 0.4 * CONE)
-    return np.column_stack([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle),
-                            np.cos(tilt)])
-
-
-# The heading and the mounting
-
-
-def test_the_heading_is_called_arbitrary_near_its_singular_direction_and_then_kept(
-        bench: Any, stored: Stored) -> None:
-    still = bench.listen(Bool, 'calibrator/still', latched=True)
-    path = stored()
-    bench.calibrator(calibration_file=path)
-    make = rest(bench, still, [GRAVITY, 0.0, 0.0])
-    answer = bench.call_while('set_level', make)
-    assert answer.success, answer.message
-    assert 'the heading of the mounting is arbitrary' in answer.message
-    for way in ('~/set_heading', 'mounting_rpy', 'base_frame'):
-        assert way in answer.message
-    first = read_calibration(path).rotation
-    for _ in range(3):
-        assert bench.call_while('set_level', make).success
-    turn = first.T @ read_calibration(path).rotation
-    assert np.degrees(np.arccos((np.trace(turn) - 1.0) / 2.0)) < 0.5
-
-
-def test_a_given_mounting_is_used_kept_by_set_level_and_reported(
-        bench: Any, stored: Stored) -> None:
-    still = bench.listen(Bool, 'calibrator/still', latched=True)
-    path, rpy = stored(), [0.02, -0.03, 2.0]
-    given = rotation_from_rpy(*rpy)
-    bench.calibrator(calibration_file=path, mounting_rpy=rpy)
-    got = bench.exchange(bench.came_out, lambda: bench.imu([0.0, 0.0, GRAVITY]))
-    calibration = read_calibration(path)
-    np.testing.assert_allclose(
-        force_of(got), given @ calibration.correct(np.array([[0.0, 0.0, GRAVITY]]))[0], atol=1e-9)
-    assert got.header.frame_id == 'imu_link_levelled'
-    flat = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]) @ given)[0]
-    answer = bench.call_while('set_level', rest(bench, still, flat))
-    assert answer.success, answer.message
-    assert re.search(r'roll 1\.1\d°, pitch -1\.7\d°, yaw 114\.\d+°', answer.message)
-    assert '<origin xyz="0 0 0" rpy="' in answer.message
-    assert 'static_transform_publisher --roll' in answer.message
-    found = read_calibration(path)
-    np.testing.assert_allclose(found.rotation.T, given, atol=2e-3)
-    about = yaml.safe_load(path.read_text())['mounting']
-    np.testing.assert_allclose([about['roll'], about['pitch'], about['yaw']], rpy, atol=2e-3)
-    assert about['urdf'] in answer.message
-
-
-def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
-        bench: Any, stored: Stored) -> None:
-    still = bench.listen(Bool, 'calibrator/still', latched=True)
-    bench.calibrator(calibration_file=stored(), mounting_rpy=[0.5, 0.0, 0.0])
-    answer = bench.call_while('set_level', rest(bench, still, [0.0, 0.0, GRAVITY]))
-    assert not answer.success
-    assert 'differs by more than 10° of tilt from the mounting' in answer.message
-
-
 def test_the_mounting_comes_from_the_static_transforms_and_is_published(
         tf_message: Any, bench: Any, stored: Stored) -> None:
     from geometry_msgs.msg import TransformStamped
-    from rclpy.qos import DurabilityPolicy, QoSProfile
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot = bench.node.create_publisher(tf_message, '/tf_static', latched)
     heard: list[Any] = []
@@ -158,49 +94,7 @@ def test_the_mounting_comes_from_the_static_transforms_and_is_published(
     assert found.transform.rotation.w == pytest.approx(math.cos(0.5))
 
 
-def test_parameters_that_need_tf_are_refused_in_words_without_it(
-        without_tf2: None, bench: Any) -> None:
-    for parameter, value in (('base_frame', 'base_link'), ('publish_tf', True)):
-        process = bench.start('calibrator', **{parameter: value})
-        printed = process.communicate(timeout=60)[0]
-        assert process.returncode == 2
-        assert f'the parameter {parameter} needs the package tf2_msgs' in printed
-        assert 'Traceback' not in printed
-
-
 # The stream
-
-
-@pytest.mark.parametrize(('kind', 'words'), sample([
-    ('zero', 'the stamps are zero'), ('constant', 'the stamps are constant'),
-    ('shuffled', 'the stamps are out of order')], 1))
-def test_wrong_stamps_are_in_the_second_diagnostics_at_latest(
-        bench: Any, kind: str, words: str) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(passthrough=True)
-    sent = 0
-
-    def make() -> Imu:
-        nonlocal sent
-        sent += 1
-        message = bench.imu([0.1, 0.2, 9.8])
-        if kind == 'zero':
-            message.header.stamp.sec = message.header.stamp.nanosec = 0
-        elif kind == 'constant':
-            message.header.stamp.sec, message.header.stamp.nanosec = 1000, 5
-        elif sent % 2:
-            message.header.stamp.sec -= 1
-        return message
-
-    bench.exchange(bench.came_out, make)
-    diagnostics.clear()
-
-    def said() -> bool:
-        bench.send(make())
-        return bool(diagnostics) and words in status(diagnostics, 'stream').message
-
-    bench.spin(said)
-    assert len(diagnostics) <= 2  # one each second
 
 
 def test_two_publishers_on_the_topic_are_named(bench: Any) -> None:
@@ -216,6 +110,43 @@ def test_two_publishers_on_the_topic_are_named(bench: Any) -> None:
 
     bench.spin(said)
     assert status(diagnostics, 'stream').level == DiagnosticStatus.WARN
+
+
+def test_an_incompatible_qos_is_named_with_both_nodes_and_what_to_do(bench: Any) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.run(*CALIBRATOR, '--ros-args', '-p',
+                     'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+    bench.client('self_test')
+    bench.spin(lambda: diagnostics)
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    latched = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    bench.node.create_publisher(Imu, 'imu/data_raw', best_effort)
+    heard: list[Imu] = []
+    bench.node.create_subscription(Imu, 'imu/data_calibrated', heard.append, latched)
+    wanted = ('/bench publishes on /imu/data_raw with the QoS best effort, but the subscriber '
+              'expects reliable', '/imu/data_calibrated has the QoS volatile, but the subscriber '
+              'expects transient local, so that /bench receives nothing')
+    bench.spin(lambda: all(words in diagnostics[-1].status[0].message for words in wanted))
+    status, printed = bench.end(node, signal.SIGTERM)
+    assert status == 0, printed
+    assert all(printed.count(words) == 1 for words in wanted)
+
+
+@pytest.mark.parametrize('publisher', sample([
+    QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+    QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)], 1))
+def test_every_qos_of_a_driver_fits_and_is_not_reported(bench: Any, publisher: QoSProfile) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.start('calibrator')
+    bench.client('self_test')
+    driver = bench.node.create_publisher(Imu, 'imu/data_raw', publisher)
+
+    def arrived() -> bool:
+        driver.publish(bench.imu([0.0, 0.0, GRAVITY]))
+        return bool(diagnostics) and 'no calibration yet' in diagnostics[-1].status[0].message
+
+    bench.spin(arrived)
+    assert 'QoS' not in bench.end(node, signal.SIGTERM)[1]
 
 
 def test_the_diagnostics_have_the_true_rate_and_the_resolved_names(
@@ -264,54 +195,6 @@ def test_the_log_says_what_the_node_waits_for_and_the_unit_that_is_likely(bench:
     assert 'waiting: no Imu messages on /imu/data_raw, although /bench publishes' in printed
     assert 'Imu messages arrive on /imu/data_raw' in printed
     assert 'start the node with units:=g' in printed
-
-
-def test_there_is_one_line_for_each_pose_and_none_when_done(
-        bench: Any, readings: Readings) -> None:
-    process = bench.calibrator(passthrough=True)
-    bench.feed(readings(spread_directions(19)))
-    again = readings(spread_directions(19)[:6])
-    bench.feed(again)
-    lines = [line for line in bench.end(process, signal.SIGINT)[1].splitlines()
-             if 'pose' in line and 'read' not in line]
-    counts = [int(found[1]) for line in lines if (found := re.search(r'pose (\d+)\b', line))]
-    assert counts == list(range(1, 20)), '\n'.join(lines)
-    assert re.search(r'pose 7 of about 1\d, \d\.\d\d mg, next: turn the sensor so that', lines[6])
-    assert not any('or call ~/fit' in line for line in lines[:8])
-    assert not any('1 poses' in line for line in lines)
-    assert len([line for line in lines if 'no longer help' in line]) <= 1
-
-
-# Few poses
-
-
-def test_set_level_works_without_a_fit(bench: Any) -> None:
-    still = bench.listen(Bool, 'calibrator/still', latched=True)
-    bench.calibrator(sensor='arm', passthrough=True)
-    reading = np.array([1.0, -0.5, 9.7])
-    answer = bench.call_while('set_level', rest(bench, still, reading))
-    assert answer.success, answer.message
-    assert 'roll' in answer.message
-    bench.exchange(bench.came_out, lambda: bench.imu(reading))
-    bench.spin(lambda: bench.came_out[-1].header.frame_id == 'imu_link_levelled' or bench.send(
-        bench.imu(reading)))
-    got = bench.came_out[-1]
-    np.testing.assert_allclose(force_of(got)[:2], 0.0, atol=0.01)
-    assert read_calibration(bench.home / 'accel_calib' / 'arm.yaml').is_levelled
-
-
-def test_a_cone_of_poses_gives_what_it_carries_with_numbers(
-        bench: Any, readings: Readings) -> None:
-    bench.calibrator(sensor='arm', passthrough=True, min_pose_angle=0.05)
-    bench.feed(readings(cone()))
-    answer = bench.call('fit')
-    assert answer.success, answer.message
-    assert re.search(r'along gravity', answer.message)
-    assert re.search(r'\d+(\.\d+)? mg', answer.message)
-    assert 'turn the sensor so that' in answer.message
-    found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
-    lengths = np.linalg.norm(found.correct(readings(cone(5), dwell=1.0)[:20]), axis=1)
-    assert abs(float(np.mean(lengths)) / GRAVITY - 1.0) < 1e-3
 
 
 def test_one_rest_gives_gyro_bias_mounting_and_the_offset_along_gravity(bench: Any) -> None:
@@ -370,44 +253,6 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
                or bench.send(bench.imu([0.3, 0.4, 9.7])))
 
 
-def test_undo_goes_back_step_by_step_also_after_a_restart(
-        bench: Any, readings: Readings) -> None:
-    bench.without_shared_memory()
-    still = bench.listen(Bool, 'calibrator/still', latched=True)
-    process = bench.calibrator(sensor='arm', passthrough=True)
-    bench.feed(readings(spread_directions(12)))
-    path = bench.home / 'accel_calib' / 'arm.yaml'
-    assert bench.call('fit').success
-    fitted = path.read_text()
-    answer = bench.call_while('set_level', rest(bench, still, readings([[0.0, 0.0, 1.0]])[-1]))
-    assert answer.success, answer.message
-    assert 'changes offset by (+0.00, +0.00, +0.00) mg' in answer.message
-    assert read_calibration(path).is_levelled
-    assert bench.end(process, signal.SIGKILL)[0] == -signal.SIGKILL
-    bench.join_anew()
-    bench.calibrator(sensor='arm', passthrough=True)
-    bench.exchange(bench.came_out, lambda: bench.imu([0.3, 0.4, 9.7]))
-    assert bench.call('undo').success
-    assert path.read_text() == fitted
-    answer = bench.call('undo')
-    assert answer.success, answer.message
-    assert not path.exists()
-    assert not bench.call('undo').success
-    assert len(list(path.parent.glob('arm.yaml.undone*'))) == 2
-
-
-def test_automatic_fits_rewrite_the_file_only_for_a_change_beyond_the_uncertainty(
-        bench: Any, readings: Readings) -> None:
-    path = bench.home / 'accel_calib' / 'arm.yaml'
-    bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=12, passthrough=True)
-    bench.feed(readings(spread_directions(12)))
-    bench.spin(path.exists)
-    written = path.stat().st_mtime_ns
-    bench.feed(readings(spread_directions(25)[:8]))
-    assert path.stat().st_mtime_ns == written
-    assert len(list(path.parent.glob('arm.yaml.before*'))) == 1
-
-
 # Start and end
 
 
@@ -418,40 +263,6 @@ def test_a_signal_at_any_time_of_the_start_ends_the_node_without_a_traceback(ben
         status, printed = bench.end(process, signal.SIGTERM)
         assert status in (0, -signal.SIGTERM), printed
         assert 'Traceback' not in printed
-
-
-def test_leftovers_of_killed_processes_are_removed_at_the_start(
-        bench: Any, stored: Stored) -> None:
-    path = stored()
-    left = [path.with_name(f'.{name}.12345.tmp') for name in (path.name, 'known_poses.csv')]
-    for each in left:
-        each.write_text('half a file')
-    bench.calibrator(calibration_file=path)
-    assert not any(each.exists() for each in left)
-    assert path.exists()
-
-
-@pytest.mark.parametrize('change', sample([
-    lambda text: re.sub(r'(x: |x:\s*)-?0\.\d+', r'\g<1>7.5', text, count=1),
-    lambda text: re.sub(r'rotation:\n(- \[.*\]\n){3}',
-                        'rotation:\n' + '- [0.0, 0.0, 0.0]\n' * 3, text)], 1))
-def test_an_absurd_calibration_edited_by_hand_is_not_used(
-        bench: Any, stored: Stored, change: Callable[[str], str]) -> None:
-    path = stored()
-    absurd = change(path.read_text())
-    assert absurd != path.read_text()
-    path.write_text(absurd)
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(calibration_file=path)
-    bench.spin(lambda: diagnostics and status(diagnostics, 'calibration').level
-               == DiagnosticStatus.ERROR)
-    assert 'implausible' in status(diagnostics, 'calibration').message
-    assert path.with_name(f'{path.name}.damaged1').read_text() == absurd
-
-
-def test_switching_the_correction_on_says_what_is_published(bench: Any, stored: Stored) -> None:
-    bench.calibrator()
-    assert 'nothing is published' in bench.call('enable', data=True).message
 
 
 def test_the_managed_node_loads_on_configure_and_publishes_when_active(
@@ -508,17 +319,3 @@ def test_the_quality_of_service_can_be_overridden(bench: Any, stored: Stored) ->
     info = bench.node.get_publishers_info_by_topic('/imu/data_calibrated')[0]
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     assert bench.end(process, signal.SIGINT)[0] == 0
-
-
-def test_the_progress_is_published_for_the_person_at_the_robot(
-        bench: Any, readings: Readings) -> None:
-    progress = bench.listen(DiagnosticStatus, 'calibrator/progress', latched=True)
-    bench.calibrator(passthrough=True)
-    bench.feed(readings(spread_directions(4)))
-    bench.spin(lambda: progress and values(progress[-1])['poses'] == '4')
-    found = values(progress[-1])
-    assert progress[-1].message == found['next pose'] != ''
-    assert len(found['next direction'].split()) == 3
-    assert 0.0 < float(found['coverage']) < 1.0
-    assert found['poses in all, about'] in ('11', '12', '13')
-    assert any(values(each)['still'] == 'true' for each in progress)

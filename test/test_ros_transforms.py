@@ -49,22 +49,6 @@ rclpy.spin(node)
 """
 """Publishes each list of links as one latched message of a node of its own."""
 
-BROADCAST = f"""
-import sys
-from {MountingBroadcaster.__module__} import MountingBroadcaster
-from {rotation_from_rpy.__module__} import rotation_from_rpy
-from builtin_interfaces.msg import Time
-import rclpy
-rclpy.init()
-node = rclpy.create_node('broadcaster')
-broadcaster = MountingBroadcaster(node)
-for roll in (0.3, 0.4):
-    broadcaster.publish(Time(sec=7), '/imu_link', 'imu_link_levelled',
-                        rotation_from_rpy(roll, -0.2, 1.0))
-print('published', flush=True)
-rclpy.spin(node)
-"""
-
 
 def robot() -> StaticTransforms:
     """
@@ -211,20 +195,3 @@ def test_repeated_transform_is_no_change(tf_message: Any, bench: Any) -> None:
         broadcaster.publish(Time(), 'base', 'imu', rotation)
     bench.spin(lambda: len(received) == 3 and len(changes) >= 2)
     np.testing.assert_allclose(changes, [IMU, MAST], atol=1e-12)
-
-
-def test_late_subscriber_receives_the_last_published_mounting(
-        tf_message: Any, bench: Any) -> None:
-    published(bench, BROADCAST)
-    received = bench.listen(tf_message, TF_TOPIC, latched=True)
-    bench.spin(lambda: received)
-    assert len(received) == 1
-    stamped, = received[0].transforms
-    assert stamped.header.stamp == Time(sec=7)
-    assert (stamped.header.frame_id, stamped.child_frame_id) == ('imu_link', 'imu_link_levelled')
-    offset = stamped.transform.translation
-    assert (offset.x, offset.y, offset.z) == (0.0, 0.0, 0.0)
-    tree = watch_static(bench.node, lambda: None)
-    bench.spin(lambda: tree.rotation('imu_link', 'imu_link_levelled') is not None)
-    np.testing.assert_allclose(tree.rotation('imu_link', 'imu_link_levelled'),
-                               rotation_from_rpy(0.4, -0.2, 1.0), atol=1e-12)

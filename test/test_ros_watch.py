@@ -9,7 +9,6 @@ from collections.abc import Callable
 import fcntl
 import os
 import pty
-import re
 import signal
 import struct
 import subprocess
@@ -96,21 +95,6 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
     assert shown.rindex(b'\x1b[?25h') > shown.rindex(b'\x1b[?25l')  # the cursor is back
     assert b'3 of about' in shown[shown.rindex(b'\x1b[?1049l'):]
     assert 'Traceback' not in shown.decode()
-
-
-def test_once_prints_the_progress_and_ends(bench: Any, readings: Readings) -> None:
-    bench.calibrator(sensor='arm', passthrough=True)
-    watching = bench.run(*WATCH)
-    lines, thread = lines_of(watching)
-    bench.spin(lambda: lines)
-    turn(bench, readings, lambda count: any(f'captured pose {count} of' in x for x in lines))
-    watching.terminate()
-    thread.join()
-    process = bench.run(*WATCH, '--once')
-    printed = process.communicate(timeout=60)[0]
-    assert process.returncode == 0
-    assert re.search('^poses: 3 of about 1[0-9]$', printed, re.MULTILINE)
-    assert re.search('^next: turn the sensor so that the .* points up', printed, re.MULTILINE)
 
 
 def test_once_without_a_node_is_one_line(bench: Any) -> None:

@@ -181,6 +181,7 @@ def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(reading
     driver.session.commands.enable(False)
     driver.feed(readings([[0, 0, 1]])[:30])
     assert not driver.session.enabled
+    assert 'nothing is published' in driver.session.commands.enable(True)
 
 
 def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_parameter(

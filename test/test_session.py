@@ -31,10 +31,11 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import answer_of
+from shared import answer_of, with_effects
 
 GRAVITY = 9.80665
 RATE = 50.0
+UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 
 pytestmark = pytest.mark.usefixtures('home')
 
@@ -162,11 +163,13 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
     other = stored('use.yaml', sensor='another').read_text()
     table = 'ax,ay,az\n1,2,words\n'
     (tmp_path / 'use_poses.csv').write_text(table)
+    (tmp_path / '.use.yaml.12345.tmp').write_text('of a process that was killed')
     driver = Driver(calibration_file=str(tmp_path / 'use.yaml'))
     driver.feed(readings(spread_directions(12)))
     assert "sensor 'another'" in driver.finding('calibration').words
     assert (tmp_path / 'use.yaml').read_text() == other
     assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
+    assert not (tmp_path / '.use.yaml.12345.tmp').exists()
     assert driver.done(driver.session.commands.fit())
     assert (tmp_path / 'use.yaml.other1').read_text() == other
     assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
@@ -264,6 +267,61 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     assert 'levelled by this pose' in driver.done(driver.session.commands.set_level())
 
 
+def captured(driver: Driver) -> list[list[int]]:
+    """Return the directions of the captured poses."""
+    reading = driver.session.sensor.live.book.poses().reading
+    found: list[list[int]] = np.round(reading / GRAVITY).astype(int).tolist()
+    return found
+
+
+def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings) -> None:
+    driver = Driver()
+    driver.feed(readings([UP], dwell=3.0))
+    driver.now, driver.stamp = driver.now + 2.3, driver.stamp + 2.3
+    driver.feed(np.tile([GRAVITY, 0.0, 0.0], (5, 1)))
+    for name in ('capture_pose', 'set_level'):
+        with pytest.raises(AccelCalibError, match='still'):
+            driver.done(getattr(driver.session.commands, name)())
+    assert 'jumped' not in driver.logged('warning')  # the stamps are as late as the messages
+
+
+@pytest.mark.parametrize(('jump', 'words'), [
+    (-3600.0, 'jumped back by 3600'), (86400.0, 'jumped ahead by 864')])
+def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
+        jump: float, words: str, readings: Readings) -> None:
+    driver = Driver()
+    driver.stamp = 10_000.0
+    turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
+    for _ in range(3):  # such as a recording that is played in a loop
+        driver.feed(turned)
+        driver.stamp += jump
+    assert captured(driver) == [UP, LEFT, FORWARD]
+    assert driver.logged('warning').count(words) == 2
+    assert len(driver.session.sensor.live.detector.interruptions) == 2
+
+
+def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
+    driver = Driver()
+    driver.feed(readings([UP], dwell=3.0))
+    rows = np.full((15, 9), np.nan)
+    rows[:, 0], rows[:, 1:4] = driver.stamp, [GRAVITY, 0.0, 0.0]
+    for _ in range(12):
+        driver.now += 0.3
+        driver.session.push(rows, driver.now)
+        driver.handle()
+    with pytest.raises(AccelCalibError, match='the stamps have not changed for'):
+        driver.done(driver.session.commands.set_level())
+    driver.feed(readings([LEFT, UP], dwell=3.0))
+    assert captured(driver) == [UP, LEFT]
+
+
+def test_one_absurd_first_reading_does_not_spoil_the_capture(readings: Readings) -> None:
+    driver = Driver()
+    driver.feed([[0.0, 0.0, 1e200]])
+    driver.feed(readings([UP, LEFT], dwell=2.5))
+    assert captured(driver) == [UP, LEFT]
+
+
 def test_the_heading_is_set_with_the_nose_down_and_kept(
         stored: Stored, readings: Readings) -> None:
     path = stored()
@@ -293,18 +351,50 @@ def test_the_heading_is_set_with_the_nose_down_and_kept(
     assert yaw() < 1.0
 
 
+def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
+        stored: Stored, readings: Readings) -> None:
+    driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
+    driver.feed(readings([UP], dwell=6.0)[:200])
+    with pytest.raises(InputError, match='differs by more than 10° of tilt from the mounting'):
+        driver.done(driver.session.commands.set_level())
+
+
+@pytest.mark.parametrize(('old', 'new', 'words'), [
+    ('version: 3', 'version: 999', 'version 999'),
+    ('readings: m/s2', 'readings: native', 'native'),
+    ('sensor: imu_link', 'sensor: another', "belongs to sensor 'another'")])
+def test_a_load_that_is_refused_keeps_the_calibration_in_use(
+        old: str, new: str, words: str, stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    driver = Driver(calibration_file=str(path))
+    driver.feed(readings([UP])[:30])
+    used = driver.session.sensor.calibration
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(StoredCalibrationError, match=words):
+        driver.done(driver.session.commands.load())
+    assert driver.session.sensor.calibration is used is not None
+
+
+def test_reset_removes_poses_and_calibration_but_keeps_the_files(
+        home: Path, readings: Readings) -> None:
+    driver = Driver(sensor='arm')
+    driver.feed(readings(spread_directions(12)))
+    driver.done(driver.session.commands.fit())
+    stored = (home / 'arm.yaml').read_bytes()
+    driver.done(driver.session.commands.reset())
+    assert driver.session.sensor.calibration is None
+    assert captured(driver) == []
+    assert not {'arm.yaml', 'arm_poses.csv'} & {path.name for path in home.iterdir()}
+    assert (home / 'arm.yaml.reset1').read_bytes() == stored
+    assert len(read_poses(home / 'arm_poses.csv.reset1')) == 12
+
+
 def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
-    found = read_calibration(path)
-    values = {**found.model.values, 'offset_temperature': np.array([1e-3, 0.0, 0.0])}
-    poses = found.poses.with_columns(temperature=np.linspace(20.0, 30.0, len(found.poses)))
-    size = len(found.covariance)
-    covariance = np.zeros((size + 3, size + 3))
-    covariance[:size, :size] = found.covariance
-    covariance[size:, size:] = 1e-12 * np.eye(3)
-    write_calibration(path, replace(found, model=Model(values), poses=poses,
-                                    covariance=covariance))
+    write_calibration(path, with_effects(
+        read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
+        temperature=np.linspace(20.0, 30.0, 20)))
     driver = Driver(calibration_file=str(path))
     for temperature, level in ((25.0, Level.OK), (40.0, Level.WARN)):
         driver.session.statistics.temperature = temperature
@@ -395,8 +485,7 @@ def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Rea
     driver.feed(readings(spread_directions(14)))
     assert driver.done(driver.session.commands.fit())
     fitted = driver.session.sensor.calibration
-    refined = replace(fitted, model=Model({**fitted.model.values, 'quadratic': np.zeros(3)}),
-                      covariance=np.eye(len(fitted.covariance) + 3) * 1e-8)
+    refined = with_effects(fitted, {'quadratic': np.zeros(3)}, 1e-8)
     driver.session.adopt(refined)
     driver.feed(readings(spread_directions(33)))
     assert driver.session.sensor.fitted_poses >= 30
@@ -487,16 +576,10 @@ def test_advice_about_a_file_that_cannot_be_written_fits_the_reason(number: int,
 def test_lag_of_the_temperature_is_followed_while_the_node_runs(
         of_sensor: float, stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
-    found = read_calibration(path)
-    lag, count = 60.0, len(found.poses)
-    values = {**found.model.values,
-              'offset_temperature': np.array([0.0, 0.0, 5e-3, lag, of_sensor])}
-    poses = found.poses.with_columns(temperature=25.0 + 20.0 * np.sin(np.arange(count) * 2.0),
-                                     time=np.arange(count) * 100.0)
-    covariance = np.zeros((len(found.covariance) + 5,) * 2)
-    covariance[:-5, :-5] = found.covariance
-    write_calibration(path, replace(found, model=Model(values), poses=poses,
-                                    covariance=covariance))
+    values, turn = np.array([0.0, 0.0, 5e-3, 60.0, of_sensor]), np.arange(20)
+    write_calibration(path, with_effects(
+        read_calibration(path), {'offset_temperature': values}, 0.0,
+        temperature=25.0 + 20.0 * np.sin(turn * 2.0), time=turn * 100.0))
     driver = Driver(calibration_file=str(path))
     still = readings([[0, 0, 1]], dwell=4.0)[:10]
     warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
@@ -512,11 +595,11 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     expected, plain = (each.apply(
         np.tile(still, (900, 1)), time=time, temperature=np.repeat(warm, 10))[during].mean(axis=0)
         for each in (calibration, replace(calibration, model=Model(
-            {**values, 'offset_temperature': values['offset_temperature'][:3]}))))
+            {**calibration.model.values, 'offset_temperature': values[:3]}))))
     np.testing.assert_allclose(gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
-    slow = np.append(values['offset_temperature'][:3], [2.0 * lag, of_sensor])
-    offered = replace(calibration, model=Model({**values, 'offset_temperature': slow}))
+    offered = replace(calibration, model=Model(
+        {**calibration.model.values, 'offset_temperature': values * [1.0, 1.0, 1.0, 2.0, 1.0]}))
     driver.session.sensor.offered = offered
     driver.session.statistics.temperature = warm[-1]
     corrected = offered.apply(np.tile(still, (900, 1)), time=time,
