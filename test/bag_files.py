@@ -1,17 +1,18 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Small sound bags of every kind, for the tests that damage them."""
+"""Messages for bags, and small sound bags of every kind for the tests that damage them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 import shutil
 import sqlite3
 from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
+from accel_calib.table import Recording
 from accel_calib.units import units_of
 from inside import simulate_poses, spread_directions
 from mcap_file import McapFile, STORE
@@ -32,20 +33,60 @@ RATE_NS = 10 ** 7
 Write = Callable[[Path], Path]
 
 
+def header(store: Any, stamp: int, frame_id: str = 'imu_link') -> Any:
+    """Return a header with a stamp [ns]."""
+    kind = store.types['std_msgs/msg/Header']
+    extra = {'seq': 0} if 'seq' in kind.__annotations__ else {}
+    return kind(frame_id=frame_id, stamp=store.types['builtin_interfaces/msg/Time'](
+        sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9), **extra)
+
+
+def imu(store: Any, about: Any, force: Any, rate: Any = (0.0, 0.0, 0.0),
+        quaternion: Any = (0.0, 0.0, 0.0, 1.0), covariances: Any = np.zeros((3, 9))) -> Any:
+    """Return an Imu with this header."""
+    vector = store.types['geometry_msgs/msg/Vector3']
+    return store.types[IMU](
+        about, store.types['geometry_msgs/msg/Quaternion'](*map(float, quaternion)),
+        covariances[0], vector(*map(float, rate)), covariances[1], vector(*map(float, force)),
+        covariances[2])
+
+
+def writer_of(path: Path, kind: str) -> tuple[Any, Any, Any]:
+    """Return a writer of bag (ROS 1), mcap or sqlite3, its types, and its serializer."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == 'bag' else Stores.ROS2_JAZZY)
+    writer = Writer1(path) if kind == 'bag' else Writer2(
+        path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    return writer, store, store.serialize_ros1 if kind == 'bag' else store.serialize_cdr
+
+
+def write_bag(path: Path, kind: str, recording: Recording,
+              topics: Sequence[str] = ('/imu/data_raw',)) -> Path:
+    """Write the samples [g] of a recording with Imu, temperature and text."""
+    writer, store, serialize = writer_of(path, kind)
+    reading = units_of('m/s2').from_g(recording.reading)
+    with writer:
+        imus = [writer.add_connection(topic, IMU, typestore=store) for topic in topics]
+        warm, words = (writer.add_connection(*each, typestore=store) for each in TOPICS[1:])
+        for k, time in enumerate(recording['time']):
+            receipt = 100 * 10 ** 9 + round(time * 1e9)
+            about = header(store, receipt)
+            for connection in imus:
+                writer.write(connection, receipt, serialize(
+                    imu(store, about, reading[k], recording['rate'][k]), IMU))
+            if k % 50 == 0:
+                value = store.types[TEMPERATURE](about, float(recording['temperature'][k]), 0.0)
+                writer.write(warm, receipt, serialize(value, TEMPERATURE))
+                writer.write(words, receipt, serialize(store.types[STRING](f'word {k}'), STRING))
+    return path
+
+
 def messages(store: Any = STORE) -> list[tuple[int, int, Any]]:
     """Return (number of the topic, time of receipt [ns], message)."""
-    types, rng = store.types, np.random.default_rng(1)
-    header = types['std_msgs/msg/Header']
-    extra = {'seq': 0} if 'seq' in header.__annotations__ else {}
-    vector, found = types['geometry_msgs/msg/Vector3'], []
+    types, rng, found = store.types, np.random.default_rng(1), []
     for k in range(COUNT):
         stamp = START + RATE_NS * k
-        about = header(frame_id='imu', stamp=types['builtin_interfaces/msg/Time'](
-            sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9), **extra)
-        reading = rng.normal([0.1, -0.2, 9.8], 0.01).tolist()
-        found.append((0, stamp, types[IMU](
-            about, types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), np.zeros(9),
-            vector(0.0, 0.0, 0.0), np.zeros(9), vector(*reading), np.zeros(9))))
+        about = header(store, stamp, 'imu')
+        found.append((0, stamp, imu(store, about, rng.normal([0.1, -0.2, 9.8], 0.01))))
         if k % 5 == 0:
             found.append((1, stamp + 1, types[TEMPERATURE](about, 20.0 + 0.1 * k, 0.0)))
             found.append((2, stamp + 2, types[STRING](f'word {k}')))

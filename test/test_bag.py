@@ -9,14 +9,11 @@ from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
+from bag_files import write_bag
 from inside import simulate_recording, spread_directions
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import get_typestore, Stores
 from shared import sensor
 
 KINDS = ['mcap', 'sqlite3', 'bag']
@@ -28,51 +25,6 @@ def recording():
     rng = np.random.default_rng(5)
     return simulate_recording(sensor(rng), spread_directions(12), rng, dwell=2.0, turn=0.5,
                               temperatures=(20.0, 30.0))
-
-
-def imu_message(store, k, recording, frame_id='imu_link'):
-    types = store.types
-    nanoseconds = round(recording['time'][k] * 1e9)
-    stamp = types['builtin_interfaces/msg/Time'](
-        sec=int(nanoseconds // 10 ** 9) + 100, nanosec=int(nanoseconds % 10 ** 9))
-    ros1 = 'seq' in types['std_msgs/msg/Header'].__annotations__
-    extra = {'seq': k} if ros1 else {}
-    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id, **extra)
-    vector = types['geometry_msgs/msg/Vector3']
-    covariance = np.zeros(9)
-    quaternion = types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0)
-    reading, rate = UNITS.from_g(recording.reading[k]), recording['rate'][k]
-    return types['sensor_msgs/msg/Imu'](
-        header=header, orientation=quaternion, orientation_covariance=covariance,
-        angular_velocity=vector(*rate.tolist()), angular_velocity_covariance=covariance,
-        linear_acceleration=vector(*reading.tolist()), linear_acceleration_covariance=covariance
-    ), header
-
-
-def write_bag(path, kind, recording, topics=('/imu/data_raw',)):
-    """Write a bag with Imu, temperature and a string topic."""
-    store = get_typestore(Stores.ROS1_NOETIC if kind == 'bag' else Stores.ROS2_JAZZY)
-    writer = Writer1(path) if kind == 'bag' else Writer2(
-        path, version=9, storage_plugin=StoragePlugin[kind.upper()])
-    serialize = store.serialize_ros1 if kind == 'bag' else store.serialize_cdr
-    with writer:
-        imus = [writer.add_connection(topic, 'sensor_msgs/msg/Imu', typestore=store)
-                for topic in topics]
-        warm = writer.add_connection('/temperature', 'sensor_msgs/msg/Temperature',
-                                     typestore=store)
-        words = writer.add_connection('/words', 'std_msgs/msg/String', typestore=store)
-        for k in range(len(recording)):
-            receipt = 100 * 10 ** 9 + round(recording['time'][k] * 1e9)
-            message, header = imu_message(store, k, recording)
-            for connection in imus:
-                writer.write(connection, receipt, serialize(message, connection.msgtype))
-            if k % 50 == 0:
-                value = store.types['sensor_msgs/msg/Temperature'](
-                    header=header, temperature=float(recording['temperature'][k]), variance=0.0)
-                writer.write(warm, receipt, serialize(value, warm.msgtype))
-                text = store.types['std_msgs/msg/String'](data=f'word {k}')
-                writer.write(words, receipt, serialize(text, words.msgtype))
-    return path
 
 
 def name(folder, kind):

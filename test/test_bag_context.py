@@ -16,13 +16,11 @@ from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import units_of
+from bag_files import header, IMU, imu, writer_of
 from inside import model_with, simulate_poses, spread_directions, together
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys import get_types_from_msg
 
 COUNT, STEP = 400, 10 ** 7
 RECEIVED = 1_700_000_000 * 10 ** 9
@@ -41,25 +39,12 @@ float64 load
 Values = Callable[[float], Any]
 
 
-def store_of(kind: str) -> Any:
-    store = get_typestore(Stores.ROS1_NOETIC if kind == 'bag' else Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg(OWN_DEFINITION, OWN))
-    return store
-
-
-def header(store: Any, stamp: int, frame_id: str = 'imu_link') -> Any:
-    kind = store.types['std_msgs/msg/Header']
-    extra = {'seq': 0} if 'seq' in kind.__annotations__ else {}
-    return kind(frame_id=frame_id, stamp=store.types['builtin_interfaces/msg/Time'](
-        sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9), **extra)
-
-
 def message(store: Any, msgtype: str, stamp: int, value: Any) -> Any:
     """Return a message of a type with this value."""
     kind = store.types[msgtype]
     if msgtype.startswith('std_msgs/'):
         return kind(value)
-    about = header(store, stamp, 'imu_link')
+    about = header(store, stamp)
     if msgtype == 'sensor_msgs/msg/BatteryState':
         found = {'header': about, 'voltage': value, 'temperature': float('nan'), 'present': True,
                  'location': '', 'serial_number': ''}
@@ -82,21 +67,15 @@ def write(path: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'mca
     acceleration.
 
     """
-    store = store_of(kind)
-    writer: Any = Writer1(path) if kind == 'bag' else Writer2(
-        path, version=9, storage_plugin=StoragePlugin[kind.upper()])
-    serialize = store.serialize_ros1 if kind == 'bag' else store.serialize_cdr
-    vector = store.types['geometry_msgs/msg/Vector3']
+    writer, store, serialize = writer_of(path, kind)
+    store.register(get_types_from_msg(OWN_DEFINITION, OWN))
     with writer:
-        imu = writer.add_connection('/imu/data', 'sensor_msgs/msg/Imu', typestore=store)
+        own = writer.add_connection('/imu/data', IMU, typestore=store)
         others = {name: writer.add_connection(name, msgtype, typestore=store)
                   for name, (msgtype, _) in topics.items()}
         for k in range(COUNT):
-            made = store.types['sensor_msgs/msg/Imu'](
-                header(store, stamped + k * STEP),
-                store.types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), np.zeros(9),
-                vector(0.0, 0.0, 0.0), np.zeros(9), vector(*force), np.zeros(9))
-            writer.write(imu, RECEIVED + k * STEP, serialize(made, imu.msgtype))
+            made = imu(store, header(store, stamped + k * STEP), force)
+            writer.write(own, RECEIVED + k * STEP, serialize(made, IMU))
             if k % 10:
                 continue
             for name, (msgtype, value) in topics.items():
@@ -157,13 +136,6 @@ def test_a_stamp_of_another_clock_is_replaced_by_the_time_of_receipt(own_stamp: 
     found, notes = read(path)
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     assert 'have no stamp of the clock of the Imu' in notes[0]
-
-
-def test_a_temperature_with_stamps_needs_no_name_and_no_note(tmp_path: Path) -> None:
-    found, notes = read(write(tmp_path / 'bag', {
-        '/t': ('sensor_msgs/msg/Temperature', warming)}))
-    np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-9)
-    assert notes == ()
 
 
 def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None:
@@ -332,13 +304,3 @@ def test_a_calibration_in_g_corrects_a_bag_in_m_s2_and_refuses_one_in_g(
                                          '9.807 at rest in m/s2'):
         correct_bag(wrong, calibration_in_g, tmp_path / 'out2')
     assert not (tmp_path / 'out2').exists()
-
-
-def test_a_calibration_in_native_units_corrects_no_bag(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    native = fit_poses(simulate_poses(model_with({'offset': 0.01}), spread_directions(16), rng),
-                       units_of('native'))
-    path = write(tmp_path / 'bag', {})
-    with pytest.raises(InputError, match='for readings in native, but the readings are in m/s2'):
-        correct_bag(path, native, tmp_path / 'out')
-    assert not (tmp_path / 'out').exists()

@@ -12,6 +12,7 @@ from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
+from bag_files import header, IMU, imu, STRING, TEMPERATURE
 from inside import (
     BLOCK_OF_A_BAG,
     rotation_from_rpy,
@@ -29,8 +30,6 @@ from scipy.spatial.transform import Rotation
 from shared import sensor
 import yaml
 
-IMU, TEMPERATURE, STRING = (f'{name[0]}_msgs/msg/{name[1]}' for name in (
-    ('sensor', 'Imu'), ('sensor', 'Temperature'), ('std', 'String')))
 TOPICS = [('/imu/a', IMU), ('/imu/b', IMU), ('/temperature', TEMPERATURE), ('/words', STRING)]
 MAKES = ['mcap', 'lz4', 'zstd', 'no chunks', 'no summary', 'sqlite3', 'sqlite3 messages',
          'mcap by rosbags', 'zstd by rosbags', 'mcap file', 'split']
@@ -38,21 +37,11 @@ UNITS = units_of('m/s2')
 COUNT = 200
 
 
-def header(stamp, frame_id):
-    types = STORE.types
-    return types['std_msgs/msg/Header'](frame_id=frame_id, stamp=types[
-        'builtin_interfaces/msg/Time'](sec=stamp // 10 ** 9, nanosec=stamp % 10 ** 9))
-
-
-def imu(rng, stamp, frame_id, little_endian=True):
-    types = STORE.types
+def imu_bytes(rng, stamp, frame_id, little_endian=True):
     numbers = rng.normal(size=37)
-    vector = types['geometry_msgs/msg/Vector3']
-    value = types[IMU](
-        header(stamp, frame_id), types['geometry_msgs/msg/Quaternion'](*numbers[:4].tolist()),
-        numbers[4:13], vector(*numbers[13:16].tolist()), numbers[16:25],
-        vector(*(9.0 + numbers[25:28]).tolist()), np.zeros(9))
-    return bytes(STORE.serialize_cdr(value, IMU, little_endian=little_endian))
+    made = imu(STORE, header(STORE, stamp, frame_id), 9.0 + numbers[25:28], numbers[13:16],
+               numbers[:4], (numbers[4:13], numbers[16:25], np.zeros(9)))
+    return bytes(STORE.serialize_cdr(made, IMU, little_endian=little_endian))
 
 
 @cache
@@ -64,9 +53,10 @@ def messages(seed, *, shuffled=False, frame_ids=('imu',), little_endian=True):
         stamp = 10 ** 9 * 1_700_000_000 + 10 ** 7 * k
         for channel in (0, 1):
             name = frame_ids[k % len(frame_ids)]
-            made.append((channel, stamp + channel, imu(rng, stamp, name, little_endian)))
+            made.append((channel, stamp + channel,
+                         imu_bytes(rng, stamp, name, little_endian)))
         if k % 7 == 3:
-            warm = STORE.types[TEMPERATURE](header(stamp, 'imu'), 20.0 + 0.01 * k, 0.0)
+            warm = STORE.types[TEMPERATURE](header(STORE, stamp, 'imu'), 20.0 + 0.01 * k, 0.0)
             made.append((2, stamp + 2, bytes(STORE.serialize_cdr(
                 warm, TEMPERATURE, little_endian=little_endian))))
         if k % 11 == 5:
@@ -275,7 +265,7 @@ def test_poses_do_not_depend_on_the_size_of_blocks(tmp_path, monkeypatch):
     recording = simulate_recording(sensor(rng), spread_directions(8), rng, dwell=2.0, turn=0.5)
     made = []
     for k, (time, reading) in enumerate(zip(recording['time'], UNITS.from_g(recording.reading))):
-        raw = bytearray(imu(rng, 10 ** 12 + round(1e9 * time), 'imu'))
+        raw = bytearray(imu_bytes(rng, 10 ** 12 + round(1e9 * time), 'imu'))
         raw[-96:-72] = reading.tobytes()
         raw[-192:-168] = recording['rate'][k].tobytes()
         made.append((0, 10 ** 12 + round(1e9 * time), bytes(raw)))

@@ -26,11 +26,11 @@ from tempfile import TemporaryDirectory
 
 import accel_calib as ac
 from accel_calib.logs import write_table
+from bag_files import write_bag
 from faults.sample import sample
 from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from test_bag import write_bag
 
 ROOT = Path(__file__).resolve().parents[1]
 LOGS = ROOT / 'test' / 'data' / 'logs'
@@ -168,13 +168,3 @@ def test_every_command_without_ros_is_run_by_a_page():
     run_ = {words[0] for page in PAGES for block in blocks_of(text_of(page))[1]
             for words in block.commands}
     assert set(COMMANDS) - OF_ROS <= run_
-
-
-def test_commands_are_found_in_blocks_with_prompts_and_continued_lines():
-    files, blocks = blocks_of('<!-- files: a.csv=esp32/a.log b.csv=c/d.log -->\n```console\n'
-                              '$ accel-calib fit \\\n    a.csv  # a comment\noutput\n```\n'
-                              '<!-- status: 1 -->\n\n```sh\npip install x\naccel-calib x "b c"\n'
-                              '```\n```python\naccel-calib no\n```\n'
-                              '1. Run it:\n\n       accel-calib y  # z\n\nText.\n')
-    assert files == {'a.csv': 'esp32/a.log', 'b.csv': 'c/d.log'}
-    assert blocks == [Block([['fit', 'a.csv']], 0), Block([['x', 'b c']], 1), Block([['y']], 0)]

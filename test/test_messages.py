@@ -3,10 +3,9 @@
 
 """Serialized Imu messages: layout and correction."""
 
-from dataclasses import replace
 import struct
 
-from accel_calib.calibrate import fit_poses, level, SampleNoise, thermal_stream
+from accel_calib.calibrate import fit_poses, level, thermal_stream
 from accel_calib.errors import InputError
 from accel_calib.logs import (
     ACCELERATION,
@@ -26,8 +25,6 @@ from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
     frame_ids,
-    Model,
-    predict,
     rotation_from_rpy,
     simulate_poses,
     spread_directions,
@@ -36,7 +33,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import random_directions, sensor
+from shared import sensor, with_effects
 
 UNITS = units_of('m/s2')
 NAMES = ['', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'übung', 'x' * 300]
@@ -89,35 +86,11 @@ def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
                                before.apply(fields[:, ANGULAR_VELOCITY]))
 
 
-def test_an_orientation_marked_as_missing_does_not_change(levelled):
-    fields = messages()
-    fields[:, ORIENTATION_COVARIANCE] = 0.0
-    fields[:, ORIENTATION_COVARIANCE.start] = -1.0
-    kept = np.r_[ORIENTATION, ORIENTATION_COVARIANCE]
-    np.testing.assert_array_equal(corrected(levelled, fields)[:, kept], fields[:, kept])
-
-
 def test_corrected_messages_have_the_frame_they_are_in(calibration, levelled):
     assert output_frame(calibration, 'imu_link', 'base') == 'imu_link'
     assert output_frame(levelled, 'imu_link') == 'imu_link_levelled'
     assert output_frame(levelled, 'imu_link', 'base') == 'base'
     assert output_frame(levelled.in_sensor_frame, 'imu_link', 'base') == 'imu_link'
-
-
-def test_unknown_covariances_are_filled_with_the_noise(levelled):
-    noise = SampleNoise(np.array([0.01, 0.02, 0.03]), np.array([1e-3, 2e-3, 3e-3]))
-    rng = np.random.default_rng(5)
-    for kind in ('unknown', 'known', 'absent', 'full'):
-        fields = every(random_message(rng, 'imu'))
-        for part in (ACCELERATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE):
-            fields[0, part] = covariance(kind, rng)
-        data = random_message(rng, 'imu')[:-296] + fields.tobytes()
-        found = every(Rewriter(layout_of(data), levelled, 1.0, STANDARD_GRAVITY, 'imu', noise)(
-            data, np.nan))
-        if kind == 'unknown':
-            fields[0, ACCELERATION_COVARIANCE] = np.diag(noise.force ** 2).ravel()
-            fields[0, ANGULAR_VELOCITY_COVARIANCE] = np.diag(noise.rate ** 2).ravel()
-        np.testing.assert_allclose(found, corrected(levelled, fields), rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize('turned', [False, True])
@@ -166,33 +139,6 @@ def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(
     assert np.all(np.linalg.eigvalsh(added) > 0)
 
 
-@pytest.mark.parametrize('first', [-1.0, 0.0])
-def test_conventions_for_no_covariance_are_kept(levelled, first):
-    fields = messages()
-    for part in (ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE):
-        fields[:, part] = 0.0
-        fields[:, part.start] = first
-    found = corrected(levelled, fields)
-    for part in (ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE):
-        np.testing.assert_array_equal(found[:, part], fields[:, part])
-
-
-def test_correction_does_not_change_its_input(levelled):
-    fields = messages()
-    before = fields.copy()
-    corrected(levelled, fields)
-    np.testing.assert_array_equal(fields, before)
-
-
-def test_corrected_readings_are_the_force(calibration):
-    force = random_directions(5, np.random.default_rng(3)) * UNITS.per_g
-    fields = messages(5)
-    fields[:, ACCELERATION] = UNITS.from_g(
-        predict(calibration.model, UNITS.to_g(force), {}))
-    np.testing.assert_allclose(corrected(calibration, fields)[:, ACCELERATION], force,
-                               atol=1e-12)
-
-
 def covariance(kind, rng):
     """Return a covariance as drivers send it."""
     values = np.zeros(9)
@@ -239,35 +185,11 @@ def every(data):
     return doubles_at(joined([data], 37, 'imu'), slice(0, 37))
 
 
-def test_readings_in_g_become_m_per_s2(calibration):
-    calibration = replace(calibration, units=units_of('g'))
-    data = random_message(np.random.default_rng(8), 'imu')
-    found = Rewriter(layout_of(data), calibration, STANDARD_GRAVITY, STANDARD_GRAVITY, 'imu')(
-        data, np.nan)
-    force = calibration.correct(every(data)[:, ACCELERATION]) * STANDARD_GRAVITY
-    np.testing.assert_allclose(every(found)[:, ACCELERATION], force, rtol=1e-12)
-
-
-def test_each_message_is_corrected_at_its_own_temperature(calibration):
-    values = {**calibration.model.values, 'offset_temperature': np.array([1e-3, 2e-3, -1e-3])}
-    calibration = replace(calibration, model=Model(values), covariance=np.eye(
-        len(calibration.covariance) + 3) * 1e-8)
-    data = random_message(np.random.default_rng(7))
-    rewriter = Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, 'imu')
-    for temperature in (20.0, 20.0, 35.0, 20.0):
-        expected = corrected(calibration, every(data), {'temperature': np.array([temperature])})
-        np.testing.assert_allclose(every(rewriter(data, temperature)), expected, rtol=1e-9)
-    with pytest.raises(InputError, match='temperature'):
-        rewriter(data, float('nan'))
-
-
 def lagged(calibration):
     """Return a calibration with lags of both kinds."""
-    values = {**calibration.model.values, 'temperature_rate': np.array([0.02, -0.03, 0.01]),
-              'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 8.0, 1.0]),
-              'gain_temperature': np.array([1e-3, -1e-3, 5e-4, 5.0, 0.0])}
-    size = len(calibration.covariance) + 13
-    return replace(calibration, model=Model(values), covariance=np.eye(size) * 1e-8)
+    return with_effects(calibration, {
+        'temperature_rate': [0.02, -0.03, 0.01], 'gain_temperature': [1e-3, -1e-3, 5e-4, 5.0, 0.0],
+        'offset_temperature': [1e-3, 2e-3, -1e-3, 8.0, 1.0]}, 1e-8)
 
 
 def test_single_messages_and_arrays_have_the_same_lag(calibration):

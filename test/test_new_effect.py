@@ -7,6 +7,7 @@ import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
+from bag_files import header, IMU, imu
 from inside import refinement_page
 import numpy as np
 import pytest
@@ -31,18 +32,6 @@ def poses(monkeypatch):
                        temperature=rng.uniform(5.0, 45.0, 60), time=np.arange(60) * 20.0)
 
 
-def message(reading):
-    """Return a serialized Imu."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    kinds = store.types
-    vector, header = kinds['geometry_msgs/msg/Vector3'], kinds['std_msgs/msg/Header']
-    stamp, unknown = kinds['builtin_interfaces/msg/Time'](1, 2), np.zeros(9)
-    imu = kinds['sensor_msgs/msg/Imu'](
-        header(stamp, 'imu_link'), kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
-        unknown, vector(0.0, 0.0, 0.0), unknown, vector(*reading), unknown)
-    return bytes(store.serialize_cdr(imu, imu.__msgtype__))
-
-
 def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tmp_path):
     found = ac.refine(poses, base='10')
     assert [step.effect for step in found.steps] == ['offset_cubic_temperature']
@@ -57,9 +46,9 @@ def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tm
     forces = calibration.apply(poses.reading, temperature=poses['temperature'])
     np.testing.assert_allclose(np.linalg.norm(forces, axis=1), 9.80665, atol=0.02)
 
-    data = message(poses.reading[7])
+    store = get_typestore(Stores.ROS2_JAZZY)
+    data = bytes(store.serialize_cdr(imu(store, header(store, 10 ** 9), poses.reading[7]), IMU))
     rewrite = Rewriter(layout_of(data), calibration, 1.0, 9.80665, '')
     corrected = rewrite(data, float(poses['temperature'][7]))
-    store = get_typestore(Stores.ROS2_JAZZY)
-    force = store.deserialize_cdr(corrected, 'sensor_msgs/msg/Imu').linear_acceleration
+    force = store.deserialize_cdr(corrected, IMU).linear_acceleration
     np.testing.assert_allclose([force.x, force.y, force.z], forces[7], atol=1e-9)

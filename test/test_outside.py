@@ -11,11 +11,11 @@ from accel_calib.logs import write_table
 from accel_calib.session import CalibratorSettings, Log, Session
 from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
-from inside import main, Model, model_with, simulate_poses, simulate_recording, spread_directions
+from bag_files import write_bag
+from inside import main, model_with, simulate_poses, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
-from test_bag import write_bag
+from shared import sensor, with_effects
 
 UNITS = units_of('m/s2')
 LOW, HIGH = 20.0, 30.0
@@ -28,13 +28,7 @@ def calibrated(values, **context):
              **context}
     poses = simulate_poses(sensor(rng), spread_directions(20), rng, context=known)
     poses = poses.with_columns(reading=UNITS.from_g(poses.reading), std=UNITS.from_g(poses['std']))
-    found = fit_poses(poses, UNITS, model='10')
-    model = Model({**found.model.values, **values})
-    covariance = np.zeros((len(model.vector),) * 2)
-    size = len(found.covariance)
-    covariance[:size, :size] = found.covariance
-    covariance[size:, size:] = 1e-12 * np.eye(len(model.vector) - size)
-    return replace(found, model=model, covariance=covariance)
+    return with_effects(fit_poses(poses, UNITS, model='10'), values)
 
 
 TCO = {'offset_temperature': np.array([1e-3, 0.0, 0.0])}

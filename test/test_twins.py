@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_log, read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import STANDARD_GRAVITY
+from bag_files import write_bag
 from inside import main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from test_bag import write_bag
 
 COMMANDS = {
     'capture': ['capture', '{log}', '-o', '{out}.csv'],
@@ -103,11 +102,3 @@ def test_a_bag_in_g_is_corrected_like_its_twin_and_gets_the_unit_of_imu_messages
         assert run(twins, 'apply', log, tmp_path / 'out', '--units', 'g') == 0
     bag, table = (read_recording(tmp_path / name) for name in ('out', 'out.csv'))
     np.testing.assert_allclose(bag.reading, table.reading * STANDARD_GRAVITY, atol=1e-6)
-
-
-@pytest.mark.parametrize('function', [ac.capture, ac.fit, ac.refine])
-def test_python_names_the_unit_too(function: Any, twins: Path) -> None:
-    for log, units in (('log', None), ('log.csv', 'm/s2')):
-        with pytest.raises(InputError, match='set the units of the readings to g'):
-            function(twins / log, units=units)
-    assert function(twins / 'log', units='g')
