@@ -171,6 +171,21 @@ class Bench:
         self.spin(self._clients[name].service_is_ready)
         return self._clients[name]
 
+    def ask(self, kind: Any, name: str, **fields: Any) -> Any:
+        """Call any service, and return its answer."""
+        client = self.node.create_client(kind, name)
+        self.spin(client.service_is_ready)
+        future = client.call_async(kind.Request(**fields))
+        self.spin(future.done)
+        return future.result()
+
+    def go(self, transition: int) -> None:
+        """Change the state of a managed calibrator."""
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+        assert self.ask(ChangeState, 'calibrator/change_state',
+                        transition=Transition(id=transition)).success
+
     def call(self, name: str, **fields: Any) -> Any:
         """Call a service of the calibrator and return its answer."""
         client = self.client(name)

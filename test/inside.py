@@ -180,7 +180,7 @@ from accel_calib.session.store import Store as SensorStore
 from accel_calib.session.stream import StreamStatistics
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
-from accel_calib.stored import calibration_yaml, plain_yaml, write_plan
+from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import _values_in as values_in
 from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import export, identifier

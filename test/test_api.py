@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 import accel_calib as ac
-from accel_calib.errors import AccelCalibError, InputError, RefusedFitError
+from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import write_table
 import numpy as np
 import pytest
@@ -67,14 +67,6 @@ def test_offset_and_matrix_are_in_the_unit_of_the_readings(calibration):
                                atol=0.01)
     np.testing.assert_allclose(calibration.matrix, MATRIX, atol=2e-3)
     np.testing.assert_allclose(calibration.matrix @ calibration.gain, np.eye(3), atol=1e-12)
-
-
-@pytest.mark.parametrize('units', ['m/s2', 'g'])
-def test_corrected_readings_are_1_g_long(units, poses):
-    table = ac.simulate(SENSOR, units=units, seed=1)
-    forces = ac.fit(table).apply(table.reading)
-    np.testing.assert_allclose(np.linalg.norm(forces, axis=1), {'m/s2': 9.80665, 'g': 1.0}[units],
-                               rtol=2e-3)
 
 
 def test_poses_are_a_path_a_table_a_data_frame_or_an_array(poses, tmp_path):
@@ -148,8 +140,34 @@ def test_bad_input_is_refused_in_one_line(call, message, poses):
     assert '\n' not in str(refusal.value)
 
 
-def test_poses_on_a_line_are_refused():
-    directions = np.column_stack([np.sin(np.linspace(0, 0.2, 20)), np.zeros(20),
-                                  np.cos(np.linspace(0, 0.2, 20))])
-    with pytest.raises(RefusedFitError):
-        ac.fit(ac.simulate(SENSOR, directions=directions), model='10')
+@pytest.fixture(scope='module')
+def refinement() -> ac.Refinement:
+    """Return the refinement of poses with an effect of the temperature, 10 to 50 °C."""
+    poses = ac.simulate({'offset': [0.02, -0.01, 0.03], 'offset_temperature': [1e-3, 2e-3, -1e-3]},
+                        poses=40, temperature=(10.0, 50.0), noise=1e-3, seed=1)
+    return ac.refine(poses, base='10')
+
+
+def test_stages_are_the_residuals_behind_the_gap(refinement: ac.Refinement) -> None:
+    assert [each.name for each in refinement.stages] == ['base', 'offset_temperature']
+    rms = [np.sqrt(np.mean(each.residual_mg ** 2)) for each in refinement.stages]
+    assert rms == pytest.approx([refinement.gap_mg, refinement.remaining_gap_mg])
+
+
+def test_typical_context_is_the_middle_of_the_ranges_at_rest(refinement: ac.Refinement) -> None:
+    known = refinement.calibration.typical_context(3)
+    np.testing.assert_array_equal(known['temperature'], [30.0] * 3)
+    np.testing.assert_array_equal(known['rate'], np.zeros((3, 3)))
+    np.testing.assert_array_equal(known['std'], np.zeros((3, 3)))
+
+
+def test_a_temperature_beyond_the_ranges_is_held_at_their_limit(
+        refinement: ac.Refinement) -> None:
+    poses = refinement.calibration.poses.take(np.arange(3))
+    beyond = poses.with_columns(temperature=np.array([-20.0, 25.0, 90.0]))
+    held = refinement.calibration.held(beyond)
+    np.testing.assert_array_equal(held['temperature'], [10.0, 25.0, 50.0])
+    np.testing.assert_array_equal(held.reading, beyond.reading)
+    np.testing.assert_array_equal(beyond['temperature'], [-20.0, 25.0, 90.0])
+    known = refinement.calibration.held_context({'temperature': beyond['temperature']})
+    np.testing.assert_array_equal(known['temperature'], held['temperature'])

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from pathlib import Path
 import shutil
 import sqlite3
@@ -21,7 +20,6 @@ from faults.sample import sample
 from mcap_file import McapFile, STORE
 import numpy as np
 import pytest
-import yaml
 
 
 @pytest.fixture(scope='module')
@@ -76,30 +74,6 @@ def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str,
     execute(path / 'bag.db3', f'UPDATE messages SET {column} = ? WHERE rowid = 1', cell)
     with pytest.raises(InputError, match=f'is damaged or not a bag .{words}'):
         read_recording(path)
-
-
-def test_metadata_of_another_type_end_in_one_line_or_in_a_result(
-        whole: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(whole['mcap folder'], tmp_path / 'in')
-    about = (path / 'metadata.yaml').read_text()
-    values = (None, 7, -1, 'words', [], {}, [None], 2.5, True)
-    for place, value in sample(product(places(yaml.safe_load(about)), values), 12):
-        changed = yaml.safe_load(about)
-        inside = changed
-        for key in place[:-1]:
-            inside = inside[key]
-        inside[place[-1]] = value
-        (path / 'metadata.yaml').write_text(yaml.safe_dump(changed))
-        check(path)
-
-
-def places(value: Any, above: tuple[Any, ...] = ()) -> Any:
-    """Yield the place of each value in nested lists and mappings, for the first item of a list."""
-    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(
-        value, list) else ()
-    for key, each in items:
-        yield (*above, key)
-        yield from places(each, (*above, key))
 
 
 def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(

@@ -6,18 +6,16 @@
 from dataclasses import replace
 from functools import cache
 
-from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
-from bag_files import header, IMU, imu, STRING, TEMPERATURE
+from bag_files import a_calibration, header, IMU, imu, STRING, TEMPERATURE
 from inside import (
     BLOCK_OF_A_BAG,
     rotation_from_rpy,
     ROWS_OF_A_BAG,
-    simulate_poses,
     simulate_recording,
     spread_directions,
 )
@@ -165,10 +163,7 @@ def test_big_endian_messages_are_read_and_corrected(make, tmp_path, calibration)
 
 @pytest.fixture(scope='module')
 def calibration():
-    rng, directions = np.random.default_rng(3), spread_directions(16)
-    poses = simulate_poses(sensor(rng), directions, rng)
-    reading, std = UNITS.from_g(poses.reading), UNITS.from_g(poses['std'])
-    return fit_poses(poses.with_columns(reading=reading, std=std), UNITS)
+    return a_calibration()
 
 
 @pytest.mark.parametrize(('make', 'turned'), [

@@ -42,8 +42,6 @@ ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 MOST_BYTES = 150e6
 """Largest memory, and largest size of all that is decompressed, until a file is refused."""
 
-HANG_S = 600
-
 RAWS = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
         for topic, stamp, each in messages()]
 

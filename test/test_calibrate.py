@@ -98,30 +98,6 @@ def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, row, recording, tmp_
     np.testing.assert_allclose(stored.apply(stored.poses.reading[row]), (0, 0, 9.80665), atol=0.05)
 
 
-def test_fit_and_verify_capture_a_recording_first(recording, tmp_path, capsys):
-    stored = tmp_path / 'c.yaml'
-    assert run('fit', recording, '-o', stored) == 0
-    assert 'captured 14 poses' in capsys.readouterr().out
-    assert len(read_calibration(stored).poses) == 14
-    assert run('verify', recording, '-c', stored, '--max', 10) == 0
-    assert 'captured 14 poses' in capsys.readouterr().out
-    assert run('verify', recording, '-c', stored, '--max', 0.001) == 1
-    assert 'GOOD' in capsys.readouterr().out
-
-
-def test_every_command_with_a_calibration_adds_its_rating(tmp_path, capsys):
-    poses, stored = tmp_path / 'poses.csv', tmp_path / 'c.yaml'
-    run('simulate', '-o', poses, '--poses', 40, *EFFECTS)
-    run('fit', poses, '-o', stored)
-    for command in (('fit', poses), ('verify', poses, '-c', stored), ('refine', poses),
-                    ('compare', stored, stored)):
-        capsys.readouterr()
-        assert run(*command, '--json', '-') == 0
-        result = json.loads(capsys.readouterr().out)
-        assert result['rating'] == 'GOOD', command
-        assert result['rating_reason']
-
-
 @pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu1'])
 def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, capsys):
     status, result, _ = calibrated(capsys, data(f'{name}.csv'), '-o', tmp_path / 'c.yaml',

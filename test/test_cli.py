@@ -9,8 +9,8 @@ from pathlib import Path
 import subprocess
 import sys
 
-from accel_calib.logs import read_poses
-from inside import main, parse_effect, parser, rotation_from_rpy
+from accel_calib.stored import read_calibration
+from inside import main, parser, rotation_from_rpy
 import numpy as np
 import pytest
 from shared import run, run_json
@@ -18,10 +18,6 @@ from shared import run, run_json
 ROOT = Path(__file__).parents[1]
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']
-FIT_KEYS = {'model', 'units', 'offset', 'gain', 'rotation', 'offset_sd', 'gain_sd', 'covariance',
-            'poses_used', 'poses_rejected', 'rms_before_mg', 'rms_after_mg', 'max_after_percent',
-            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof', 'coverage', 'warnings',
-            'uncertainty_mg', 'identifiability', 'next_pose'}
 
 
 @pytest.fixture
@@ -36,17 +32,6 @@ def calibration(poses, tmp_path):
     path = tmp_path / 'calibration.yaml'
     assert run('fit', poses, '-o', path, '--sensor', 'imu_link') == 0
     return path
-
-
-def test_fit_finds_the_effects_that_were_simulated(poses, capsys):
-    status, result = run_json(capsys, 'fit', poses)
-    assert status == 0
-    assert set(result) >= FIT_KEYS
-    offset = parse_effect(EFFECTS[1])[1] * 9.80665
-    np.testing.assert_allclose(result['offset'], offset, atol=4 * max(result['offset_sd']))
-    assert result['rms_after_mg'] < 0.5 < result['rms_before_mg']
-    assert np.array(result['covariance']).shape == (9, 9)
-    assert len(result['parameters']) == 9
 
 
 @pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
@@ -65,50 +50,6 @@ def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_pa
             f'{result["uncertainty_mg"]:.2g} mg' in capsys.readouterr().out) or model == 'auto'
 
 
-def test_fit_reports_what_six_faces_do_not_determine(tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    rows = [f'{sign * 9.8 * (k == 0) + 0.2},{sign * 9.8 * (k == 1)},{sign * 9.8 * (k == 2)}'
-            for k in range(3) for sign in (1, -1, 1.001, -1.001)]
-    path.write_text('\n'.join(['ax,ay,az', *rows]) + '\n', encoding='utf-8')
-    status, result = run_json(capsys, 'fit', path)
-    found = result['identifiability']
-    assert (status, found['model'], found['dilution']) == (0, '10', None)
-    unseen = [name for name, each in found['parameters'].items() if not each['determined']]
-    assert unseen == ['cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz']
-    assert [each['words'] for each in found['undetermined']] == unseen
-    assert found['undetermined'][0]['weights']['cross_axis.xy'] == pytest.approx(1.0, abs=1e-3)
-    assert found['parameters']['offset.x']['dilution'] < 1.0
-
-
-@pytest.mark.parametrize(('model', 'keys'), [('9', {'shifts', 'scales', 'angles'}),
-                                             ('12', {'matrix', 'shift'})])
-def test_fit_adds_the_names_of_the_report(model, keys, tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, *EFFECTS, '--reference')
-    capsys.readouterr()
-    status, result = run_json(capsys, 'fit', path, '--model', model)
-    assert status == 0
-    assert keys <= set(result)
-    if model == '12':
-        np.testing.assert_allclose(result['matrix'], result['gain'])
-    else:
-        assert set(result['angles']) == {'phi', 'psi', 'theta'}
-
-
-@pytest.mark.parametrize('units', ['m/s2', 'g', 'native'])
-def test_simulation_fit_and_verify_agree_in_every_unit(units, tmp_path, capsys):
-    poses, stored = tmp_path / 'poses.csv', tmp_path / 'c.yaml'
-    run('simulate', '-o', poses, *EFFECTS, '--units', units, '--seed', 1)
-    assert run('fit', poses, '-o', stored, '--units', units) == 0
-    run('simulate', '-o', poses, *EFFECTS, '--units', units, '--seed', 2)
-    capsys.readouterr()
-    status, result = run_json(capsys, 'verify', poses, '-c', stored)
-    assert status == 0
-    assert result['rms_after_mg'] < 1.5 * result['noise_floor_mg']
-    assert set(result) >= {'rms_before_mg', 'rms_after_mg', 'max_after_percent',
-                           'noise_floor_mg'}
-
-
 def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
     run('simulate', '-o', path, *EFFECTS, '--mounting', 20, -30, 0, '--poses', 30)
@@ -118,24 +59,6 @@ def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     assert result['poses_used'] == 29
     expected = rotation_from_rpy(*np.radians((20, -30, 0)))[2]
     np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
-
-
-def test_a_recording_is_captured_fitted_and_corrected(tmp_path, capsys):
-    recording, poses, stored, out = (tmp_path / name for name in ('r.csv', 'p.csv', 'c.yaml',
-                                                                  'o.csv'))
-    run('simulate', '-o', recording, '--recording', *EFFECTS, '--poses', 14, '--temperature', 20,
-        30)
-    capsys.readouterr()
-    status, result = run_json(capsys, 'capture', recording, '-o', poses)
-    assert status == 0
-    assert result['poses'] == 14
-    assert set(result) >= {'poses', 'samples', 'threshold', 'seconds'}
-    assert 'temperature' in read_poses(poses)
-    assert run('fit', poses, '-o', stored) == 0
-    assert run('apply', recording, '-c', stored, '-o', out) == 0
-    assert run('capture', out, '-o', poses) == 0
-    lengths = np.linalg.norm(read_poses(poses).reading, axis=1)
-    np.testing.assert_allclose(lengths, 9.80665, atol=0.01)
 
 
 def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
@@ -157,6 +80,10 @@ def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     status, results = run_json(capsys, 'verify', *tables[2:], '-c', folder / '0.yaml')
     assert status == 0
     assert all(result['rms_after_mg'] < 1 for result in results)
+    status, results = run_json(capsys, 'refine', *tables, '--jobs', 2, '-o', folder)
+    assert status == 2
+    assert [result.get('verdict') for result in results] == ['no_gap', None, 'no_gap', 'no_gap']
+    assert set(results[1]) == {'file', 'error', 'advice'}
 
 
 def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
@@ -218,6 +145,11 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
     ('simulate', '-o', 'x.csv', '--poses', '0'), ('simulate', '-o', 'no_folder/x.csv'),
     ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
     ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
+    ('refine', 'missing.mcap'), ('refine', 'poses.csv', '-c', 'missing.yaml'),
+    ('refine', 'poses.csv', '-o', 'no_folder/c.yaml'), ('refine', 'poses.csv', '--rows', '1:3'),
+    ('refine', 'poses.csv', '--report', 'no_folder/r.html'),
+    ('refine', 'poses.csv', '--base', '12'), ('report', 'missing.csv', '-o', 'r.html'),
+    ('report', 'poses.csv', '-o', 'no_folder/r.html'),
 ])
 def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, capsys,
                                             monkeypatch):
@@ -295,3 +227,42 @@ def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, 
     details, = tmp_path.glob('accel_calib-*.txt')
     assert str(details) in error
     assert 'Traceback' in details.read_text(encoding='utf-8')
+
+
+def test_a_refinement_is_printed_stored_and_drawn(tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    poses, stored, page = (tmp_path / name for name in ('poses.csv', 'refined.yaml', 'page.html'))
+    hidden = ['--effect', 'quadratic=0.006,-0.004,0.005']
+    run('simulate', '-o', poses, *EFFECTS, *hidden, '--poses', 60)
+    assert run('refine', poses, '-o', stored, '--sensor', 'imu_link', '--report', page) == 0
+    printed = capsys.readouterr().out
+    for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'noise floor',
+                  'only noise remains', 'these data cannot show'):
+        assert words in printed
+    assert page.read_text().startswith('<!DOCTYPE html>')
+    assert read_calibration(stored).sensor == 'imu_link'
+    run('simulate', '-o', poses, *EFFECTS, *hidden, '--seed', 7, '--poses', 40)
+    capsys.readouterr()
+    _, result = run_json(capsys, 'verify', poses, '-c', stored)
+    assert result['rms_after_mg'] < 1.5 * result['noise_floor_mg']
+
+
+def test_the_report_has_a_page_and_figures(poses, tmp_path):
+    pytest.importorskip('matplotlib')
+    page, folder = tmp_path / 'r.html', tmp_path / 'figures'
+    assert run('report', poses, '-o', page, '--figures', folder) == 0
+    assert page.read_text().startswith('<!DOCTYPE html>')
+    names = {path.name for path in folder.iterdir()}
+    assert {'ladder.svg', 'ladder.png', 'remaining_sphere.png'} <= names
+
+
+def test_without_matplotlib_one_line_advises_what_to_install(poses, tmp_path, capsys,
+                                                             monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    page = tmp_path / 'r.html'
+    assert run('refine', poses, '--report', page) == 2
+    printed = capsys.readouterr()
+    assert 'pip install matplotlib' in printed.err
+    assert printed.err.count('\n') == 1
+    assert not page.exists()
+    assert run('refine', poses) == 0

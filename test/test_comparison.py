@@ -4,16 +4,12 @@
 """Comparison: calibrations of one sensor agree, and those of a changed sensor do not."""
 
 from dataclasses import replace
-import json
 
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.compare import compare, history_of
-from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
-from accel_calib.stored import write_calibration
-from accel_calib.units import Units, units_of
+from accel_calib.units import units_of
 from inside import (
-    main,
     Model,
     model_with,
     PARAMETER_NAMES,
@@ -139,29 +135,6 @@ def test_models_with_other_axes_agree(first, second):
     assert alarms <= 1
 
 
-def test_a_model_that_omits_an_existing_effect_does_not_agree_and_a_note_names_it():
-    rng = np.random.default_rng(5)
-    model = sensor(rng)
-    runs = runs_of(model, rng, 1, name='7') + runs_of(model, rng, 2)
-    found = compare(runs)
-    assert not found.agree
-    assert found.outlier == 0
-    assert any('run 1 (model 7) omits parameters of model 10' in note for note in found.notes)
-
-
-def test_runs_with_different_models_by_auto_agree():
-    alarms, models = 0, set()
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        model = sensor(rng)
-        model = model_with({**model.values, 'cross_axis': 0.03 * model.values['cross_axis']})
-        runs = runs_of(model, rng, 5, name='auto')
-        models |= {run.name for run in runs}
-        alarms += not compare(runs).agree
-    assert models >= {'7', '10'}
-    assert alarms <= 1
-
-
 def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one():
     rng = np.random.default_rng(16)
     model = sensor(rng, 'offset', 'gain')
@@ -221,40 +194,3 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
     found = compare([cold[0], warm[0]])
     assert not found.agree
     assert any('taken at 1' in note and 'temperature' in note for note in found.notes)
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'sensor': 'other'}, 'of the sensors imu and other'),
-    ({'units': Units('native', 400.0)}, 'run 2 is in native units and another run in g'),
-    ({'covariance': np.full((9, 9), np.nan)}, 'run 2 has no uncertainty')])
-def test_calibrations_that_cannot_be_compared_are_refused(change, message):
-    rng = np.random.default_rng(13)
-    run = replace(runs_of(sensor(rng), rng, 1)[0], sensor='imu')
-    with pytest.raises(InputError, match=message):
-        compare([run, replace(run, **change)])
-    with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
-        compare([run])
-
-
-def test_the_exit_status_of_compare_is_its_answer(tmp_path, capsys):
-    rng = np.random.default_rng(14)
-    model = sensor(rng)
-    runs = [*runs_of(model, rng, 3, 20), *runs_of(with_offset(model, 0, 3e-3), rng, 1, 20)]
-    paths = [tmp_path / f'{k}.yaml' for k in range(4)]
-    for path, run in zip(paths, runs, strict=True):
-        write_calibration(path, run)
-
-    def result_of(*which):
-        status = main(['compare', *(str(paths[k]) for k in which), '--json', '-'])
-        return status, json.loads(capsys.readouterr().out)
-
-    status, result = result_of(0, 1, 2)
-    assert (status, result['agree'], result['outlier']) == (0, True, None)
-    status, result = result_of(0, 3, 1, 2)
-    assert (status, result['agree'], result['outlier']) == (1, False, 2)
-    assert result['runs'][1]['file'] == str(paths[3])
-    assert set(result) == {'agree', 'p_value', 'chi2', 'dof', 'outlier', 'runs', 'parameters',
-                           'tilt_deg', 'notes', 'rating', 'rating_reason', 'findings'}
-    status, result = result_of(0)
-    assert status == 2
-    assert set(result) == {'error', 'advice'}

@@ -3,6 +3,7 @@
 
 """The documentation agrees with the code; test_docs_commands.py runs its commands."""
 
+import ast
 from dataclasses import fields
 import importlib
 import inspect
@@ -122,3 +123,45 @@ def test_the_site_has_every_page():
         name = str(page.relative_to(ROOT / 'docs').with_suffix(''))
         if not name.startswith('figures/'):
             assert f'\n   {name}\n' in index, name
+
+
+PAGE = (ROOT / 'docs' / 'troubleshooting.md').read_text(encoding='utf-8')
+FOREIGN = {'externally-managed-environment'}
+"""Messages of other programs."""
+
+QUOTED = [quote for quote in re.findall(r'^- \*\*`([^`]+)`\*\*', PAGE, re.MULTILINE)
+          if quote not in FOREIGN]
+
+
+def template(node):
+    """Return the text of a string in the code, with … for each value in it; None: no string."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return ''.join(template(part) or '…' for part in node.values)
+    return None
+
+
+@pytest.fixture(scope='module')
+def templates():
+    texts = set()
+    for path in (ROOT / 'accel_calib').rglob('*.py'):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
+        parts = {id(part) for node in nodes if isinstance(node, ast.JoinedStr)
+                 for part in node.values}
+        documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts |= {template(node) for node in nodes
+                  if id(node) not in parts | documented and template(node)}
+    return texts
+
+
+def is_in(quote, text):
+    """Return whether the parts of a quote between … are in a text, in their order."""
+    parts = [re.escape(part.strip()) for part in quote.split('…') if part.strip()]
+    return re.search('.*'.join(parts), text) is not None
+
+
+def test_each_quoted_message_is_in_the_code(templates):
+    assert len(QUOTED) >= 35
+    for quote in QUOTED:
+        assert any(is_in(quote, text) for text in templates), quote

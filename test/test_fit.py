@@ -1,9 +1,10 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From poses to a calibration: known sensors are recovered within the stated uncertainty."""
+"""From poses to a calibration: known sensors within the stated uncertainty, and outliers."""
 
-from accel_calib.calibrate import fit_poses, in_g, level, outlook, verify
+import accel_calib as ac
+from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
     lower_triangular,
@@ -11,10 +12,12 @@ from accel_calib.estimate import (
     Point,
     sensing_axes,
     solve,
+    variance_factor,
 )
+from accel_calib.finding import has
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of
-from inside import predict, rotation_from_rpy, simulate_poses, spread_directions
+from inside import Model, predict, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -52,16 +55,6 @@ def test_auto_takes_the_model_that_the_sensor_has(model):
                '10': ('offset', 'axis_gain', 'cross_axis')}[model]
     names = [fit_poses(simulated(seed, 20, *effects)[1], G).name for seed in range(12)]
     assert names.count(model) >= 10
-
-
-@pytest.mark.parametrize('units', [units_of('m/s2'), units_of('m/s2', 9.78), G])
-def test_fit_is_the_same_in_every_unit(units):
-    poses = simulated(2, 20)[1]
-    found, expected = fit_poses(in_units(poses, units), units), fit_poses(poses, G)
-    np.testing.assert_allclose(found.model.vector, expected.model.vector, atol=1e-9)
-    np.testing.assert_allclose(found.offset, units.from_g(expected.offset), atol=1e-8)
-    np.testing.assert_allclose(found.offset_sd, units.from_g(expected.offset_sd), rtol=1e-5)
-    np.testing.assert_allclose(found.gain_sd, expected.gain_sd, rtol=1e-5)
 
 
 def test_native_units_find_their_own_scale():
@@ -251,20 +244,6 @@ def test_model_12_without_orientations_is_refused():
         fit_poses(simulated(15, 20)[1], G, model='12')
 
 
-@pytest.mark.parametrize('frame', ['ros', 'ned', 'android', 'win8'])
-def test_levelled_calibration_reads_flat_in_its_frame(frame):
-    rng = np.random.default_rng(16)
-    tilted = rotation_from_rpy(0.3, -0.2, 1.0) @ np.array([0.0, 0.0, 1.0])
-    model, poses = simulated(16, 30)
-    flat = predict(model, tilted[np.newaxis], {})[0]
-    calibration = level(fit_poses(poses, G), flat, frame)
-    down = -1.0 if frame == 'win8' else 1.0
-    np.testing.assert_allclose(calibration.correct(flat[np.newaxis])[0], (0, 0, down), atol=2e-3)
-    assert calibration.frame == frame
-    force = calibration.correct(rng.normal(size=(5, 3)))
-    np.testing.assert_allclose(calibration.correct(calibration.predict(force)), force, atol=1e-12)
-
-
 def test_force_covariance_is_that_of_repeated_fits():
     force = np.array([[0.6, 0.0, 0.8]])
     model, _ = simulated(17, 14)
@@ -325,3 +304,143 @@ def test_a_fit_without_any_residual_has_converged():
     values, point = solve(lambda values: zero, np.ones(1), np.zeros(1), np.full(1, 2.0))
     assert values == 1.0
     assert point.cost == 0.0
+
+
+SETS = 4000
+
+
+def share_held(ratio, dof, noise_known):
+    """Return the share of values within 1.96 standard deviations, for noise of this variance."""
+    rng = np.random.default_rng(dof)
+    chi2 = ratio * rng.chisquare(dof, SETS)
+    value = np.sqrt(ratio) * rng.normal(size=SETS)
+    factor = [variance_factor(each, dof, noise_known) for each in chi2]
+    return np.mean(np.abs(value) < 1.96 * np.sqrt(factor))
+
+
+@pytest.mark.parametrize('ratio', [1.0, 9.0])
+@pytest.mark.parametrize('dof', [27, 91])
+def test_intervals_contain_the_truth_if_residuals_determine_the_noise(ratio, dof):
+    assert share_held(ratio, dof, noise_known=True) == pytest.approx(0.95, abs=0.02)
+
+
+def test_intervals_with_correct_noise_contain_the_truth_with_few_residuals():
+    assert share_held(1.0, 3, noise_known=True) == pytest.approx(0.95, abs=0.02)
+
+
+@pytest.mark.parametrize('ratio', [0.04, 1.0, 25.0])
+@pytest.mark.parametrize('dof', [3, 27])
+def test_unknown_noise_is_estimated_from_the_residuals_alone(ratio, dof):
+    assert share_held(ratio, dof, noise_known=False) == pytest.approx(0.95, abs=0.01)
+
+
+def test_poses_that_repeat_better_than_stated_are_believed():
+    assert variance_factor(0.04 * 91, 91, True) < 0.1
+    assert share_held(0.04, 91, noise_known=True) > 0.93
+
+
+def test_without_residuals_measured_noise_is_used_and_assumed_noise_is_increased():
+    assert variance_factor(0.0, 0, True) == 1.0
+    assert variance_factor(0.0, 0, False) > 2.0
+
+
+def knocked(seed, count, bad):
+    """Return poses of which the first `bad` are shifted by 50 mg, outwards or inwards."""
+    rng = np.random.default_rng(seed)
+    poses = simulate_poses(sensor(rng), spread_directions(count), rng)
+    reading = poses.reading.copy()
+    reading[:bad] *= 1.0 + rng.choice([-0.05, 0.05], (bad, 1))
+    return poses.with_columns(reading=reading)
+
+
+def left_out(poses, **settings):
+    return {each.row for each in fit_poses(poses, G, model='10', **settings).rejected}
+
+
+def test_two_knocked_poses_of_twelve_are_found_with_few_clean_poses_lost():
+    clean = [len(left_out(knocked(seed, 12, 2)) - {1, 2}) for seed in range(20)]
+    assert np.count_nonzero(clean) <= 3
+
+
+@pytest.mark.parametrize('count', [36, 400])
+def test_underestimated_noise_makes_no_outliers(count):
+    for seed in range(3):
+        poses = knocked(seed, count, 0)
+        assert not left_out(poses.with_columns(std=poses['std'] / 3.0))
+
+
+@pytest.mark.parametrize('count', [100, 400])
+def test_all_outliers_are_found_if_a_fifth_of_the_poses_is_knocked(count):
+    bad = count // 5
+    poses = knocked(7, count, bad)
+    assert left_out(poses) == set(poses.row[:bad].tolist())
+
+
+@pytest.mark.parametrize('count', [40, 400])
+def test_at_most_a_quarter_of_the_poses_is_left_out(count):
+    poses = knocked(8, count, 2 * count // 5)
+    assert len(left_out(poses)) <= count // 4
+
+
+def with_copies(poses, rows):
+    """Return poses followed by exact copies of these rows, 0-based."""
+    again = np.concatenate([np.arange(len(poses)), rows]).astype(int)
+    kept = ('reading', 'std', 'count', 'temperature')
+    return Poses({key: poses[key][again] for key in kept if key in poses},
+                 np.arange(1, len(again) + 1))
+
+
+def lacking(seed, count, effect):
+    """Return poses of a sensor with an effect that no model of `fit` has."""
+    rng = np.random.default_rng(seed)
+    values = {**sensor(rng).values, effect: 0.0005 * rng.normal(size=3)}
+    return simulate_poses(Model(values), spread_directions(count), rng, noise_g=1e-4,
+                          context={'temperature': rng.uniform(15.0, 45.0, count)})
+
+
+@pytest.mark.parametrize('copies', [[2], [2, 2, 2, 2, 2], [0, 3, 5, 7, 8, 10], range(12)])
+@pytest.mark.parametrize('apart', [0.0, 2e-7])
+@pytest.mark.parametrize('measured', [True, False])
+def test_copies_of_a_pose_make_no_pose_an_outlier(copies, measured, apart):
+    for seed in range(3):
+        poses = lacking(seed, 12, 'offset_temperature')
+        poses = Poses({key: poses[key] for key in ('reading', 'std', 'count')[:3 if measured
+                                                                              else 1]}, poses.row)
+        once = fit_poses(poses, G, model='10')
+        again = with_copies(poses, copies)
+        if measured:  # the noise is 1e-5 g
+            again.reading[12:] += apart * np.random.default_rng(seed).normal(
+                size=again.reading[12:].shape)
+        found = fit_poses(again, G, model='10')
+        assert {each.row for each in found.rejected if each.row <= 12} == {
+            each.row for each in once.rejected}
+        np.testing.assert_allclose(found.model.vector, once.model.vector, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6)
+        assert found.quality.held_out_rms_mg == pytest.approx(once.quality.held_out_rms_mg)
+        assert found.quality.chi2_per_dof == pytest.approx(once.quality.chi2_per_dof)
+
+
+def test_readings_that_were_measured_again_are_not_copies():
+    poses = knocked(5, 18, 0)
+    again = with_copies(poses, range(18))
+    again.reading[18:] += np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
+    found = fit_poses(again, G, model='10')
+    once = fit_poses(poses, G, model='10')
+    assert not [line for line in found.warnings if 'equal' in line]
+    assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
+
+
+def test_poses_that_count_once_are_too_few_for_the_model():
+    poses = knocked(6, 8, 0)
+    with pytest.raises(RefusedFitError, match='14 poses have 8 directions'):
+        fit_poses(with_copies(poses, [0, 1, 2, 3, 4, 5]), G, model='10')
+
+
+def test_a_region_that_only_outliers_cover_is_named():
+    up = spread_directions(60)
+    up = np.vstack([up[up[:, 2] < -0.2], [[0.0, 0.0, 1.0]]])
+    poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, directions=up, units='g')
+    poses.reading[-1] *= 1.2
+    found = fit_poses(poses, G, model='10')
+    assert [each.row for each in found.rejected] == [len(up)]
+    assert has(found.noted, 'not_covered')

@@ -28,7 +28,6 @@ G = units_of('g')
 FACES = np.vstack([np.eye(3), -np.eye(3)])
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
-CROSS = ('cross_axis.xy', 'cross_axis.xz', 'cross_axis.yz')
 
 
 def about(directions, count, degrees, rng):
@@ -54,17 +53,6 @@ def named(text):
 
 def all_named(text):
     return np.array([named(part) for part in re.findall(r'\([+-xyz ]*\)', text)]).reshape(-1, 3)
-
-
-@pytest.mark.parametrize('model', ['10', '9'])
-def test_faces_alone_determine_all_but_the_cross_axis_gains(model):
-    found = identifiability(model, np.repeat(FACES, 2, axis=0))
-    assert found.open_parameters == CROSS
-    assert tuple(each.words for each in found.undetermined) == CROSS
-    assert all(np.isinf(found.deviations[name]) for name in CROSS)
-    assert all(each < 1.0 for name, each in found.deviations.items() if name not in CROSS)
-    assert np.isinf(found.dilution)
-    assert np.isinf(found.mean_dilution)
 
 
 @pytest.mark.parametrize('model', ['4', '7', '10', '12'])
@@ -138,25 +126,6 @@ def test_poses_that_a_refusal_asks_for_make_the_fit_possible(model, directions):
     assert dilution(model, one_less) > 3.0 or len(one_less) < poses_needed(model)
 
 
-@pytest.mark.parametrize(('directions', 'model', 'open_', 'offer'), [
-    (np.repeat(FACES, 2, axis=0), '10', ', '.join(CROSS[:2]) + ' and ' + CROSS[2], 'model 7'),
-    (FACES, '9', 'cross_axis.xy, ', 'model 7'),
-    (RING, '4', 'offset.z', ''),
-    (RING, '12', 'axis_gain.z, 0.71 ', '')])
-def test_refusal_names_what_is_open_and_the_smaller_model(directions, model, open_, offer):
-    rng = np.random.default_rng(5)
-    known = {'reference': directions} if model == '12' else {}
-    poses = simulate_poses(sensor(rng), directions, rng, context=known)
-    with pytest.raises(RefusedFitError, match=f'not determined: {re.escape(open_)}') as refusal:
-        fit_poses(poses, G, model=model)
-    if offer:
-        assert re.search(rf'or use {offer}, which these poses determine: it omits cross_axis, '
-                         r'which causes an error of \|a\| of 1\d mg in a common sensor$',
-                         refusal.value.advice)
-    else:
-        assert refusal.value.advice.endswith('hold it still and continue')
-
-
 @pytest.mark.parametrize('directions', [FACES, spread_directions(12),
                                         cone(90.0, np.random.default_rng(10))])
 @pytest.mark.parametrize('smaller', ['4', '7'])
@@ -172,25 +141,6 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
         errors.append(np.linalg.norm(fit.correct(predict(model, fresh, {})), axis=1) - 1.0)
     expected = error_left_in(smaller, '10', directions) / 10.0
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
-
-
-def test_noisy_poses_do_not_determine_a_model():
-    directions = spread_directions(12)
-    noise = np.where(np.arange(12) < 5, 300.0, 1.0)
-    refuse_if_unfit('7', directions, noise)
-    with pytest.raises(RefusedFitError, match='some of the 12 poses are too noisy') as refusal:
-        refuse_if_unfit('10', directions, noise)
-    assert 'or use model 7' in refusal.value.advice
-
-
-def test_auto_warns_of_effects_that_the_poses_cannot_show():
-    rng = np.random.default_rng(7)
-    poses = simulate_poses(sensor(rng, 'offset', 'axis_gain'), np.repeat(FACES, 3, axis=0), rng)
-    (warning,) = [text for text in fit_poses(poses, G).warnings if 'do not determine' in text]
-    assert ', '.join(CROSS[:2]) + ' and ' + CROSS[2] in warning
-    assert determines('10', np.vstack([FACES, all_named(warning)]))
-    free = fit_poses(simulate_poses(sensor(rng), spread_directions(18), rng), G)
-    assert not any('do not determine' in text for text in free.warnings)
 
 
 def test_next_pose_has_words_and_a_direction():

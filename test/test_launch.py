@@ -12,7 +12,7 @@ misspelt keyword fails here too. `started` visits a launch file as launch does.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 import re
 import runpy
@@ -131,27 +131,23 @@ class LifecycleNode(Node):
     """A managed node."""
 
 
-@dataclass(frozen=True)
-class ChangeState:
-    lifecycle_node_matcher: Node = field(kw_only=True)
-    transition_id: int = field(kw_only=True)
+def record(name: str, *members: str) -> Any:
+    """Return a class with keywords, whose visit starts nothing."""
+    return make_dataclass(name, members, kw_only=True, frozen=True,
+                          namespace={'visit': lambda self, context: []})
 
 
-@dataclass(frozen=True)
+ChangeState = record('ChangeState', 'lifecycle_node_matcher', 'transition_id')
+EmitEvent = record('EmitEvent', 'event')
+
+
+@dataclass(frozen=True, kw_only=True)
 class OnStateTransition:
-    target_lifecycle_node: Node = field(kw_only=True)
-    start_state: str = field(kw_only=True)
-    goal_state: str = field(kw_only=True)
-    entities: list[Any] = field(kw_only=True)
-    handle_once: bool = field(default=False, kw_only=True)
-
-
-@dataclass(frozen=True)
-class EmitEvent:
-    event: ChangeState = field(kw_only=True)
-
-    def visit(self, context: Context) -> list[Any]:
-        return []
+    target_lifecycle_node: Node
+    start_state: str
+    goal_state: str
+    entities: list[Any]
+    handle_once: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,14 @@ from accel_calib.calibrate import fit_poses, level
 from accel_calib.capture import CaptureSettings, Dwell, poses_from
 from accel_calib.session import CalibratorSettings
 from accel_calib.stored import read_calibration
-from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
     dwells_of,
-    fitted,
     LiveCapture,
     model_with,
-    plan_for,
     PoseBook,
     rest_after,
     Sensor,
-    simulate_poses,
     simulate_recording,
     spread_directions,
     with_temperature,
@@ -89,14 +84,6 @@ def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate:
     assert 'doubtful' not in live.book.poses()
 
 
-def test_time_that_jumps_back_only_ends_a_rest(readings: Readings) -> None:
-    live = LiveCapture(CaptureSettings(repeated='merge'), UNITS)
-    for _ in range(3):
-        push_all(live, readings(FACES, dwell=2.0), start=100.0)
-    assert len(live.book.poses()) == 3
-    assert len(live.detector.interruptions) == 2
-
-
 def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     rest = readings([[0, 0, 1]], dwell=12.0)
@@ -116,14 +103,6 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
     poses = live.book.poses()
     assert len(poses) == 1
     assert poses['reading'][0, 2] > 9.0
-
-
-def test_moving_sensor_is_not_a_pose() -> None:
-    live = LiveCapture(CaptureSettings(), UNITS)
-    rng = np.random.default_rng(1)
-    push_all(live, [0, 0, GRAVITY] + rng.normal(size=(500, 3)) * 3.0)
-    assert len(live.book.poses()) == 0
-    assert live.capture_now() is None
 
 
 def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
@@ -157,42 +136,6 @@ def test_stored_poses_are_added_as_they_were() -> None:
     for key in poses.columns:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
     assert len(dwells_of(poses)) == 8
-
-
-def test_fit_keeps_the_mounting(stored: Callable[..., Path]) -> None:
-    flat = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
-    before = read_calibration(stored(flat=flat))
-    again = fitted(before.poses, UNITS, CalibratorSettings(model='10'), '', before, {})
-    np.testing.assert_allclose(again.model.rotation, before.model.rotation, atol=1e-6)
-    new = fitted(before.poses, UNITS, CalibratorSettings(model='10'), '', None, {})
-    np.testing.assert_array_equal(new.model.rotation, np.eye(3))
-
-
-@pytest.mark.parametrize('unit', ['m/s2', 'native'])
-@pytest.mark.parametrize('count', [0, 1, 5])
-def test_a_next_pose_is_asked_for_with_any_number_of_poses(unit: Any, count: int) -> None:
-    book = PoseBook(CaptureSettings(), UNITS)
-    for k in range(count):
-        book.end(dwell(10.0 * k, [0, 0, 1]))
-    poses = book.poses()
-    assert 'turn the sensor' in plan_for(poses, units_of(unit), 'auto').asked.words
-
-
-def test_drift_is_that_of_the_rests_since_the_calibration(stored: Callable[..., Path]) -> None:
-    calibration = read_calibration(stored())
-    sensor = Sensor(CalibratorSettings(), UNITS)
-    assert sensor.drift is None
-    sensor.adopt(calibration)
-    for k, direction in enumerate(spread_directions(5)):
-        reading = calibration.predict((direction * GRAVITY * 1.01)[None])[0]
-        rest = dwell(10.0 * k, reading / GRAVITY)
-        sensor.update(rest, 0.001)
-        sensor.end(rest, 0.001)
-    assert sensor.residual == pytest.approx(0.01, abs=1e-6)
-    assert sensor.drift.error == pytest.approx(0.01, abs=1e-6)
-    sensor.adopt(calibration)
-    assert sensor.drift.count == 0
-    assert sensor.residual == pytest.approx(0.01, abs=1e-6)
 
 
 def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
@@ -324,12 +267,3 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     assert not needed.rejected
     assert ('the sensor may have moved during the poses of rows 1, 2, 3'
             in ' '.join(needed.warnings))
-
-
-def test_native_readings_are_never_asked_for_the_same_pose_twice() -> None:
-    poses = simulate_poses(model_with({}), spread_directions(12), np.random.default_rng(1),
-                           noise_g=0.001)
-    counts = Poses({**poses.columns, 'reading': 16384.0 * poses.reading + 900.0}, poses.row)
-    asked = [plan_for(counts.take(slice(0, count)), units_of('native'), 'auto').asked.direction
-             for count in range(4)]
-    assert not any(np.allclose(one, other) for one, other in combinations(asked, 2))

@@ -1,21 +1,34 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples of a serial port (a pseudo-terminal) and of a recording that is played in real time."""
+"""Samples of a serial port (a pseudo-terminal) or a recording, and ``accel-calib live``."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager, ExitStack
 from pathlib import Path
+import signal
+import subprocess
+import sys
 import time
 
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_log
+from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
-from inside import CLOCK_OF_A_SOURCE, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT
+from inside import (
+    CLOCK_OF_A_SOURCE,
+    COMMAND,
+    HEAD_OF_A_PORT,
+    is_port,
+    main,
+    open_source,
+    PATIENCE_OF_A_PORT,
+)
+from live_bench import TurnedSensor
 import numpy as np
 import pytest
 from serial_board import board
-from viewer import wait
+from viewer import Viewer, wait
 
 RATE_HZ = 200.0
 
@@ -193,3 +206,75 @@ def test_a_recording_is_played_in_real_time(
     assert np.all((late[:300] > -1e-9) & (late[:300] < 0.05))
     assert np.ptp(late[300:]) < 0.05  # the gap of 1000 s is left out
     assert arrivals[-1][0] < 2.0
+
+
+COUNTS = 16384.0 / 9.80665
+PATIENCE = 120.0
+
+
+def lines_of(sensor: TurnedSensor) -> Iterator[str]:
+    """Yield what a board sends: a greeting, a header, and a line of counts for each sample."""
+    yield 'boot ok\r\n'
+    yield 't_ms;accX;accY;accZ;temp_C\r\n'
+    for block in sensor.blocks:
+        yield ''  # the board can end between two blocks
+        for row in block:
+            x, y, z = np.round(row[1:4] * COUNTS)
+            yield f'{1000.0 * row[0]:.1f};{x:g};{y:g};{z:g};24.5\r\n'
+
+
+@contextmanager
+def live(*arguments: str) -> Iterator[tuple[str, list[str], subprocess.Popen[str]]]:
+    """Run the command, and yield the link that it prints, its lines, and the process."""
+    process = subprocess.Popen([sys.executable, *COMMAND, 'live', '--port', '0', *arguments],
+                               stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    lines: list[str] = []
+    try:
+        for line in process.stdout:
+            lines.append(line.strip())
+            if line.startswith('live page: '):
+                break
+        assert lines, 'the command has ended'
+        yield lines[-1].removeprefix('live page: '), lines, process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def follow(viewer: Viewer, sensor: TurnedSensor) -> None:
+    """Turn a sensor as the page asks, until it asks for the fit."""
+    wait(lambda: viewer.of('progress') and viewer.of('progress')[-1]['direction'])
+    while direction := (now := viewer.of('progress')[-1])['direction']:
+        sensor.turn_to(np.array(direction))
+        wait(lambda poses=now['poses']: viewer.of('progress')[-1]['poses'] > poses)
+    assert '~/fit' in now['advice']
+
+
+def test_a_board_on_a_serial_port_is_calibrated(tmp_path: Path) -> None:
+    sensor, stored = TurnedSensor(speed=5.0), tmp_path / 'board.yaml'
+    with (board(lines_of(sensor)) as port,
+          live(port, '-o', str(stored)) as (link, lines, run)):
+        viewer = Viewer(link)
+        follow(viewer, sensor)
+        wait(lambda: viewer.of('progress')[-1]['up'])  # also before the zero is fitted
+        assert viewer.ask('fit')['success']
+        wait(lambda: viewer.state['preview'] and viewer.state['rating'])
+        assert viewer.state['rating']['rating'] == 'GOOD'
+        assert viewer.ask('save')['success']
+        viewer.close()
+        run.send_signal(signal.SIGINT)
+        assert run.wait(PATIENCE) == 0
+    assert any(line.startswith("read as: ';'") for line in lines)
+    calibration = read_calibration(stored)
+    assert calibration.units.name == 'native'
+    offset = calibration.units.to_g(calibration.offset)
+    np.testing.assert_allclose(offset, (0.03, -0.02, 0.04), atol=0.002)
+
+
+def test_a_missing_recording_or_port_is_one_line_and_status_2(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for source in (tmp_path / 'missing.csv', '/dev/ttyUSB97'):
+        assert main(['live', str(source)]) == 2
+        assert capsys.readouterr().err.count('\n') == 1

@@ -277,8 +277,8 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
 
 
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
-    rows = [*make.dataflash_rows()[:len(make.DATAFLASH)],
-            ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)), *make.imu_rows(make.recording(1), 0)]
+    rows = [*make.dataflash_forms(), ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)),
+            *make.imu_rows(make.recording(1), 0)]
     pytest.importorskip('pymavlink')
     path = tmp_path / 'log.bin'
     path.write_bytes(make.dataflash_bytes(rows))

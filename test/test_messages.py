@@ -237,22 +237,3 @@ def test_no_force_beyond_100_g_is_published(calibration):
     for reading in (np.nan, np.inf):
         struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
         assert rewriter(bytes(data), 20.0) is None
-
-
-def test_messages_as_arrays_equal_the_single_messages():
-    rng = np.random.default_rng(4)
-    raws = [random_message(rng) for _ in range(50)]
-    raws = [swapped(raw) if k % 3 == 0 else raw for k, raw in enumerate(raws)]
-    messages = joined(raws, 37, 'imu')
-    names, samples = frame_ids(messages), samples_of(messages)
-    assert [bytes(each) for each in messages.each()] == raws
-    for k, raw in enumerate(raws):
-        order = '>' if k % 3 == 0 else '<'
-        sec, nanosec, length = struct.unpack_from(f'{order}iII', raw, 4)
-        doubles = np.frombuffer(raw[-296:], f'{order}f8')
-        assert names[k] == raw[16:15 + length].decode()
-        assert samples['time'][k] == sec + nanosec * 1e-9
-        np.testing.assert_array_equal(samples['reading'][k], doubles[25:28])
-        rate = doubles[13:16]
-        absent = doubles[16] == -1.0 or not np.isfinite(rate).all()
-        np.testing.assert_array_equal(samples['rate'][k], np.full(3, np.nan) if absent else rate)

@@ -47,16 +47,6 @@ def values_of(name, rng):
                      *(SHAPES[part] for part in effect.shape)])
 
 
-def everything(rng):
-    return Model({name: values_of(name, rng) for name in ADDED}, rotation_from_rpy(0.3, -0.4, 2.0))
-
-
-def test_predict_and_correct_undo_each_other_with_every_effect(rng, context):
-    model, force = everything(rng), random_directions(40, rng)
-    np.testing.assert_allclose(correct(model, predict(model, force, context), context), force,
-                               atol=1e-12)
-
-
 @pytest.mark.parametrize('name', ADDED)
 def test_basis_is_the_derivative_of_the_reading_by_the_values(name, rng, context):
     force, values = random_directions(40, rng), values_of(name, rng)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
@@ -167,51 +166,6 @@ def test_changes_too_small_to_matter_are_ignored() -> None:
     assert state.change is None
     state = rested(state, calibration, truth, [UP] * 20, rng, shift=2.0 * shift, noise=0.0001)
     assert state.change is not None
-
-
-@pytest.mark.parametrize(('temperature', 'words'), [
-    (38.2, 'the temperature is 38.2 °C, but the sensor was calibrated at 24.0 to 25.3 °C: capture '
-           'poses at this temperature and call ~/refine'),
-    (26.0, 'call ~/reset, capture poses and call ~/fit'),
-    (None, 'call ~/reset, capture poses and call ~/fit')])
-def test_advice_names_the_temperature_where_it_changed(
-        temperature: float | None, words: str) -> None:
-    rng = np.random.default_rng(9)
-    truth = sensor(rng)
-    calibration = made(truth, rng, temperature=np.linspace(24.0, 25.3, 12))
-    state = rested(monitor(calibration), calibration, truth, [UP] * 4, rng,
-                   temperature=temperature)
-    assert 'stated uncertainty' in status(state)
-    state = rested(state, calibration, truth, [UP] * 3, rng, shift=-0.005 * UP,
-                   temperature=temperature)
-    assert status(state).startswith('|a| at rest has differed by -')
-    assert 'for 3 rests' in status(state)
-    assert status(state).endswith(words)
-
-
-def test_calibration_without_uncertainty_is_not_judged() -> None:
-    rng = np.random.default_rng(10)
-    truth = sensor(rng)
-    calibration = made(truth, rng)
-    calibration = replace(calibration, covariance=np.nan * calibration.covariance)
-    state = rested(monitor(calibration), calibration, truth, [UP] * 5, rng, shift=0.02 * UP)
-    assert state.change is None
-    assert 'has no uncertainty' in status(state)
-    assert status(monitor(calibration)) == 'no rest since the calibration'
-
-
-def test_readings_in_counts_are_monitored_like_others() -> None:
-    rng = np.random.default_rng(11)
-    truth = sensor(rng)
-    table = simulate_poses(truth, spread_directions(24), rng, noise_g=0.003)
-    counts = table.with_columns(reading=table.reading * 16384.0, std=table['std'] * 16384.0)
-    calibration = fit_poses(counts, units_of('native'), model='10')
-    state = monitor(calibration)
-    mean = predict(truth, np.array([UP] * 3), {}) + 0.005 * UP + NOISE * rng.normal(size=(3, 3))
-    for rest in rests_of(calibration, mean * 16384.0, np.full((3, 3), NOISE * 16384.0), {}):
-        state = compared(state, rest, LEAST)
-    assert state.change is not None
-    assert state.change.error == pytest.approx(0.005, abs=0.001)
 
 
 @pytest.mark.parametrize(('name', 'unit'), [

@@ -80,22 +80,6 @@ def test_models_of_several_effects_are_those_of_the_arrays(seed):
     check(calibration_with(*names, unit='g', seed=seed), 9.80665)
 
 
-def test_lagged_temperature_of_one_reading_is_the_given_one():
-    calibration = calibration_with('offset_temperature', 'gain_temperature', 'temperature_rate')
-    values = dict(calibration.model.values)
-    for name in ('offset_temperature', 'gain_temperature'):
-        values[name] = np.array([*values[name][:3], 80.0, 1.0])
-    calibration = replace(calibration, model=Model(values, calibration.model.rotation))
-    acting = {'temperature_of_offset': 28.0, 'temperature_of_gain': 35.0,
-              'temperature_rate': 0.04}
-    found = OneReading(calibration).at({**KNOWN, **acting}).correct(1.0, -2.0, 9.0)
-    context = {**arrays(), **{key: np.array([value]) for key, value in acting.items()}}
-    expected = calibration.correct(np.array([[1.0, -2.0, 9.0]]), context)[0]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    plain = OneReading(calibration).at(KNOWN).correct(1.0, -2.0, 9.0)
-    assert np.max(np.abs(np.subtract(found, plain))) > 1e-3
-
-
 def test_acting_temperature_is_limited_to_its_range_at_the_poses():
     calibration = calibration_with('offset_temperature')
     values = dict(calibration.model.values)

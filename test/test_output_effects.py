@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from accel_calib.calibrate import fit_poses, in_g
-from accel_calib.capture import capture, CaptureSettings, StillDetector
+from accel_calib.capture import capture
 from accel_calib.logs import read_recording
 from accel_calib.table import Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, Units, units_of
@@ -61,20 +61,6 @@ def test_a_clipped_recording_has_the_poses_of_the_recording(name, limit):
     np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.02)
 
 
-def test_a_clipped_stream_has_the_dwells_of_the_recording():
-    recording = limited(read_recording(data('mpu9150_imu0.csv')), -9.6, 9.6)
-    samples = np.column_stack([recording['time'], recording.reading, recording['rate'],
-                               np.full((len(recording), 2), np.nan)])
-    detector = StillDetector(CaptureSettings(), MPS2)
-    for block in np.array_split(samples, len(samples) // 23):
-        detector.push(block)
-    detector.close()
-    poses = capture(recording, MPS2).poses
-    assert len(poses) == 21
-    np.testing.assert_allclose([each.mean for each in detector.dwells()], poses.reading,
-                               rtol=1e-9)
-
-
 @pytest.mark.parametrize('limit', [9.0, 9.6])
 def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
     poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -limit, limit), MPS2)
@@ -104,13 +90,6 @@ def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
     poses = found(limited(simulated(3), -0.93, 0.93), G)
     too_small = Model({'offset': np.zeros(3)})
     assert unclipped(poses, too_small)[1] is not None
-
-
-@pytest.mark.parametrize(('step_mg', 'least'), [(2, 38), (8, 38), (20, 37)])
-def test_a_coarsely_quantised_real_recording_has_its_poses(step_mg, least):
-    recording = rounded(read_recording(data('xsens_mti_counts.csv')),
-                        round(step_mg * 1e-3 * COUNTS_PER_G))
-    assert least <= len(capture(recording, NATIVE).poses) <= 38
 
 
 @pytest.mark.parametrize('step_mg', [4, 8, 20])

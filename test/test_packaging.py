@@ -82,17 +82,10 @@ def test_package_xml_and_setup_py_agree(
     assert texts(package_xml, tag) == [setup_py[tag]]
 
 
-def test_version_is_that_of_the_package(setup_py: dict[str, Any]) -> None:
+def test_version_email_and_addresses_agree(
+        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     assert setup_py['version'] == accel_calib.__version__
-
-
-def test_email_of_the_maintainer_agrees(
-        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     assert package_xml.find('maintainer').get('email') == setup_py['maintainer_email']
-
-
-def test_addresses_of_the_project_agree(
-        setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     urls = {element.get('type'): element.text for element in package_xml.findall('url')}
     assert urls == {'website': setup_py['url'],
                     'repository': setup_py['project_urls']['Repository'],

@@ -20,7 +20,6 @@ from accel_calib.calibrate import (
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import estimate
 from accel_calib.refine import refine
-from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
@@ -148,14 +147,6 @@ def test_poses_that_repeat_worse_than_stated_get_a_larger_uncertainty(std):
     assert lost <= 1
 
 
-def test_poses_without_noise_columns_are_fitted_with_a_warning():
-    model, poses = tilting(3, 12)
-    found = fit_partial(Poses({'reading': poses.reading}, poses.row), G)
-    assert any('no std and count' in line for line in found.warnings)
-    error, stated = errors(found, model, np.array([[0.0, 0.0, 1.0]]))
-    assert abs(error[0]) < 3.0 * stated[0] < 5e-3
-
-
 def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
     lost = missed = 0
     for seed in range(10):
@@ -167,17 +158,6 @@ def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
         error, stated = errors(found, model, UP)
         assert np.mean(np.abs(error) < 4.0 * stated) > 0.95
     assert (lost, missed) == (0, 0)
-
-
-def test_equal_rows_count_as_one_pose():
-    _, poses = tilting(5)
-    again = poses.take(np.array([*range(7), 2, 2]))
-    again = Poses(again.columns, np.arange(1, 10))
-    once, found = fit_partial(poses, G), fit_partial(again, G)
-    np.testing.assert_allclose(found.model.vector, once.model.vector, atol=1e-9)
-    np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6)
-    assert len(found.used_poses) == 9
-    assert 'equal rows count as one pose: rows 3, 8, 9' in found.warnings
 
 
 def test_result_does_not_depend_on_the_axis_that_points_up():
@@ -244,13 +224,6 @@ def test_a_reading_of_another_length_is_left_out_and_named():
     np.testing.assert_allclose(found.model.vector, expected.model.vector)
 
 
-def test_doubtful_poses_are_used_only_if_there_are_no_others():
-    _, poses = tilting(11)
-    doubtful = poses.with_columns(doubtful=np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert [each.row for each in fit_partial(doubtful, G).rejected] == [2]
-    assert len(fit_partial(doubtful.take(np.array([1])), G).used_poses) == 1
-
-
 def test_a_mounting_levels_the_raw_reading():
     rng = np.random.default_rng(12)
     tilt = np.radians(12.0)
@@ -285,18 +258,6 @@ def test_the_gate_accepts_both_and_refuses_readings_that_no_sensor_has(make):
 def level_broken(calibration):
     """Return a calibration whose ΔR is a mirror image."""
     return replace(calibration, model=Model(calibration.model.values, -np.eye(3)))
-
-
-@pytest.mark.parametrize('make', [fit_partial, mounting_only])
-def test_both_are_stored_and_read(make, tmp_path):
-    _, poses = tilting(16)
-    found = level(make(poses, G, sensor='imu_link', date='2026-05-01'), poses.reading[0], 'ros')
-    write_calibration(tmp_path / 'cal.yaml', found)
-    read = read_calibration(tmp_path / 'cal.yaml')
-    assert (read.name, read.method, read.warnings) == (found.name, PRIOR, found.warnings)
-    np.testing.assert_allclose(read.covariance, found.covariance)
-    np.testing.assert_allclose(read.correct(UP), found.correct(UP))
-    assert carried_words(read) == carried_words(found)
 
 
 def test_a_partial_fit_is_better_than_none_and_refine_completes_it():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import json
 
 from accel_calib.calibrate import NextPose
-from accel_calib.refine import PlannedPose, PosePlan, refine
+from accel_calib.refine import PlannedPose, refine
 from accel_calib.units import units_of
 from generator import Setup, simulate, write_csv
 from inside import (
@@ -18,7 +18,6 @@ from inside import (
     NOTHING_TO_PLAN,
     Plan,
     simulate_poses,
-    write_plan,
 )
 import numpy as np
 import pytest
@@ -140,19 +139,6 @@ def test_the_poses_of_the_plan_name_the_hidden_effect():
 
 def planned(up, **context):
     return PlannedPose(up, attitude_words(np.array(up)), context, ('cubic', 'odd_quadratic'), 0.9)
-
-
-def test_conditions_with_the_same_directions_share_a_line(tmp_path):
-    pose = planned((0.0, 0.0, 1.0), temperature=15.0, time=0.0)
-    assert pose.conditions == 'at 15 °C'
-    later = replace(pose, context={'temperature': 40.0, 'time': 1800.0})
-    assert later.conditions == 'at 40 °C 30 min after the last pose'
-    path = tmp_path / 'plan.csv'
-    write_plan(path, PosePlan((pose, later), ('two poses',)))
-    first, second = read_plan(path)
-    assert numbers(first, 'pose', 'up_z', 'temperature', 'wait') == [1.0, 1.0, 15.0, 0.0]
-    assert numbers(second, 'pose', 'up_z', 'temperature', 'wait') == [2.0, 1.0, 40.0, 1800.0]
-    assert first['vibration'] == ''
 
 
 def guide_at(guide, up):

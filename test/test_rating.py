@@ -6,8 +6,6 @@
 from dataclasses import replace
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_partial, fit_poses, mounting_only, verify
-from accel_calib.capture import capture
 from accel_calib.finding import NextStep
 from accel_calib.findings import (
     Expected,
@@ -17,13 +15,11 @@ from accel_calib.findings import (
     rate_refinement,
     rate_verification,
 )
-from accel_calib.logs import read_poses, read_recording
-from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import number, spread_directions
 import numpy as np
 import pytest
-from shared import data, random_directions
+from shared import random_directions
 
 MS2, NATIVE = units_of('m/s2'), units_of('native')
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],
@@ -46,35 +42,10 @@ def true_error_mg(calibration, effects=COMMON, **context):
     return 1e3 * float(np.sqrt(np.mean((lengths - 1.0) ** 2)))
 
 
-def without(poses, *names):
-    return Poses({key: values for key, values in poses.columns.items() if key not in names},
-                 poses.row)
-
-
 def moved(poses, rows, by):
     reading = poses.reading.copy()
     reading[np.asarray(rows) - 1] += by
     return poses.with_columns(reading=reading)
-
-
-def tilted():
-    up = np.array([[0, 0, 1], [0.2, 0, 1], [-0.2, 0, 1], [0, 0.2, 1], [0, -0.2, 1]])
-    return poses_of(directions=up / np.linalg.norm(up, axis=1, keepdims=True))
-
-
-def test_many_spread_poses_are_good_and_the_figures_are_in_the_first_line():
-    calibration = ac.fit(poses_of(poses=24))
-    rating = rate(calibration)
-    quality = calibration.quality
-    assert rating.name == 'GOOD'
-    first, *others = rating.lines
-    assert first.startswith(f'GOOD  {quality.rms_before_mg:.1f} -> {quality.rms_after_mg:.2g} mg, '
-                            f'of new poses {quality.held_out_rms_mg:.2g} mg, noise '
-                            f'{quality.noise_floor_mg:.2g} mg, 24 poses, ')
-    assert first.endswith(' % of the sphere')
-    assert len(first) <= 100
-    assert len(others) == 1
-    assert others[0].startswith('next  ')
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -124,53 +95,12 @@ def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, con
     assert base.next.kind == 'refine'
 
 
-def test_a_hidden_effect_without_its_column_stays_usable_after_a_refinement():
-    table = without(poses_of({**COMMON, 'offset_temperature': [2e-3, -1e-3, 1e-3]}, poses=30,
-                             temperature=WARM), 'temperature')
-    result = ac.refine(table)
-    rating = rate_refinement(result)
-    assert result.verdict == 'unexplained'
-    assert rating.name == 'USABLE'
-    assert 'no effect explains' in rating.reason
-
-
 def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
     table = poses_of({**COMMON, 'quadratic': [0.0015, -0.001, 0.001]}, poses=30, noise=1e-4)
     calibration = ac.fit(table)
     assert calibration.quality.chi2_per_dof > 400.0
     assert Expected(calibration).hidden_mg < 1.0
     assert rate(calibration).name == 'GOOD'
-
-
-def test_a_drift_with_time_is_usable_because_it_may_go_on():
-    mixed = np.random.default_rng(2).permutation(spread_directions(30))
-    table = poses_of({**COMMON, 'offset_drift': [0.03, 0.03, -0.03, 0.0]}, directions=mixed,
-                     time=TIME)
-    result = ac.refine(table)
-    assert 'offset_drift' in result.calibration.model.effects
-    rating = rate_refinement(result)
-    assert rating.name == 'USABLE'
-    assert 'changed with time' in rating.reason
-    assert 'offset_drift' in rating.reason
-
-
-def test_an_effect_of_the_pose_before_cannot_be_corrected_in_single_samples():
-    up = np.random.default_rng(4).permutation(spread_directions(40))
-    way = np.vstack([np.zeros(3), up[:-1] - up[1:]])
-    way[1:] /= np.linalg.norm(way[1:], axis=1, keepdims=True)
-    table = poses_of({**COMMON, 'hysteresis': [0.01, 0.008, -0.01]}, directions=up, previous=way)
-    result = ac.refine(without(table, 'previous'))
-    assert 'hysteresis' in result.calibration.model.effects
-    rating = rate_refinement(result)
-    assert rating.name == 'USABLE'
-    assert 'cannot be corrected in single samples' in rating.reason
-
-
-def test_a_refused_refinement_is_bad_with_the_reason_of_the_gate():
-    result = ac.refine(poses_of(poses=24))
-    rating = rate_refinement(replace(result, refusal=('the covariance is not valid', 'fit again')))
-    assert (rating.name, rating.reason) == ('BAD', 'the covariance is not valid')
-    assert rating.next == NextStep('poses', 'fit again')
 
 
 def test_a_fit_beside_a_refused_refinement_is_not_bad():
@@ -212,14 +142,6 @@ def test_a_sensor_that_was_right_before_is_good_if_the_error_does_not_matter(noi
     assert ('without the calibration' in rating.reason) == (expected == 'USABLE')
 
 
-@pytest.mark.parametrize(('fitted', 'reason'), [(fit_partial, 'near one direction'),
-                                                (mounting_only, 'mounting alone')])
-def test_a_robot_that_cannot_be_turned_over_is_usable(fitted, reason):
-    rating = rate(fitted(tilted(), MS2))
-    assert rating.name == 'USABLE'
-    assert reason in rating.reason
-
-
 @pytest.mark.parametrize('fitted', [fit_partial, mounting_only])
 def test_what_a_robot_cannot_determine_is_stated_once(fitted):
     kinds = [each.kind for each in rate(fitted(tilted(), MS2)).findings]
@@ -232,64 +154,6 @@ def test_what_a_robot_cannot_determine_is_stated_once(fitted):
     (100.0, '100')])
 def test_numbers_have_two_digits_and_one_after_the_point_from_10_to_100(value, expected):
     assert number(value) == expected
-
-
-def known(mirror):
-    table = poses_of(poses=24, reference=True)
-    return table.with_columns(reading=table.reading * mirror)
-
-
-def test_a_wrong_sign_that_model_10_does_not_correct_is_bad():
-    rating = rate(ac.fit(known([1.0, -1.0, 1.0]), model='10'))
-    assert rating.name == 'BAD'
-    assert 'the y axis has the wrong sign' in rating.reason
-
-
-def test_a_wrong_sign_that_model_12_corrects_is_usable():
-    calibration = ac.fit(known([1.0, -1.0, 1.0]))
-    assert calibration.name == '12'
-    rating = rate(calibration)
-    assert rating.name == 'USABLE'
-    assert 'model 12 corrects it' in rating.reason
-    assert rate(ac.fit(known([1.0, 1.0, 1.0]))).name == 'GOOD'
-
-
-@pytest.mark.parametrize(('name', 'units'), [('mpu9150_imu0', MS2),
-                                             ('xsens_mti_counts', NATIVE)])
-def test_real_recordings_are_good(name, units):
-    found = capture(read_recording(data(f'{name}.csv')), units)
-    rating = rate(fit_poses(found.poses, units))
-    assert rating.name == 'GOOD'
-    even, odd = np.arange(len(found.poses)) % 2 == 0, np.arange(len(found.poses)) % 2 == 1
-    half = fit_poses(found.poses.take(even), units)
-    other = found.poses.take(odd)
-    assert rate_verification(verify(half, other), half).name == 'GOOD'
-
-
-@pytest.mark.parametrize('name', ['esgi95_dataset1_huawei', 'esgi95_dataset2',
-                                  'esgi95_dataset3_gt'])
-def test_phones_of_the_report_are_good_with_all_poses_and_usable_with_the_first(name):
-    units, table = units_of('m/s2', 9.8061), read_poses(data(f'{name}.csv'))
-    assert rate(fit_poses(table, units)).name == 'GOOD'
-    for count in (6, 9, 12):
-        assert rate(fit_poses(table.take(np.arange(count)), units)).name == 'USABLE'
-
-
-def test_new_poses_of_the_same_sensor_are_good():
-    calibration = ac.fit(poses_of(poses=24))
-    new = poses_of(poses=12, seed=9)
-    rating = rate_verification(ac.verify(new, calibration), calibration, new)
-    assert rating.name == 'GOOD'
-    assert '12 poses' in rating.figures
-
-
-def test_a_sensor_that_changed_is_usable_with_the_advice_to_fit_again():
-    calibration = ac.fit(poses_of(poses=24))
-    changed = poses_of({**COMMON, 'offset': [0.036, -0.02, 0.04]}, poses=12, seed=9)
-    rating = rate_verification(ac.verify(changed, calibration), calibration)
-    assert rating.name == 'USABLE'
-    assert 'the sensor has changed' in rating.reason
-    assert rating.next.kind == 'fit'
 
 
 def test_a_calibration_of_another_sensor_is_bad_on_new_poses():

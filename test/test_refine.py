@@ -3,25 +3,20 @@
 
 """Hidden effects are named and no others, on data of an independent generator."""
 
-from accel_calib.calibrate import fit_poses
-from accel_calib.capture import capture
-from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.logs import read_poses, read_recording
+from accel_calib.logs import read_poses
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
 from inside import (
-    format_calibration,
     LARGEST_SAMPLE,
     model_with,
-    parse_calibration,
     simulate_poses,
     spread_directions,
 )
 import numpy as np
 import pytest
-from shared import data, random_directions, sensor
+from shared import random_directions, sensor
 
 MPS2, G = units_of('m/s2'), units_of('g')
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
@@ -133,19 +128,6 @@ def test_knocked_poses_are_found_and_nothing_is_named(taken):
         assert names(found) == []
 
 
-def test_a_refined_calibration_is_an_ordinary_one(taken):
-    poses, made = taken(5, {'offset_temperature': 6.0, 'quadratic': 6.0}, poses=60)
-    calibration = refine(poses, MPS2, base='10', sensor='imu').calibration
-    stored = parse_calibration(format_calibration(calibration), 'x.yaml')
-    fresh = generator.again(np.random.default_rng(1), made)
-    columns = {'reading': np.column_stack([fresh.columns[name] for name in ('ax', 'ay', 'az')])}
-    force = stored.correct(columns['reading'], {'temperature': np.array(
-        fresh.columns['temperature'])})
-    assert np.std(np.linalg.norm(force, axis=1)) / 9.80665 < 1e-3
-    with pytest.raises(InputError, match='need temperature'):
-        stored.correct(columns['reading'])
-
-
 def test_the_effects_of_the_ladder_are_added_to_an_ideal_sensor(taken):
     found = refine(taken(6, poses=60)[0], MPS2, base='ideal')
     steps = [step.effect for step in found.steps]
@@ -187,12 +169,6 @@ def test_an_effect_that_was_tested_is_not_listed_as_untestable(taken):
             'gain_step', 'offset_wander', 'misalignment'} == {effect for effect, _ in bare}
 
 
-def test_too_few_poses_are_refused():
-    poses = simulate_poses(model_with({}), spread_directions(3), np.random.default_rng(1))
-    with pytest.raises(RefusedFitError, match='found 3 sound poses, expected at least 4'):
-        refine(poses, G)
-
-
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
     monkeypatch.setattr(*LARGEST_SAMPLE, 400)
     rng = np.random.default_rng(4)
@@ -203,31 +179,6 @@ def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
     assert 'uses 400 of 1000 poses' in found.calibration.warnings[0]
     np.testing.assert_allclose(found.calibration.model.values['quadratic'],
                                truth.values['quadratic'], atol=5e-4)
-
-
-def test_base_may_be_a_stored_calibration(taken):
-    poses, _ = taken(9, {'cubic': 6.0}, poses=60)
-    base = fit_poses(poses, MPS2, model='10', sensor='imu')
-    found = refine(poses, MPS2, base=base)
-    assert names(found) == ['cubic']
-    assert found.calibration.sensor == 'imu'
-
-
-def test_mpu9150_has_no_hidden_effect():
-    poses = capture(read_recording(data('mpu9150_imu0.csv')), MPS2).poses
-    assert names(refine(poses, MPS2, base='10')) == []
-    climbed = refine(poses, MPS2, base='ideal')
-    assert sorted(step.effect for step in climbed.steps) == ['axis_gain', 'cross_axis', 'offset']
-
-
-def test_report_data_show_a_quadratic_part_in_the_first_phone_alone():
-    units = units_of('m/s2', 9.8061)
-    found = refine(read_poses(data('esgi95_dataset1_huawei.csv')), units, base='10')
-    assert names(found) == ['quadratic']
-    assert found.steps[-1].held_out_before_mg == pytest.approx(1.5, abs=0.1)
-    assert found.steps[-1].held_out_after_mg == pytest.approx(0.8, abs=0.1)
-    for name in ('esgi95_dataset2.csv', 'esgi95_dataset3_gt.csv'):
-        assert names(refine(read_poses(data(name)), units)) == []
 
 
 def test_poses_are_left_as_they_were(taken):

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import json
 
 from accel_calib.calibrate import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of
 from accel_calib.capture import capture
@@ -17,7 +16,6 @@ from accel_calib.table import Poses, Recording
 from accel_calib.units import units_of
 from inside import (
     format_calibration,
-    main,
     Model,
     parse_calibration,
     simulate_poses,
@@ -255,19 +253,3 @@ def test_bias_and_noise_are_read_as_they_were_written(known):
         np.testing.assert_array_equal(getattr(read.gyro, name), getattr(calibration.gyro, name))
     for name in ('force', 'rate'):
         np.testing.assert_array_equal(getattr(read.noise, name), getattr(calibration.noise, name))
-
-
-def fit(tmp_path, poses, capsys):
-    write_table(tmp_path / 'poses.csv', replace(poses, units='g'))
-    status = main(['fit', str(tmp_path / 'poses.csv'), '--json', str(tmp_path / 'fit.json')])
-    assert status == 0
-    return json.loads((tmp_path / 'fit.json').read_text()), capsys.readouterr().out
-
-
-def test_fit_prints_the_bias_in_degrees_and_writes_it_in_radians(tmp_path, capsys):
-    result, out = fit(tmp_path, rests(16), capsys)
-    assert 'gyro bias: x 0.57' in out
-    assert '°/s (24 rests)' in ' '.join(out.split())
-    np.testing.assert_allclose(result['gyro_bias'], BIAS, atol=4 * max(result['gyro_bias_sd']))
-    np.testing.assert_allclose(result['noise_force'], 0.003, rtol=0.05)
-    np.testing.assert_allclose(result['noise_rate'], [0.003, 0.002, 0.005], rtol=0.05)

@@ -75,11 +75,7 @@ def test_the_node_is_turned_by_its_services(bench: Any) -> None:
     bench.start('simulator', poses=2, dwell=0.0, turn=0.2, flat_last=False)
 
     def call(name: str) -> Any:
-        client = bench.node.create_client(Trigger, f'simulator/{name}')
-        bench.spin(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        bench.spin(future.done)
-        return future.result()
+        return bench.ask(Trigger, f'simulator/{name}')
 
     def up() -> tuple[float, ...]:
         vector = truth[-1].vector

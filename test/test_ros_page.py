@@ -18,7 +18,6 @@ from typing import Any
 from accel_calib.stored import read_calibration
 from inside import spread_directions
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
@@ -128,25 +127,17 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
 def test_the_managed_node_serves_the_page_while_it_is_configured(
         bench: Any, stored: Callable[..., Path]) -> None:
     node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
-    change = bench.node.create_client(ChangeState, 'calibrator/change_state')
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
-    bench.spin(change.service_is_ready)
-
-    def go(transition: int) -> None:
-        changed = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        bench.spin(changed.done)
-        assert changed.result().success
-
     for _ in range(2):  # the second page is at the same port
-        go(Transition.TRANSITION_CONFIGURE)
+        bench.go(Transition.TRANSITION_CONFIGURE)
         viewer = Viewer(printed_until(node, 'live page: ').split('live page: ')[1].strip())
         bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
-        go(Transition.TRANSITION_ACTIVATE)
+        bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(
             each['raw'] for each in viewer.of('progress')))
         assert viewer.ask('disable', bench.spin)['success']
-        go(Transition.TRANSITION_DEACTIVATE)
-        go(Transition.TRANSITION_CLEANUP)
+        bench.go(Transition.TRANSITION_DEACTIVATE)
+        bench.go(Transition.TRANSITION_CLEANUP)
         wait(lambda viewer=viewer: viewer.code)
         viewer.close()
     assert bench.end(node, signal.SIGTERM)[0] == 0

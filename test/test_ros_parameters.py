@@ -89,11 +89,7 @@ def test_node_declares_all_parameters_and_refuses_invalid_values_while_it_runs(b
     bench.calibrator()
 
     def ask(kind: Any, name: str, **request: Any) -> Any:
-        client = bench.node.create_client(kind, f'calibrator/{name}')
-        bench.spin(client.service_is_ready)
-        future = client.call_async(kind.Request(**request))
-        bench.spin(future.done)
-        return future.result()
+        return bench.ask(kind, f'calibrator/{name}', **request)
 
     table = {parameter.name: parameter.metadata for parameter in fields(CalibratorSettings)}
     names = ask(ListParameters, 'list_parameters').result.names

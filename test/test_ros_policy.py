@@ -67,12 +67,6 @@ def test_simulator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) 
 
 def test_managed_calibrator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
     from lifecycle_msgs.msg import Transition
-    from lifecycle_msgs.srv import ChangeState
     bench.start('calibrator_lifecycle')
-    change = bench.node.create_client(ChangeState, 'calibrator/change_state')
-    bench.spin(change.service_is_ready)
-    configure = Transition(id=Transition.TRANSITION_CONFIGURE)
-    future = change.call_async(ChangeState.Request(transition=configure))
-    bench.spin(future.done)
-    assert future.result().success
+    bench.go(Transition.TRANSITION_CONFIGURE)
     compare(bench, 'calibrator', allowed('calibrator_lifecycle'))

@@ -268,22 +268,10 @@ def test_a_signal_at_any_time_of_the_start_ends_the_node_without_a_traceback(ben
 def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         bench: Any, stored: Stored) -> None:
     from lifecycle_msgs.msg import Transition
-    from lifecycle_msgs.srv import ChangeState, GetState
+    from lifecycle_msgs.srv import GetState
     heard = bench.listen(Imu, 'imu/data_calibrated')
     process = bench.start('calibrator_lifecycle', calibration_file=stored())
-    change = bench.node.create_client(ChangeState, 'calibrator/change_state')
-    state = bench.node.create_client(GetState, 'calibrator/get_state')
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
-
-    def ask(client: Any, request: Any) -> Any:
-        bench.spin(client.service_is_ready)
-        future = client.call_async(request)
-        bench.spin(future.done)
-        return future.result()
-
-    def go(transition: int) -> bool:
-        request = ChangeState.Request(transition=Transition(id=transition))
-        return bool(ask(change, request).success)
 
     def pushes(seconds: float = 0.6) -> int:
         heard.clear()
@@ -297,16 +285,17 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         return len(heard)
 
     for _ in range(2):
-        assert go(Transition.TRANSITION_CONFIGURE)
+        bench.go(Transition.TRANSITION_CONFIGURE)
         bench.spin(lambda: publisher.get_subscription_count() > 0)
         assert pushes() == 0
-        assert go(Transition.TRANSITION_ACTIVATE)
+        bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda: pushes() > 0)
-        assert go(Transition.TRANSITION_DEACTIVATE)
+        bench.go(Transition.TRANSITION_DEACTIVATE)
         pushes(0.3)
         assert pushes() == 0
-        assert go(Transition.TRANSITION_CLEANUP)
-        assert ask(state, GetState.Request()).current_state.label == 'unconfigured'
+        bench.go(Transition.TRANSITION_CLEANUP)
+        state = bench.ask(GetState, 'calibrator/get_state').current_state
+        assert state.label == 'unconfigured'
     assert bench.end(process, signal.SIGINT)[0] == 0
 
 

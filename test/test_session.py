@@ -118,21 +118,6 @@ def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.Monke
     assert store_of('~/x.yaml', named, 'm/s2').calibration == Path('/me/x.yaml')
 
 
-def test_two_sensors_with_names_that_look_alike_do_not_share_anything(
-        home: Path, readings: Readings) -> None:
-    turned = readings(spread_directions(12))
-    one, other = Driver(sensor='left/imu'), Driver(sensor='left_imu')
-    one.feed(turned)
-    assert one.done(one.session.commands.fit())
-    other.feed(turned[:10])
-    assert other.session.sensor.calibration is None
-    assert len(other.session.sensor.live.book.poses()) == 0
-    found = read_calibration(next(home.glob('left_imu-*.yaml')))
-    assert (found.sensor, found.stream) == ('left/imu', '/imu/data_raw')
-    poses = read_poses(next(home.glob('left_imu-*_poses.csv')))
-    assert (poses.sensor, poses.units) == ('left/imu', 'm/s2')
-
-
 def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
         stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')

@@ -122,18 +122,6 @@ def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
     assert linear.base_rss > 10.0 * chosen.rss
 
 
-def test_an_effect_in_a_set_without_a_pose_is_fitted_without_it():
-    poses = poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(7, 30))
-    state, linear = problem_of(poses, 'quadratic')
-    chosen = linear.set_of((0,), (7, 30))
-    others = np.delete(np.arange(COUNT), (7, 30))
-    after = fitted_state(Model({**state.model.values, 'quadratic': np.zeros(3)}),
-                         state.poses_g.take(others))
-    assert chosen.rss == pytest.approx(after.fit.chi2, rel=1e-2)
-    np.testing.assert_allclose(linear.values_of(chosen)[0], after.model.values['quadratic'],
-                               atol=2e-5)
-
-
 def test_the_score_counts_values_shapes_choice_and_size():
     residual = np.zeros(40)
     residual[:3] = 6.0, 8.0, 2.0

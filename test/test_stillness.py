@@ -1,11 +1,22 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stillness detector: many sensors, tremor, slow turning, interrupted stamps."""
+"""The stillness detector: many sensors, tremor, slow turning, real recordings."""
 
 from __future__ import annotations
 
-from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, StillDetector
+from dataclasses import replace
+
+from accel_calib.capture import (
+    capture,
+    Captured,
+    CaptureSettings,
+    Dwell,
+    select,
+    StillDetector,
+)
+from accel_calib.errors import InputError
+from accel_calib.logs import read_recording
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 from inside import lines_through, long_run
@@ -13,6 +24,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
+from shared import data
 
 G = units_of('g')
 
@@ -146,25 +158,6 @@ def test_slow_turning_is_not_still(speed, noise):
         assert np.abs(result.poses.reading[0] - [0.0, 0.0, 1.0]).max() < 5e-3 + noise
 
 
-@pytest.mark.parametrize('speed', [0.5, 1.0, 2.0])
-def test_slow_turning_of_a_noisy_sensor_leaves_no_pose(speed):
-    rng = np.random.default_rng(7)
-    time = np.arange(3000) / 100.0
-    angle = np.radians(speed) * np.maximum(time - 14.0, 0.0)
-    force = np.column_stack([np.sin(angle), np.zeros(3000), np.cos(angle)])
-    result = captured(time, force + 0.05 * rng.normal(size=force.shape))
-    assert np.all(result.poses['time'] < 14.0)
-
-
-def test_a_slow_turn_there_and_back_within_a_dwell_of_a_noisy_sensor_is_found():
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        time = np.arange(700) / 50.0
-        angle = np.radians(0.7) * np.abs(time - 7.0)
-        force = np.column_stack([np.sin(angle), np.zeros(700), np.cos(angle)])
-        assert len(captured(time, force + 0.05 * rng.normal(size=force.shape)).poses) == 0
-
-
 def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
     """Return readings and rates of rests; one rest is turned at 1 °/s."""
     rng = np.random.default_rng(3)
@@ -197,16 +190,6 @@ def test_a_gyro_distinguishes_rests_from_slow_turning_once_its_bias_is_known():
     assert not np.any((poses['time'] > 20.0) & (poses['time'] < 23.0))
 
 
-@pytest.mark.parametrize('amplitude', [0.01, 0.03])
-def test_a_hand_held_tremor_is_not_a_pose_after_a_quiet_rest(amplitude):
-    time, reading, _ = turned(2, noise=2e-3, poses=4)
-    first, held = still(8, 5.0)
-    held = held + amplitude * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
-    result = captured(np.arange(len(time) + 500) / 100.0, np.concatenate([held, reading]))
-    assert len(result.poses) == 4
-    assert result.poses['time'].min() > 5.0
-
-
 def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):
     """Return times and readings of a sensor shaken along gravity by this share of |a|."""
     time, reading = still(seed, seconds, rate, noise)
@@ -229,15 +212,6 @@ def test_shaking_from_the_first_second_on_is_neither_still_nor_a_pose(frequency,
     assert detector.dwells() == []
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_shaking_at_a_wandering_frequency_is_not_a_pose(seed):
-    rng = np.random.default_rng(seed)
-    time, reading = still(seed, 12.0)
-    frequency = 3.0 + 0.3 * lfilter([0.14], [1.0, -0.99], rng.normal(size=len(time)))
-    swing = np.sin(2.0 * np.pi * np.cumsum(frequency) / 100.0)[:, np.newaxis] * [0.05, 0.08, -0.02]
-    assert len(captured(time, reading + swing).poses) == 0
-
-
 @pytest.mark.parametrize(('size', 'poses'), [(0.01, 0), (4e-3, 6)])
 def test_shaking_in_counts_is_not_a_pose(size, poses):
     moved = np.random.default_rng(1).normal(size=(6, 100, 3))
@@ -254,14 +228,6 @@ def test_noise_behind_a_low_pass_filter_is_still(seed, order, corner):
     noise = lfilter(*butter(order, corner, fs=100.0),
                     np.random.default_rng(seed).normal(size=(len(time) + 500, 3)), axis=0)[500:]
     assert len(captured(time, [0.6, 0.0, 0.8] + 0.01 * noise / noise.std()).poses) == 1
-
-
-@pytest.mark.parametrize(('slope_g', 'poses'), [(6e-4, 1), (3e-3, 0)])
-def test_a_dwell_may_settle_but_not_turn(slope_g, poses):
-    time = np.arange(1000) / 100.0
-    force = np.column_stack([np.sin(slope_g * time), np.zeros(1000), np.cos(slope_g * time)])
-    noise = 5e-4 * np.random.default_rng(1).normal(size=force.shape)
-    assert len(captured(time, force + noise).poses) == poses
 
 
 def test_the_ongoing_dwell_is_available_before_it_ends():
@@ -337,3 +303,101 @@ def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
     shorter = known * [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     np.testing.assert_array_equal(long_run(beyond, sizes), long_run(known, sizes))
     assert long_run(known, sizes) > long_run(shorter, sizes)
+
+
+def recording(**columns) -> Recording:
+    return Recording(columns, np.arange(1, len(columns['time']) + 1))
+
+
+def visited(directions, seed=0, seconds=3.0, noise=2e-3) -> Recording:
+    """Return a recording at 100 Hz with rests in these directions, and shaking in between."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for direction in directions:
+        rest = np.asarray(direction) + noise * rng.normal(size=(int(seconds * 100), 3))
+        parts += [rest, np.asarray(direction) + 0.5 * rng.normal(size=(80, 3))]
+    reading = np.concatenate(parts)
+    return recording(time=np.arange(len(reading)) / 100.0, reading=reading)
+
+
+def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation():
+    result = capture(read_recording(data('sensehat_lsm9ds1_temperature.csv')), G)
+    assert 3 <= len(result.poses) <= 5
+    assert result.samples > 24000
+    assert [each.kind for each in result.interruptions] == ['gap']
+    assert 'orientation' not in result.poses
+
+
+def test_max_dwell_splits_a_dwell_of_changing_temperature():
+    poses = capture(read_recording(data('sensehat_lsm9ds1_temperature.csv')), G,
+                    CaptureSettings(max_dwell=3600)).poses
+    assert 60 < len(poses) < 80
+    long = np.bincount(poses['orientation']).max()
+    assert long == pytest.approx(58, abs=1)
+    assert np.ptp(poses['temperature']) > 1.0
+    assert np.all(np.diff(poses['time']) > 0.0)
+
+
+FACES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0)]
+AGAIN = [*FACES, (0.03, 0.0, 0.9996), (0.0, 0.9996, 0.02)]
+
+
+@pytest.mark.parametrize(('repeated', 'poses'), [('keep', 8), ('merge', 6), ('refuse', 6)])
+@pytest.mark.parametrize('unit', ['g', 'native'])
+def test_repeated_poses_are_kept_merged_or_refused_as_asked(repeated, poses, unit):
+    samples = visited(AGAIN)
+    samples = samples.with_columns(reading=samples.reading * (4e3 if unit == 'native' else 1.0))
+    settings = CaptureSettings(repeated=repeated)
+    assert len(capture(samples, units_of(unit), settings).poses) == poses
+
+
+@pytest.mark.parametrize('repeated', ['merge', 'refuse'])
+def test_a_doubtful_pose_does_not_take_the_place_of_a_sure_one(repeated):
+    samples = visited(AGAIN)
+    detector = StillDetector(CaptureSettings(), G)
+    detector.push(np.column_stack([samples['time'], samples.reading]))
+    detector.close()
+    dwells = [replace(each, doubtful=k == 0) for k, each in enumerate(detector.dwells())]
+    kept = select(dwells, CaptureSettings(repeated=repeated), G)
+    assert [each.doubtful for each in kept] == [True, *[False] * 6]
+    assert kept[0] is dwells[0]
+    assert kept[6] is dwells[6]
+
+
+def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
+    kept = capture(visited(AGAIN), G).poses
+    poses = capture(visited(AGAIN), G, CaptureSettings(repeated='merge')).poses
+    assert np.linalg.norm(poses.reading[0]) == pytest.approx(1.0, abs=4e-4)
+    assert poses.reading[0, 0] == pytest.approx(0.015, abs=1e-3)
+    assert np.all(poses.noise[:2] < kept.noise[:2])
+
+
+def test_a_number_that_is_not_finite_is_refused_with_its_row():
+    samples = visited(FACES)
+    reading = samples.reading.copy()
+    reading[70, 1] = np.nan
+    with pytest.raises(InputError, match='row 71 .* remove that row'):
+        capture(samples.with_columns(reading=reading), G)
+
+
+@pytest.mark.parametrize('rows', [0, 1, 2, 12])
+def test_a_recording_of_a_few_samples_has_no_poses(rows):
+    result = capture(visited(FACES).take(slice(0, rows)), G)
+    assert len(result.poses) == 0
+    assert result.samples == 0
+
+
+def test_stamps_that_stop_are_reported_and_make_no_pose():
+    samples = recording(time=np.zeros(250_000), reading=np.tile([0.0, 0.0, 1.0], (250_000, 1)))
+    result = capture(samples, G)
+    assert len(result.poses) == 0
+    assert [each.kind for each in result.interruptions] == ['stopped']
+
+
+@pytest.mark.parametrize('settings', [
+    {'still_window': 0.0}, {'min_dwell': -1.0}, {'max_dwell': 0.5}, {'still_std_max': -1.0},
+    {'still_gyro_max': float('nan')}, {'still_norm_tolerance': 0.0}, {'min_pose_angle': 4.0},
+    {'repeated': 'forget'}])
+def test_settings_out_of_range_are_refused_by_name(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        CaptureSettings(**settings)

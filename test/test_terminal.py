@@ -72,13 +72,6 @@ def test_a_long_line_breaks_at_words_and_a_path_stays_whole(monkeypatch):
         'the calibration with', '12.3 ± 0.4 mg at 31 °C is', 'stored in', path]
 
 
-def test_parameters_that_the_model_lacks_are_absent(poses, printed):
-    text = printed('fit', poses, '--model', '4')
-    assert 'gain x ' in text
-    assert 'gain xy' not in text
-    assert 'gain xy' in printed('fit', poses, '--model', '10')
-
-
 def test_control_characters_are_escaped():
     assert in_one_line('a\x1b[31m\nb') == 'a\\x1b[31m b'
     assert shown('\x1b[31m', 'utf-8') == '\\x1b[31m'

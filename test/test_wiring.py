@@ -3,14 +3,11 @@
 
 """Wiring faults and wrong units are reported."""
 
-import json
 
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.finding import without
-from accel_calib.logs import write_table
-from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import axes_of, fault_of, main, rotation_from_rpy, simulate_poses, spread_directions
+from inside import axes_of, fault_of, rotation_from_rpy, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -69,14 +66,6 @@ def test_a_knocked_pose_does_not_hide_the_fault():
     assert 'the y axis has the wrong sign' in calibration.warnings[0]
 
 
-def test_without_sufficient_known_orientations_there_is_no_wiring_warning():
-    poses = wired(SWAP_XY)
-    columns = {key: value for key, value in poses.columns.items() if key != 'reference'}
-    assert not fit_poses(Poses(columns, poses.row), G).warnings
-    flat = np.column_stack([poses['reference'][:, :2], np.zeros(len(poses))])
-    assert axes_of(poses.reading, flat) is None
-
-
 def levelled(up, frame='ros'):
     rng = np.random.default_rng(2)
     poses = simulate_poses(sensor(rng), random_directions(20, rng), rng)
@@ -95,13 +84,3 @@ def test_a_flat_pose_on_another_face_causes_a_warning(up, frame, words):
     (found,) = without(levelled(up, frame).noted, 'heading')
     assert found.kind == 'flat_pose'
     assert words in found.text
-
-
-def test_the_command_reports_the_wiring_fault(tmp_path, capsys):
-    poses, path = wired(np.diag([1.0, 1, -1])), tmp_path / 'poses.csv'
-    write_table(path, poses)
-    assert main(['fit', str(path), '--units', 'g', '--json', '-']) == 0
-    warnings = json.loads(capsys.readouterr().out)['warnings']
-    assert 'the z axis has the wrong sign' in warnings[0]
-    assert main(['fit', str(path), '--units', 'm/s2']) == 2
-    assert 'set the units of the readings to g' in capsys.readouterr().err

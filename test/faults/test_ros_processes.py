@@ -129,30 +129,6 @@ def test_a_killed_node_has_stored_all_that_it_answered(
                   for state in set(states)]
 
 
-def test_a_node_that_fits_by_itself_is_killed_without_damage(
-        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
-    folder = bench.home / 'accel_calib'
-    log_to_files(bench, tmp_path)
-    bench.without_shared_memory()
-    turned = readings(spread_directions(12))
-    rng = np.random.default_rng(FACTOR)
-    poses = 0
-    for _ in range(max(2, KILLS // 3)):
-        node = bench.calibrator(sensor='arm', auto_fit=True, auto_fit_poses=8, passthrough=True)
-        bench.feed(turned[:round(rng.uniform(0.3, 1.0) * len(turned))])
-        bench.end(node, signal.SIGKILL)
-        bench.join_anew()
-        assert 'Traceback' not in node.communicate()[0]
-        stored = Stored(folder)
-        assert not stored.damaged
-        assert stored.poses >= poses
-        poses = stored.poses
-    bench.calibrator(sensor='arm', passthrough=True)
-    bench.feed(turned)
-    assert bench.call('fit').success
-    assert not list(folder.glob('.*.tmp'))
-
-
 def second(bench: Any) -> Any:
     """Start a second calibrator for the same sensor."""
     return bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second',
