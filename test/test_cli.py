@@ -144,6 +144,7 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
     ('fit', 'poses.csv', '--units', 'g'), ('simulate', '-o', 'x.csv', '--effect', 'wobble=1'),
     ('simulate', '-o', 'x.csv', '--poses', '0'), ('simulate', '-o', 'no_folder/x.csv'),
     ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
+    ('noise', 'poses.csv'),
     ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
     ('refine', 'missing.mcap'), ('refine', 'poses.csv', '-c', 'missing.yaml'),
     ('refine', 'poses.csv', '-o', 'no_folder/c.yaml'), ('refine', 'poses.csv', '--rows', '1:3'),

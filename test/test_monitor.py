@@ -168,6 +168,26 @@ def test_changes_too_small_to_matter_are_ignored() -> None:
     assert state.change is not None
 
 
+@pytest.mark.parametrize(('temperature', 'words'), [
+    (38.2, 'the temperature is 38.2 °C, but the sensor was calibrated at 24.0 to 25.3 °C: capture '
+           'poses at this temperature and call ~/refine'),
+    (26.0, 'call ~/reset, capture poses and call ~/fit'),
+    (None, 'call ~/reset, capture poses and call ~/fit')])
+def test_advice_names_the_temperature_where_it_changed(
+        temperature: float | None, words: str) -> None:
+    rng = np.random.default_rng(9)
+    truth = sensor(rng)
+    calibration = made(truth, rng, temperature=np.linspace(24.0, 25.3, 12))
+    state = rested(monitor(calibration), calibration, truth, [UP] * 4, rng,
+                   temperature=temperature)
+    assert 'stated uncertainty' in status(state)
+    state = rested(state, calibration, truth, [UP] * 3, rng, shift=-0.005 * UP,
+                   temperature=temperature)
+    assert status(state).startswith('|a| at rest has differed by -')
+    assert 'for 3 rests' in status(state)
+    assert status(state).endswith(words)
+
+
 @pytest.mark.parametrize(('name', 'unit'), [
     ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
 def test_real_rests_are_not_a_change_unless_shifted(name: str, unit: Any) -> None:
