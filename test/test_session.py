@@ -277,12 +277,21 @@ def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
     driver = Driver()
     driver.stamp = 10_000.0
     turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
-    for _ in range(3):  # such as a recording that is played in a loop
+    for _ in range(3):
         driver.feed(turned)
         driver.stamp += jump
     assert captured(driver) == [UP, LEFT, FORWARD]
     assert driver.logged('warning').count(words) == 2
     assert len(driver.session.sensor.live.detector.interruptions) == 2
+
+
+def test_poses_of_a_recording_that_is_played_in_a_loop_count_once(readings: Readings) -> None:
+    driver, turned = Driver(), readings([UP, LEFT, FORWARD], dwell=2.5)
+    for _ in range(3):
+        driver.stamp = 10_000.0
+        driver.feed(turned)
+    assert captured(driver) == [UP, LEFT, FORWARD]
+    assert np.all(driver.session.sensor.live.book.poses()['count'] < 2.5 * RATE * 1.1)
 
 
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
