@@ -102,6 +102,7 @@ from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
 from accel_calib.live.server import PageServer, policy_hash
 from accel_calib.live.sources import is_port, open_source
+from accel_calib.live.viewer import qr_code, reachable
 from accel_calib.logs import (
     are_samples,
     bag_samples,
@@ -110,7 +111,6 @@ from accel_calib.logs import (
     open_bag,
     text,
 )
-from accel_calib.live.viewer import qr_code, reachable
 from accel_calib.logs.ardupilot import read_dataflash
 from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest

@@ -6,6 +6,7 @@
 from dataclasses import replace
 
 import accel_calib as ac
+from accel_calib.calibrate import fit_partial, mounting_only
 from accel_calib.finding import NextStep
 from accel_calib.findings import (
     Expected,
@@ -140,6 +141,11 @@ def test_a_sensor_that_was_right_before_is_good_if_the_error_does_not_matter(noi
     rating = rate(ac.fit(poses_of({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=noise)))
     assert rating.name == expected
     assert ('without the calibration' in rating.reason) == (expected == 'USABLE')
+
+
+def tilted():
+    up = np.array([[0, 0, 1], [0.2, 0, 1], [-0.2, 0, 1], [0, 0.2, 1], [0, -0.2, 1]])
+    return poses_of(directions=up / np.linalg.norm(up, axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize('fitted', [fit_partial, mounting_only])

@@ -158,9 +158,9 @@ class Page:
         if not settings.web_port:
             return
         from ..live.host import Exchange
-        from ..live.viewer import qr_code
         from ..live.messages import PERIOD
         from ..live.server import PageServer
+        from ..live.viewer import qr_code
         exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
                             self._stream.flush)
         try:
