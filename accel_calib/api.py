@@ -35,7 +35,7 @@ from .refine import Refinement
 from .stored import read_calibration, write_calibration
 from .table import check_units, columns_from, Floats, numbered, Poses, Recording, Table
 from .text import counted, now
-from .units import STANDARD_GRAVITY, UnitName, Units, units_of
+from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
 
 __all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
            'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
@@ -508,7 +508,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
             if reference or key != 'reference'}
     scaled: dict[str, NDArray[Any]] = {
         key: known.from_g(kept[key]) for key in ('reading', 'std', 'reference')
-        if key in kept and (key != 'reference' or units != 'native')}
+        if key in kept and (key != 'reference' or not is_native(units))}
     return replace(found, columns={**kept, **scaled}, units=units)  # type: ignore[return-value]
 
 

@@ -72,18 +72,9 @@ class Units:
         return reading_g * self.per_g
 
 
-DEFAULT_UNIT: UnitName = 'm/s2'
-"""Unit of readings that nothing states: that of Imu messages."""
-
-
 def is_native(name: str) -> bool:
     """Return whether this is the name of native units, whose scale is not known."""
     return name == 'native'
-
-
-def known_per_g(name: str, gravity: float = STANDARD_GRAVITY) -> float | None:
-    """Return the value of 1 g in the unit of this name; None if its scale is not known."""
-    return {'m/s2': gravity, 'g': 1.0}.get(name)
 
 
 def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:

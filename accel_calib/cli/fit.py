@@ -22,9 +22,8 @@ from ..calibrate import (
     Outlook,
     outlook,
 )
-from ..effects import effect_named, LADDER, value_unit
 from ..estimate import sensing_axes
-from ..findings import Rating
+from ..findings import effect_figures, linear_figures, Rating
 from ..intake import Intake
 from ..pipeline import calibrated, Outcome
 from ..stored import write_calibration
@@ -210,7 +209,7 @@ def _outlook(found: Outlook) -> dict[str, Any]:
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:
     """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
-    if calibration.name == '9':
+    if calibration.form.sensing_axes:
         axes = sensing_axes(calibration.gain, calibration.offset)
         return {'shifts': axes.shifts, 'scales': axes.scales,
                 'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
@@ -251,35 +250,9 @@ def _parameter_table(calibration: Calibration) -> Table:
     table.add_column('', no_wrap=True)
     table.add_column('', no_wrap=True, justify='right')
     table.add_column('', no_wrap=True)
-    for row in (*_linear_rows(calibration), *_effect_rows(calibration)):
-        table.add_row(*row)
+    for each in (*linear_figures(calibration), *effect_figures(calibration)):
+        table.add_row(each.label, with_sd(each.value, each.sd), each.unit)
     return table
-
-
-def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield name, value and unit of the entries of V and W that the model has."""
-    name = calibration.units.name
-    unit = {'m/s2': 'm/s²', 'g': 'g', 'native': 'native'}[name]
-    for axis, value, sd in zip('xyz', calibration.offset, calibration.offset_sd, strict=True):
-        yield f'offset {axis}', with_sd(value, sd), unit
-    per_g = 'per g' if name == 'native' else ''
-    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1)):
-        value, sd = calibration.gain[i, j], calibration.gain_sd[i, j]
-        mirrored = i > j and value == calibration.gain[j, i]
-        if (sd > 0.0 or value) and not mirrored:
-            yield f'gain {"xyz"[i]}{"xyz"[j] if i != j else ""}', with_sd(value, sd), per_g
-
-
-def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield name, value and unit of the parameters beyond V and W."""
-    deviations = dict(zip(calibration.parameters, np.sqrt(np.diag(calibration.covariance)),
-                          strict=True))
-    for effect, values in calibration.model.values.items():
-        shown = {} if effect in LADDER else effect_named(effect).shown(values)
-        for own, value in shown.items():
-            unit, scale = value_unit(effect, own)
-            sd = deviations[f'{effect}.{own}']
-            yield f'{effect} {own}', with_sd(value * scale, sd * scale), unit
 
 
 def short_if_known(value: float | None) -> str:

@@ -37,7 +37,7 @@ from rich.console import Console
 from rich.table import Table
 
 from .commands import BAD_INPUT, COMMANDS, next_command
-from .terminal import shown
+from .terminal import plain_character
 from ..disk import write_atomically
 from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
 from ..text import counted
@@ -362,6 +362,25 @@ class Output(Console):
         parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
                      break_on_hyphens=False)
         return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+
+
+def shown(text: str, encoding: str) -> str:
+    """Return text in the characters of an encoding, without control characters."""
+    safe = ''.join(each if each.isprintable() or each == '\n' else plain_character(each)
+                   for each in text)
+    try:
+        safe.encode(encoding)
+    except UnicodeEncodeError:
+        return ''.join(each if _has(encoding, each) else plain_character(each) for each in safe)
+    return safe
+
+
+def _has(encoding: str, character: str) -> bool:
+    try:
+        character.encode(encoding)
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:

@@ -14,6 +14,7 @@ from .frame import Output, progress
 from ..calibrate import Calibration, FleetPrior
 from ..capture import CaptureSettings
 from ..errors import InputError
+from ..estimate import NORM_MODELS
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
 from ..pipeline import Plan
@@ -82,7 +83,8 @@ def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
 
     """
     plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': prior(args), **more})
-    if plan.fleet is not None and (plan.model not in ('auto', '10') or plan.method != 'ml'):
+    usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
+    if plan.fleet is not None and not usual:
         raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '
                          'model 10 by maximum likelihood', 'leave out these options')
     return plan

@@ -38,35 +38,17 @@ def _replace(error: UnicodeError) -> tuple[str, int]:
     """Return the replacement for characters that the encoding lacks, and where to go on."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    return ''.join(map(_plain, error.object[error.start:error.end])), error.end
+    return ''.join(map(plain_character, error.object[error.start:error.end])), error.end
 
 
-def shown(text: str, encoding: str) -> str:
-    """Return text in the characters of an encoding, without control characters."""
-    safe = ''.join(each if each.isprintable() or each == '\n' else _plain(each) for each in text)
-    try:
-        safe.encode(encoding)
-    except UnicodeEncodeError:
-        return ''.join(each if _has(encoding, each) else _plain(each) for each in safe)
-    return safe
-
-
-def _has(encoding: str, character: str) -> bool:
-    try:
-        character.encode(encoding)
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _plain(character: str) -> str:
+def plain_character(character: str) -> str:
     """Return the replacement of a character: ASCII without control characters."""
     return _PLAIN.get(character) or character.encode('unicode_escape').decode('ascii')
 
 
 def in_one_line(text: str) -> str:
     """Return text as one line without control characters."""
-    return ''.join(each if each.isprintable() else _plain(each)
+    return ''.join(each if each.isprintable() else plain_character(each)
                    for each in ' '.join(text.split()))
 
 
