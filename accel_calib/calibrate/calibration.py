@@ -196,12 +196,12 @@ class Calibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was noted, as lines of text."""
+        """Return what was noted, as lines of text."""
         return tuple(each.words for each in self.noted)
 
     @property
     def form(self) -> ModelForm:
-        """The form of the fitted model, before effects were added."""
+        """Return the form of the fitted model, before effects were added."""
         return MODELS[self.name]
 
     @property

@@ -75,7 +75,7 @@ class Layout:
 
     @property
     def frame_id(self) -> str:
-        """The frame_id as text."""
+        """Return the frame_id as text."""
         return self.name[4:-1].decode(errors='replace')
 
     def place(self, field: slice) -> int:

@@ -51,12 +51,12 @@ class Exported:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """What the format does not hold, with numbers; one line each."""
+        """Return what the format does not hold, with numbers; one line each."""
         return tuple(loss.words for loss in self.details)
 
     @property
     def data(self) -> bytes:
-        """The content as bytes."""
+        """Return the content as bytes."""
         content = self.text_or_bytes
         return content.encode() if isinstance(content, str) else content
 
