@@ -66,13 +66,11 @@ _LEAST_SIDE = 5
 
 
 def _times(context: Context) -> Floats:
-    """Return the known times of the poses, sorted."""
     time: Floats = np.sort(context['time'])
     return time[np.isfinite(time)]
 
 
 def _from_start(context: Context) -> Iterator[Floats]:
-    """Yield the time of the first pose."""
     time = _times(context)
     if len(time) and time[-1] > time[0]:
         yield time[:1]
@@ -161,7 +159,6 @@ def _since(context: Mapping[str, Any], shape: Floats) -> Any:
 
 
 def _settling(context: Mapping[str, Any], shape: Floats) -> Any:
-    """Return exp(-(t - start) / tau)."""
     start, tau = shape
     return np.exp(-np.maximum(context['time'] - start, 0.0) / max(tau, 1e-9))
 
@@ -313,9 +310,9 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     """
     Return the name of an empirical curve.
 
-    The carrier, one of `CARRIERS` or one part of it, changes with the variable, one of
-    `VARIABLES`, by Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the
-    range of the variable in the poses. Outside of this range, the curve is constant.
+    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` by Σ_k c_k
+    cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the range of the variable in
+    the poses. Outside of it, the curve is constant.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
@@ -343,7 +340,6 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
 
 
 def _empirical(name: str) -> Effect:
-    """Return the effect of an empirical curve, from its name."""
     carrier, variable, modes = empirical_parts(name)
     whole, _, part = carrier.partition('.')
     parts = CARRIERS[whole]
@@ -438,7 +434,6 @@ def curve_unit(name: str) -> str:
 
 
 def _shape_unit(name: str, curve: str) -> str:
-    """Return the unit of a constant of the shape of an effect."""
     if name in _WITHOUT_UNIT:
         return ''
     return unit_of(empirical_parts(curve)[1]) if curve else 's'

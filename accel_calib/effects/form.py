@@ -114,10 +114,8 @@ class Effect:
 
     Parameters
     ----------
-    words : str
-        Short description.
-    term : str
-        Name in IEEE 1293 or in data sheets.
+    words, term : str
+        Short description; name in IEEE 1293 or in data sheets.
     parameters : tuple of str
         Names of the p parameters.
     unit : str
@@ -130,8 +128,9 @@ class Effect:
         What the effect adds to the reading.
     factor : callable or None
         Factor of the terms; None: 1.
-    needs : tuple of str
-        Keys of the context that the factor uses.
+    needs, over : tuple of str
+        Keys of the context that the factor uses; columns that it is a function of, if not those in
+        `needs`.
     shape : tuple of str
         Names of the s constants in which the effect is not linear.
     shapes : callable or None
@@ -139,8 +138,6 @@ class Effect:
     usual : tuple of float
         Shape where a file or a command does not state it, and the first that the search tries;
         empty: the shape must be stated.
-    over : tuple of str
-        Columns that the factor is a function of; empty: those in `needs`.
     lagged : str
         Column of the temperature that acts, for the shape ``lag``, ``of_sensor``; else empty.
     family : {'', 'force', 'time'}

@@ -30,18 +30,10 @@ class ModelForm:
     """
     One of the models that consist of offset and gains.
 
-    Parameters
-    ----------
-    effects : tuple of str
-        Names of its effects.
-    gains : int
-        Number of parameters of W, apart from a rotation.
-    norm : str
-        Model with the same ellipsoid that |force| = 1 g alone determines.
-    known_orientation : bool
-        Whether it needs poses of known orientation, and then determines the axes of W.
-    sensing_axes : bool
-        Whether its axes are fixed to the sensing axes.
+    W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
+    that |force| = 1 g alone determines. A model of `known_orientation` needs poses of known
+    orientation, and then determines the axes of W. With `sensing_axes`, its axes are fixed to the
+    sensing axes.
 
     """
 
@@ -90,15 +82,8 @@ def parse_effect(text: str) -> tuple[str, Floats]:
     """
     Return name and (p,) values from ``NAME=VALUE,…``, in the unit of the catalogue.
 
-    Parameters
-    ----------
-    text : str
-        For example ``offset=0.01,-0.02,0.03``, or ``quadratic=0.002`` for all axes.
-
-    Raises
-    ------
-    InputError
-        If the text is not of this form, or as `model_with`.
+    Examples are ``offset=0.01,-0.02,0.03``, and ``quadratic=0.002`` for all axes. Raise
+    `InputError` if the text is not of this form, or as `model_with`.
 
     """
     name, equals, values = text.partition('=')
@@ -133,19 +118,11 @@ def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
 
 def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None) -> Model:
     """
-    Return the model with these effects, in the order of the catalogue.
+    Return the model with these effects and ΔR, in the order of the catalogue.
 
-    Parameters
-    ----------
-    effects : mapping of str to array
-        Values by effect, in the units of the catalogue; one value is used for all axes.
-    rotation : (3, 3) array, optional
-        ΔR.
-
-    Raises
-    ------
-    InputError
-        If an effect is not in the catalogue, or has not the expected number of finite values.
+    The values are in the units of the catalogue; one value is used for all axes. Raise
+    `InputError` if an effect is not in the catalogue, or has not the expected number of finite
+    values.
 
     """
     values = {name: _values_of(name, given) for name, given in effects.items()}
@@ -157,19 +134,8 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
     """
     Return the (n, 3) readings of a sensor [g].
 
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    force : (n, 3) array
-        Specific force in the levelled frame [g].
-    context : mapping of str to array
-        Columns that the effects need, n rows each.
-
-    Raises
-    ------
-    InputError
-        If a column is missing.
+    `force` is the (n, 3) specific force in the levelled frame [g]. `context` has the columns that
+    the effects need, n rows each. Raise `InputError` if a column is missing.
 
     """
     return reading_of(model, force @ model.rotation.T, context)
@@ -202,14 +168,7 @@ def correct(model: Model, reading: Floats, context: Context) -> Floats:
     """
     Return the (n, 3) specific force in the levelled frame [g]; the inverse of `predict`.
 
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    reading : (n, 3) array
-        Readings [g].
-    context : mapping of str to array
-        Columns that the effects need, n rows each.
+    `reading` is (n, 3) [g], and `context` as in `predict`.
 
     Raises
     ------
@@ -242,20 +201,9 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     """
     Simulate averaged still poses, in g, with std, count and context.
 
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    directions : (n, 3) array
-        Specific force [g], unit vectors at rest.
-    rng : numpy.random.Generator
-        Source of the noise.
-    noise_g : float
-        Standard deviation of a sample [g].
-    samples : int
-        Independent samples per pose.
-    context : mapping of str to array, optional
-        Columns that the effects need, n rows each.
+    `directions` are (n, 3) specific forces [g], unit vectors at rest. `noise_g` is the standard
+    deviation of a sample [g], and `samples` the number of independent samples per pose. `context`
+    is as in `predict`.
 
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
@@ -296,8 +244,7 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
     """
     Return force [g] and angular rate [rad/s] along a path, (m, 3) each, in the levelled frame.
 
-    The sensor rests in each of the (n, 3) directions for `dwell` [s], and turns smoothly to the
-    next in `turn` [s].
+    The sensor rests in each of the (n, 3) directions for `dwell` [s]. Each turn takes `turn` [s].
 
     """
     resting, turning = max(1, round(dwell * rate_hz)), max(1, round(turn * rate_hz))
@@ -320,22 +267,11 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     """
     Simulate a sensor that is turned through poses.
 
-    The samples are in g, with angular rate and the true force as ``reference``.
-
-    Parameters
-    ----------
-    model : Model
-        The sensor.
-    directions : (n, 3) array
-        Direction of up in each pose, unit vectors in the levelled frame.
-    rng : numpy.random.Generator
-        Source of the noise.
-    noise_g, gyro_noise : float
-        Standard deviation of a sample [g], [rad/s].
-    rate_hz, dwell, turn : float
-        As `path`.
-    temperatures : sequence of float
-        First and last temperature [°C]; the temperature changes linearly in time.
+    The samples are in g, with angular rate and the true force as ``reference``. `directions` are
+    those of up in each pose, (n, 3) unit vectors in the levelled frame. `noise_g` [g] and
+    `gyro_noise` [rad/s] are standard deviations of a sample. `rate_hz`, `dwell` and `turn` are as
+    in `path`. The temperature changes linearly in time, from the first to the last of
+    `temperatures` [°C].
 
     """
     force, rate = path(directions, rate_hz, dwell, turn)

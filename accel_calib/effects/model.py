@@ -245,11 +245,6 @@ class Model:
     rotation : (3, 3) array
         ΔR, transforms from the levelled frame to the sensor axes.
 
-    Attributes
-    ----------
-    terms : Terms
-        Terms of the effects.
-
     """
 
     values: Mapping[str, Floats]
@@ -359,14 +354,9 @@ class Model:
         """
         Return the derivative of the reading by each value, in the order of ``model.vector``.
 
-        Parameters
-        ----------
-        u : (n, 3) array
-            Force in the sensor axes [g].
-        context : mapping of str to array
-            Columns that the effects need, n rows each.
-        direction : (n, 3) array, optional
-            If given, return the derivative of the basis along this direction of the force.
+        `u` is the (n, 3) force in the sensor axes [g]. `context` has n rows of the columns that
+        the effects need. With a `direction`, (n, 3), the result is the derivative of the basis
+        along this direction of the force.
 
         """
         terms = self.terms

@@ -73,11 +73,10 @@ def rate_at(context: Mapping[str, Any]) -> Any:
 
 def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sensor: bool) -> Any:
     """
-    Return the (n,) temperature that acts with a lag [°C].
+    Return the (n,) temperature that acts with a lag [°C], or the column `key` if present.
 
-    The rows of ``time`` and ``temperature`` are the whole history; for one row alone it is the
-    recorded temperature. The temperature sensor lags if `of_sensor`, otherwise the die. The column
-    `key` is returned if it is present.
+    The temperature sensor lags if `of_sensor`, otherwise the die. The rows of ``time`` and
+    ``temperature`` are the whole history; one row alone has no lag.
 
     """
     if key in context:
@@ -151,8 +150,8 @@ def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats | Non
     """
     Return the (n,) low pass of a temperature [°C], which starts in equilibrium.
 
-    At equal times the temperature jumps. With `rate` [°C/s] the temperature is cubic between the
-    times, otherwise linear. NaN where time or temperature is NaN.
+    With `rate` [°C/s] the temperature is cubic between the times, otherwise linear; at equal times
+    it jumps. NaN where an input is NaN.
 
     """
     found = np.full(len(time), np.nan)
@@ -229,7 +228,6 @@ class _RateFilter:
         self._spread = np.diag(np.square([_ERROR, _START_RATE, _START_BEND]))
 
     def add(self, time: float, temperature: float) -> None:
-        """Add an average."""
         moved, added = (each[0] for each in _motion(np.array([time - self._time])))
         state = moved @ self._state
         spread = moved @ self._spread @ moved.T + added
@@ -251,17 +249,9 @@ class ThermalStream:
     Each sample uses only itself and earlier samples. `add_all` gives the same numbers as `add`,
     sample by sample, also if a stream is added in several parts.
 
-    Parameters
-    ----------
-    lags : mapping of str to Lag
-        Lag by column of the temperature that acts; see `accel_calib.effects.model.Model.lags`.
-    rate : bool
-        Whether the column ``temperature_rate`` is computed.
-
-    Attributes
-    ----------
-    value : dict of str to float
-        Columns at the last sample with a temperature; empty before it.
+    `lags` are by column of the temperature that acts (`accel_calib.effects.model.Model.lags`).
+    With `rate`, the column ``temperature_rate`` is computed. `value` has the columns at the last
+    sample with a temperature; it is empty before it.
 
     """
 

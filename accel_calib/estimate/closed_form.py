@@ -4,12 +4,9 @@
 """
 Closed forms: the cost functions of AN5286 and the ESGI'95 report, without weights.
 
-Poses of unknown orientation lie on a quadric. For model 4 the quadric is a sphere, fitted by
-linear least squares. For model 7 its axes are parallel to those of the sensor, and for model 10
-they have any direction.
-
-Poses of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report,
-section 3).
+Poses of unknown orientation lie on a quadric: for model 4 a sphere, fitted by linear least
+squares; for model 7 with axes parallel to those of the sensor; for model 10 with any axes. Poses
+of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report, section 3).
 
 **Quadric.** Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
 
@@ -119,9 +116,8 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
     """
     Return centre (..., 3) and radius (...) of the sphere through n readings r minus their mean.
 
-    It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses. The
-    sum of all r is zero. `second` is the sum of r rᵀ, (..., 3, 3), and `third` that of |r|² r,
-    (..., 3).
+    It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses, from
+    the sums `second` of r rᵀ, (..., 3, 3), and `third` of |r|² r, (..., 3).
 
     """
     trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
@@ -194,12 +190,7 @@ def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
 
 
 def along_quadrics(values: Floats, step: Floats) -> Floats:
-    """
-    Return the (9,) values of model 10 after a step that is straight in A' and b'.
-
-    The step is to first order. NaN where the quadric is no ellipsoid.
-
-    """
+    """Return the (9,) values after a small step straight in A' and b' (model 10), or NaN."""
     with np.errstate(all='ignore'):
         try:
             mat_w, vec_v = _stepped(values, step)
@@ -264,22 +255,8 @@ def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
     """
     Fit m = X a + y to poses of known orientation (ESGI'95 report, section 3).
 
-    Parameters
-    ----------
-    reading : (n, 3) array
-        Readings m in any unit.
-    reference : (n, 3) array
-        True specific force a.
-
-    Returns
-    -------
-    (3, 3) array, (3,) array
-        X and y.
-
-    Raises
-    ------
-    RefusedFitError
-        If the known forces all lie in a plane.
+    Return X (3, 3) and y (3,) from (n, 3) readings m in any unit and the (n, 3) true specific
+    force a. Raise `RefusedFitError` if the known forces all lie in a plane.
 
     """
     design = np.column_stack([reference, np.ones(len(reference))])
@@ -292,12 +269,7 @@ def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:
 
 
 def faces(reading: Floats) -> Floats | None:
-    """
-    Return the (n, 3) directions of up if poses are exactly the six faces; otherwise None.
-
-    The readings are in any unit; the directions are unit vectors along the axes.
-
-    """
+    """Return the (n, 3) unit vectors of up if poses are exactly the six faces; otherwise None."""
     centre = (reading.max(axis=0) + reading.min(axis=0)) / 2.0
     r = reading - centre
     axis = np.argmax(np.abs(r), axis=1)
@@ -329,14 +301,9 @@ class SensingAxes:
     """
     The nine parameters of the ESGI'95 report.
 
-    Parameters
-    ----------
-    shifts : (3,) array
-        s, in the unit of the readings.
-    scales : (3,) array
-        b > 0, in the unit of the readings per unit of force.
-    phi, psi, theta : float
-        Angles between f1 and f2, f1 and f3, f2 and f3 [rad].
+    `shifts` are s (3,) in the unit of the readings, and `scales` b > 0 (3,) in this unit per unit
+    of force. `phi`, `psi` and `theta` are the angles between f1 and f2, f1 and f3, f2 and f3
+    [rad].
 
     """
 
@@ -356,10 +323,5 @@ def sensing_axes(mat_w: Floats, vec_v: Floats) -> SensingAxes:
 
 
 def lower_triangular(mat_w: Floats) -> Floats:
-    """
-    Rotate the axes of W (3, 3) so that e1 = f1 and e2 is in the f1-f2 plane.
-
-    W Q is lower triangular with a positive diagonal, for a rotation Q.
-
-    """
+    """Rotate the axes of W (3, 3), so that it is lower triangular with a positive diagonal."""
     return np.linalg.cholesky(mat_w @ mat_w.T)

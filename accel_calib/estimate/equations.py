@@ -28,11 +28,10 @@ where N is the covariance of the reading, and B'(u)g is the derivative of B alon
 A with u, by bending terms, is neglected: it is of the order of e times these terms.)
 
 **Copies.** Rows of a table that are one measurement, entered several times, count as one pose.
-
-Copies agree with each other far better than their noise allows. Counted as separate poses, they
-would make the noise seem smaller than it is, and the other poses would look like outliers. Two
-rests in the same orientation are no copies: by chance, only one pair in 5000 differs by less than
-`_ALIKE` of the noise on all axes.
+They agree far better than their noise allows. As separate poses, they would make the noise seem
+smaller than it is, and the other poses would look like outliers. Two rests in the same orientation
+are no copies: by chance, only one pair in 5000 differs by less than `_ALIKE` of the noise on all
+axes.
 
 """
 
@@ -82,12 +81,7 @@ Indices = NDArray[np.intp]
 
 
 def believable(noise: Floats | None) -> Floats | None:
-    """
-    Return the (n, 3) noise of pose means [g], raised where it is far below that of other poses.
-
-    None if the noise is not known, or is zero for most poses.
-
-    """
+    """Return the (n, 3) noise of means [g], raised where far too low; None if unknown or 0."""
     if noise is None or not len(noise):
         return None
     median = np.median(noise)
@@ -124,13 +118,10 @@ def originals(poses_g: Poses) -> Indices:
 
 def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
     """
-    Return the indices of poses of known, shared and unknown orientation.
+    Return the indices of poses by kind of orientation.
 
-    Returns
-    -------
-    (a,) array, list of arrays, (c,) array
-        Poses of known orientation, groups of poses with the same orientation, and poses of which
-        only |force| = 1 g is known.
+    These are the (a,) poses of known orientation, a list of groups of poses with the same
+    orientation, and the (c,) poses of which only |force| = 1 g is known.
 
     """
     everyone, columns = np.arange(len(poses.row)), poses.columns
@@ -146,13 +137,7 @@ def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
 
 
 class _Kind(NamedTuple):
-    """
-    Poses of one kind of orientation.
-
-    Their indices among all poses, the group of each for shared orientations, context, reading and
-    noise s of the means [g].
-
-    """
+    """Poses of one kind: index, group if shared, context, reading and noise s of means [g]."""
 
     which: Indices
     group: Indices
@@ -258,12 +243,7 @@ class _Part(Protocol):
 
 
 def equations(model: Model, poses: Measured) -> Equations:
-    """
-    Set up the equations of poses near a model with ΔR = I.
-
-    A residual is NaN where the force of the reading is not unique.
-
-    """
+    """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
     parts: list[_Part] = []
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
     for make, kind in ((_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)):
@@ -303,7 +283,6 @@ class _Alone:
         self._at, self._along = u, g
 
     def columns(self, model: Model) -> Floats:
-        """Return the derivative; see `Equations.columns`."""
         return (model.basis(self._at, self._context).along(self._rows)
                 - model.basis(self._at, self._context, self._along).along(self._rows_along))
 
@@ -319,7 +298,6 @@ class _Known:
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
     def columns(self, model: Model) -> Floats:
-        """Return the derivative; see `Equations.columns`."""
         basis = model.basis(self.force, self._context).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
@@ -372,7 +350,6 @@ class _Shared:
         return rows - self._turn @ onto[self._group]
 
     def columns(self, model: Model) -> Floats:
-        """Return the derivative; see `Equations.columns`."""
         basis = model.basis(self.force, self._context).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])

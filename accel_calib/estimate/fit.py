@@ -14,14 +14,12 @@ The bounds of each parameter limit its contribution to a reading to `Effect.plau
 shape constant stays near the values that the search tries. The effects of V and W have no bounds
 here: native readings can have any offset, and known orientations any rotation.
 
-**Prior.** Poses that do not determine all values are fitted with the spread of common sensors.
-
-The values then have additional rows, 0 = L⁻¹ (values - mean) with L Lᵀ their covariance, in units
-of the noise (maximum a posteriori). The rows are part of the cost and of JᵀJ, but not of the
+**Prior.** Poses that do not determine all values are fitted with the spread of common sensors:
+additional rows, 0 = L⁻¹ (values - mean) with L Lᵀ their covariance, in units of the noise (maximum
+a posteriori). The rows are part of the cost, of JᵀJ and of the covariance, but not of the
 residuals of the poses: chi² and the degrees of freedom are those of the poses. The number of
-values that the poses determine is the sum of their leverages. The covariance is the posterior
-covariance, and includes the prior. The variance factor of the noise is given, because it
-determines the weight of the prior.
+values that the poses determine is the sum of their leverages. The variance factor of the noise is
+given, because it determines the weight of the prior.
 
 """
 
@@ -88,16 +86,10 @@ _SHAPE_ROOM = 5.0
 @dataclass(frozen=True)
 class Fit:
     """
-    A model at poses, with residuals, derivatives and covariance.
+    A model with ΔR = I at poses in g, with their equations, derivatives and covariance.
 
     Parameters
     ----------
-    model : Model
-        The model, ΔR = I.
-    poses_g : Poses
-        The poses, in g.
-    equations : Equations
-        The equations of the poses near the model.
     columns : (m, q) array
         Derivative of the prediction by the free values, in units of the noise.
     ties : (p, q) array
@@ -233,21 +225,12 @@ NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
           move: Callable[[Floats, Floats], Floats] = np.add) -> tuple[Floats, Point]:
     """
-    Compute the values that minimise the sum of squared residuals.
+    Return the (q,) values that minimise the sum of squared residuals, and the point there.
 
-    Parameters
-    ----------
-    point_at : callable
-        (q,) values -> residuals and derivative. The step solves residual = columns · step.
-    start, lower, upper : (q,) array
-        Start values, and bounds of the values.
-    move : callable
-        Values and step to first order -> values after the step; by default their sum.
-
-    Raises
-    ------
-    NotConvergedError
-        If the fit has not converged after `_MOST_STEPS` steps.
+    The values stay between `lower` and `upper`. `point_at` computes residuals and derivative at
+    values; the step solves residual = columns · step. `move` returns the values after a step to
+    first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
+    `_MOST_STEPS` steps.
 
     """
     values = np.clip(start, lower, upper)
@@ -316,7 +299,7 @@ class Prior:
 def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
              factor: float | None = None) -> Fit:
     """
-    Fit a model.
+    Fit a model; raise `NotConvergedError` if the fit does not converge.
 
     Parameters
     ----------
@@ -329,11 +312,6 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     factor : float, optional
         Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
         that of the residuals in the covariance.
-
-    Raises
-    ------
-    NotConvergedError
-        If the fit does not converge.
 
     """
     if not np.any(start.fitted):

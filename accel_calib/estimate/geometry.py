@@ -217,12 +217,8 @@ class Combination:
     """
     A combination of parameters that the poses do not determine.
 
-    Parameters
-    ----------
-    weights : mapping of str to float
-        Weight of each parameter, the largest first; the sum of the squares is 1.
-    deviation : float
-        Standard deviation relative to the noise of a pose; infinite if not determined at all.
+    `weights` has the weight of each parameter, the largest first; the sum of the squares is 1.
+    `deviation` is relative to the noise of a pose; infinite if not determined at all.
 
     """
 
@@ -248,8 +244,6 @@ class Identifiability:
 
     Parameters
     ----------
-    model : str
-        The model.
     deviations : mapping of str to float
         Standard deviation of each parameter, relative to the noise of a pose; infinite if not
         determined at all.
@@ -279,14 +273,8 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None
     """
     Return what poses determine of a model; it depends only on directions and noise.
 
-    Parameters
-    ----------
-    name : {'4', '7', '9', '10', '12'}
-        The model.
-    directions : (n, 3) array
-        Unit vectors of force in the sensor axes.
-    noise : (n,) array, optional
-        Noise of each pose, in any unit; by default equal for all poses.
+    `name` is 4, 7, 9, 10 or 12. `directions` are (n, 3) unit vectors of force in the sensor axes.
+    `noise` is (n,), of each pose, in any unit; by default it is equal for all poses.
 
     """
     deviations, axes, errors = spectrum(name, directions, noise)
@@ -323,10 +311,9 @@ def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats |
     """
     Return the typical error of |force| if a model omits effects of a larger model [g].
 
-    The omitted effects have their typical size (`accel_calib.effects`). The fit to these poses
-    partly absorbs them in its parameters, which changes the correction over the whole sphere; the
-    error is RMS over the sphere. Both models are for poses of unknown orientation; directions and
-    noise as in `identifiability`.
+    The omitted effects have their typical size. The fit partly absorbs them, which changes the
+    correction over the whole sphere; the error is RMS over it. Both models are for poses of
+    unknown orientation; directions and noise as in `identifiability`.
 
     """
     effects = [effect for effect in left_out(smaller, larger) for _ in EFFECTS[effect].values]

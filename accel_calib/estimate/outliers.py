@@ -13,16 +13,13 @@ are extreme relative to the median are removed at once.
 
 A gross outlier can distort the first fit. `fit_norm` then starts from poses that agree.
 
-**Noise.** Weight of the measured noise of poses against the residuals of a fit.
-
-The variance of a residual is λ times the variance predicted by the noise of its pose. Either the
-noise is correct and λ = 1, or poses repeat worse or better than their samples predict. Then log λ
-is uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both (Bayes' rule
-with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then a mixture of
-normal distributions. Its stated variance is chosen so that ±1.96 standard deviations contain 95 %
-of the mixture. If the noise was not measured, λ is estimated from the residuals alone, and the
-mixture is Student's t. If there are no degrees of freedom either, the noise of a common sensor is
-assumed.
+**Noise.** The variance of a residual is λ times the variance predicted by the noise of its pose.
+Either the noise is correct and λ = 1, or poses repeat worse or better than their samples predict,
+with log λ uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both
+(Bayes' rule with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then
+a mixture of normal distributions, and its stated variance is such that ±1.96 standard deviations
+contain 95 % of it. If the noise was not measured, λ is estimated from the residuals alone, and the
+mixture is Student's t. Without degrees of freedom, the noise of a common sensor is assumed.
 
 In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
 2004).
@@ -98,14 +95,8 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     """
     Return the ratio of the stated variance to the variance predicted by the noise.
 
-    Parameters
-    ----------
-    chi2 : float
-        Sum of the squared residuals in units of the noise.
-    dof : int
-        Number of equations minus number of free values.
-    noise_known : bool
-        Whether the noise was measured; otherwise the unit of `chi2` is `USUAL_NOISE_G`.
+    `chi2` is the sum of the squared residuals in units of the noise, or of `USUAL_NOISE_G` if the
+    noise was not measured. `dof` is the number of equations minus that of free values.
 
     """
     if dof <= 0:
@@ -207,18 +198,7 @@ def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_kno
     """
     Find the outliers among poses, given their equations at a fit.
 
-    Parameters
-    ----------
-    data : ByPose
-        The equations.
-    chi2 : float
-        Sum of the squared residuals.
-    dof : int
-        Number of equations minus number of fitted values.
-    total : int
-        Number of poses before any was left out.
-    noise_known : bool
-        Whether the noise was measured.
+    `chi2` and `dof` are as in `variance_factor`; `total` includes the poses left out before.
 
     """
     rows = int(data.rows.max())

@@ -4,11 +4,9 @@
 """
 Fits without gross outliers, and mistakes in poses that the other poses do not locate or show.
 
-**Gross outliers.** Fits that are robust against gross outliers.
-
-A single wrong row, such as zeros or a reading in another unit, can distort the closed form and the
-fit of all poses so far that the residuals do not show which row is wrong. If the fit of all poses
-is suspicious, subsets are therefore fitted in closed form. The subset with the smallest trimmed
+**Gross outliers.** A single wrong row, such as zeros or a reading in another unit, can distort the
+closed form and the fit of all poses so far that the residuals do not show which row is wrong. If
+that fit is suspicious, subsets are fitted in closed form. The subset with the smallest trimmed
 squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
 agrees with it.
 
@@ -93,8 +91,8 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, NDArray[np.intp]]:
     """
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
-    The poses are at least as many as free parameters. Returns the fit and the (k,) indices of the
-    poses used. Raises `NotConvergedError` if the poses are not on an ellipsoid.
+    Return the fit and the (k,) indices of the poses used. Raise `NotConvergedError` if the poses
+    are not on an ellipsoid. The poses are at least as many as free parameters.
 
     """
     everyone = np.arange(len(poses_g))
@@ -272,16 +270,8 @@ def rivals(fit: Fit, kept: NDArray[np.intp], poses_g: Poses,
     """
     Return the poses that may be wrong instead of those that were left out.
 
-    Parameters
-    ----------
-    fit : Fit
-        Fit to the poses kept.
-    kept : (k,) array of int
-        Indices of these poses.
-    poses_g : Poses
-        All poses without copies, in g.
-    refit : callable
-        Fit of the same model to other poses; may raise `NotConvergedError`.
+    `kept` are the (k,) indices of the poses of the fit among `poses_g`, all poses without copies.
+    `refit` fits the same model to other poses, and may raise `NotConvergedError`.
 
     """
     found = []
@@ -331,8 +321,8 @@ def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Fl
     """
     Return the (n,) part of the residuals by a mistake of one pose that each other pose explains.
 
-    The mistake is `shift` (k,), in units of the noise. `own` (k, q) and `others` (n, k, q) are the
-    derivatives at the poses, and `spread` is (JᵀJ)⁻¹ of the others.
+    The mistake is `shift` (k,) per noise, `own` (k, q) and `others` (n, k, q) are the derivatives
+    at the poses, and `spread` is (JᵀJ)⁻¹ of the others.
 
     """
     onto = spread @ own.T

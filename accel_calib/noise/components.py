@@ -79,16 +79,9 @@ class Component:
     """
     One component of the noise of one axis, in the unit of the figure.
 
-    Parameters
-    ----------
-    value, sd : float
-        Size and standard deviation; NaN if it is not seen.
-    interval : (2,) tuple of float
-        95 % interval; NaN if it is not seen.
-    upper : float
-        Upper limit with 95 % probability, if it is not seen; otherwise the end of the interval.
-    share : float
-        Largest part of the variance that it makes at a τ of the range.
+    `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then the upper
+    limit with 95 % probability, otherwise the end of the interval. `share` is the largest part of
+    the variance that it makes at a τ of the range.
 
     """
 
@@ -107,18 +100,10 @@ class Component:
 @dataclass(frozen=True)
 class Fitted:
     """
-    Components of one axis.
+    Components of one axis, in the order of `COMPONENTS` and for τ0 = 1.
 
-    Parameters
-    ----------
-    squares : (5,) array
-        Squared sizes of the components that are seen, for τ0 = 1.
-    components : tuple of Component
-        In the order of `COMPONENTS`, for τ0 = 1.
-    first, last : int
-        First and last octave of the range, inclusive.
-    p_value : float
-        Probability of χ² in the range.
+    `squares` (5,) are the squared sizes of those that are seen. `first` and `last` are the octaves
+    at the ends of the range, inclusive, and `p_value` is the probability of χ² in it.
 
     """
 
@@ -139,19 +124,7 @@ class _Solution:
 
 
 def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted:
-    """
-    Fit the components to the Allan variances of one axis.
-
-    Parameters
-    ----------
-    variances : (k,) array
-        Overlapping Allan variances, above 0.
-    lengths : (k,) array of int
-        Numbers of samples per average.
-    spread : Spread
-        Covariances for these lengths.
-
-    """
+    """Fit the components to (k,) overlapping Allan variances > 0 at these (k,) lengths."""
     shape = shares(lengths)
     first, last = _range(variances, shape, spread)
     curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
@@ -253,12 +226,7 @@ class _RangeFit:
                          (float(ends[0]), float(ends[1])), float(ends[1]), share)
 
     def _upper(self, found: _Solution, which: int) -> float:
-        """
-        Return the upper limit of a component that is not seen.
-
-        It is the size at which its estimate is this small with a probability of 5 %.
-
-        """
+        """Return the size whose estimate is this small with a probability of 5 %."""
         free = sorted({which, *np.flatnonzero(found.squares)})
         estimate = self.solve(free)
         trial = estimate.squares.copy()
@@ -333,9 +301,7 @@ class AxisNoise:
     Parameters
     ----------
     kind : {'accelerometer', 'gyroscope'}
-        The sensor.
     axis : {'x', 'y', 'z'}
-        The axis.
     unit : {'m/s²', 'rad/s', 'native'}
         Unit of the deviation.
     tau : (k,) array
@@ -383,12 +349,8 @@ class NoiseFigures:
     axes : tuple of AxisNoise
         Accelerometer x, y, z, then gyro x, y, z if the recording has rates. An axis whose reading
         does not change is missing.
-    start, seconds : float
-        First stamp and duration of the rest [s].
-    samples : int
-        Number of samples.
-    rate : float
-        Samples per second [Hz].
+    start, seconds, rate : float
+        First stamp and duration of the rest [s], and samples per second [Hz].
     temperature : (2,) tuple of float or None
         Lowest and highest temperature [°C], averaged over a hundredth of the rest.
     notes : tuple of str

@@ -135,20 +135,12 @@ def check_allantools() -> None:
 @dataclass(frozen=True)
 class Spread:
     """
-    Covariances of the estimates at all lengths, for any sizes of the components.
+    Covariances of the estimates at all k lengths, for any sizes of the components.
 
-    Parameters
-    ----------
-    size : int
-        Number of lengths k.
-    pairs : (p, 2) array of int
-        Pairs of lengths i <= j.
-    gamma : (p, 4, g) array
-        Covariance of the differences at each lag, for each component of size 1.
-    weight : (p, g) array
-        Weight of the square at each lag.
-    of_mean : (4, k, k) array
-        Covariance of the mean differences times m_i m_j, for each component of size 1.
+    For `pairs` (p, 2) of lengths i <= j, `gamma` (p, 4, g) is the covariance of the differences at
+    each lag, for each component of size 1, and `weight` (p, g) is the weight of the square at each
+    lag. `of_mean` (4, k, k) is the covariance of the mean differences times m_i m_j, for each
+    component of size 1.
 
     """
 
@@ -239,20 +231,9 @@ class LongRest:
     """
     The longest rest of a recording.
 
-    Parameters
-    ----------
-    start : float
-        Stamp of the first sample [s].
-    rate : float
-        Samples per second [Hz].
-    values : (c, n) array
-        Readings [g], and angular rates [rad/s] if the recording has them.
-    temperature : (n,) array or None
-        Temperature [°C], if the recording has it.
-    recorded : float
-        Duration of the recording [s].
-    notes : tuple of str
-        What is not regular.
+    `start` is the first stamp [s], and `rate` the samples per second [Hz]. `values` (c, n) are
+    readings [g], and angular rates [rad/s] if the recording has them; `temperature` (n,) is in °C.
+    `recorded` is the duration of the recording [s]. `notes` state what is not regular.
 
     """
 

@@ -97,7 +97,6 @@ def notes_of(axes: Sequence[AxisNoise], temperature: tuple[float, float] | None)
 
 
 def _axis_notes(axis: AxisNoise) -> Iterator[str]:
-    """Yield what limits the figures of one axis."""
     unit, scale = shown_unit(axis.kind, 'bias_instability', axis.unit)
     if axis.step:
         yield (f'the noise is smaller than one step of the output ({_three(axis.step * scale)} '
@@ -147,7 +146,6 @@ def needs_of(axes: Sequence[AxisNoise], rest: LongRest) -> dict[tuple[Kind, str]
 
 
 def _white_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
-    """Return why the white noise is not seen."""
     if rest.samples < _WHITE_SAMPLES:
         return _needs_rest(_WHITE_SAMPLES / rest.rate, rest)
     return np.inf, ('the curve does not fall with slope -1/2 at the shortest τ '
@@ -236,18 +234,10 @@ _LEAST_VARIANCE = 1e-18
 def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVITY,
              progress: Callable[[int, int], object] = lambda done, count: None) -> NoiseFigures:
     """
-    Return the noise figures of a recording with a long rest.
+    Return the noise figures of the longest rest of a recording without an interruption.
 
-    Parameters
-    ----------
-    recording : Recording
-        The samples. The longest rest without an interruption is used.
-    units : Units
-        Unit of the readings. Figures of native readings stay in native units.
-    gravity : float
-        Local gravity [m/s²], for readings in g.
-    progress : function of two int
-        Called with the number of axes done and of all axes.
+    Figures of native readings stay in native units. `gravity` [m/s²] is the local one, for
+    readings in g. `progress` is called with the number of axes done and of all axes.
 
     Raises
     ------
@@ -300,7 +290,6 @@ def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
 
 def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread: Spread
           ) -> AxisNoise:
-    """Return the noise of one axis."""
     lengths = octaves(len(values))
     size = float(np.std(values))
     variances = np.maximum(allan_variances(values / size, lengths), _LEAST_VARIANCE)
@@ -331,13 +320,11 @@ def _band(variances: Floats, freedom: Floats, fitted: Fitted, spread: Spread
 
 
 def _slope_sd(relative: Floats) -> Floats:
-    """Return the standard deviations of the slopes from the relative covariance."""
     across = np.diff(np.eye(len(relative)), axis=0)
     return np.asarray(0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)))
 
 
 def _freedom_of_walk(spread: Spread, lengths: Counts) -> Floats:
-    """Return the equivalent degrees of freedom of a random walk at each length."""
     walk = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
     return 2.0 * (shares(lengths) @ walk)**2 / np.diag(spread.covariance(walk))
 
@@ -403,7 +390,6 @@ def to_json(found: NoiseFigures) -> dict[str, Any]:
 
 
 def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]:
-    """Return one figure of one sensor for JSON."""
     axes = {axis.axis: axis.figures[figure] for axis in found.of(kind)}
     every = [axes.get(axis) for axis in 'xyz'] if axes else []
     native = any(is_native(axis.unit) for axis in found.of(kind))

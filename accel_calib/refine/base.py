@@ -4,13 +4,12 @@
 """
 What a search starts from: the poses that can be used, and a model fitted to them.
 
-**Long tables.** A sample of a long table bounds the time and the memory of a refinement. Nobody
-turns a sensor to thousands of poses by hand: long tables come from machines, or are samples in
-place of poses. With `MOST` equations a refinement takes 10 s and 300 MB as a rule, and about a
-minute and 900 MB in the worst case: all context, and noise that no effect explains. A pose has one
-equation, or three if its orientation is known or shared. The sample takes one pose out of each
-part of the table. The place in the part changes by the golden ratio, so that a table that repeats
-the same turns gives all of them.
+**Long tables.** A sample of a long table bounds the time and the memory of a refinement; such
+tables come from machines, or are samples in place of poses. With `MOST` equations a refinement
+takes 10 s and 300 MB as a rule, and about a minute and 900 MB in the worst case: all context, and
+noise that no effect explains. A pose has one equation, or three if its orientation is known or
+shared. The sample takes one pose out of each part of the table. The place in the part changes by
+the golden ratio, so that a table that repeats the same turns gives all of them.
 
 **Effects of the output** act on the whole reading: readings clipped at a limit, or on a grid. They
 are not columns of the equations, so they are detected in the readings themselves.
@@ -204,12 +203,7 @@ def fitted_state(model: Model, poses_g: Poses) -> State | None:
 
 
 def sampled(poses: Poses) -> Poses:
-    """
-    Return the poses for `MOST` equations, and as many of those of a stored calibration.
-
-    Poses that share their orientation stay together, unless too many do.
-
-    """
+    """Return the poses for `MOST` equations, and as many of those of a stored calibration."""
     most = MOST // (_VECTORS if {'reference', 'orientation'} & set(poses.columns) else 1)
     if len(poses) <= most:
         return poses
@@ -220,7 +214,7 @@ def sampled(poses: Poses) -> Poses:
 
 
 def _kept(poses: Poses, most: int) -> NDArray[np.intp]:
-    """Return the indices of the sample."""
+    """Return the indices of the sample; poses of one orientation stay together if few enough."""
     count = len(poses)
     if 'orientation' in poses and count > most:
         group = np.unique(poses['orientation'], return_inverse=True)[1]
@@ -326,12 +320,7 @@ def _constant(poses_g: Poses) -> list[Floats]:
 
 
 def _alternating_step(poses_g: Poses) -> float | None:
-    """
-    Return the step with which the variance of the samples repeats, or None.
-
-    The variance is smallest for a mean on the grid, and largest half a step away from it.
-
-    """
+    """Return the step with which the variance repeats (least for means on the grid), or None."""
     if 'std' not in poses_g:
         return None
     mean, variance = poses_g.reading.ravel(), _varying(poses_g['std']).ravel()

@@ -93,8 +93,8 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     """
     Return new poses in g followed by those of a stored calibration, with the column ``new``.
 
-    Only the new poses, without this column, are returned if the calibration has no effects or no
-    poses, or was fitted to some of the new poses and still agrees with them.
+    Return only the new poses, without this column, if the calibration has no effects or no poses,
+    or was fitted to some of the new poses and still agrees with them.
 
     """
     stored = in_g(calibration.used_poses, calibration.units)
@@ -169,11 +169,7 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
     """
     Return a model with the changes since the stored calibration included in its effects.
 
-    Returns
-    -------
-    Model, (q, p) array
-        The model without effects of `accel_calib.effects.CHANGES`, and the matrix from the values
-        of `model` to its values.
+    The (q, p) matrix maps the values of `model` to those of the result.
 
     """
     effects: list[str] = []

@@ -320,10 +320,10 @@ def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
 
 def _fall_by_scatter(linear: Linear, chosen: Set) -> float:
     """
-    Return twice the logarithm of the likelihood ratio of an offset that scatters.
+    Return twice the log of the likelihood ratio of an offset that scatters, which is no walk.
 
     Poses that repeat worse than their samples have the same additional variance in g, which shows
-    most where the samples vary little. This is no walk.
+    most where the samples vary little.
 
     """
     size = np.sum(linear.offset ** 2, axis=1)

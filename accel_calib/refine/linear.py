@@ -101,12 +101,8 @@ class Linear:
     ----------
     onto : (m, p) array
         Orthonormal columns that span the base.
-    residual : (m,) array
-        Residual of the base, in units of the noise.
-    pose : (m,) array of int
-        Index of the pose of each equation.
-    blocks : tuple of Block
-        The candidates.
+    residual, pose : (m,) array
+        Residual of the base, in units of the noise, and index of the pose of each equation.
     columns, sizes : (m, c) array, (c,) array
         Columns of all blocks outside of the base, and their norms before it was projected out, to
         which they are relative.
@@ -328,19 +324,12 @@ class Set:
     """
     Effects that are added to the base, and poses that are left out.
 
-    Parameters
-    ----------
-    blocks, out : tuple of int
-        Indices of the blocks, and of the poses left out.
-    onto : (m, q) array
-        Orthonormal columns that span both; those of the poses first.
-    residual, rss : (m,) array, float
-        The residual that they leave, and its sum of squares.
-    ranks, parameters : tuple of float, float
-        Number of values that each block determines beside the blocks before it; number of values,
-        with searched shapes and equations left out.
-    charge, score : float
-        What is subtracted from the score apart from these values; the criterion, 0 for the base.
+    `blocks` are the indices of the blocks of the effects, and `out` those of the poses. The
+    orthonormal columns `onto` (m, q) span both, those of the poses first, and leave `residual`
+    (m,) with the sum of squares `rss`. `ranks` are the numbers of values that each block
+    determines beside the blocks before it. `parameters` is the number of values, with searched
+    shapes and equations left out. `charge` is subtracted from the score apart from these values.
+    `score` is the criterion, 0 for the base.
 
     """
 

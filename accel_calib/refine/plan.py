@@ -198,16 +198,8 @@ class _Predictions:
     """
     The predictions of k models for c candidates of r equations each, in units of √λ.
 
-    Parameters
-    ----------
-    means : (k, c, r) array
-        Predictions.
-    rows : tuple of (c, r, q) array
-        Their derivative by the values of each model.
-    spreads : tuple of (q, q) array
-        Covariance of the values of each model.
-    weights : (k,) array
-        Probabilities of the models.
+    `means` is (k, c, r), and `weights` (k,) the probabilities of the models. For each model,
+    `rows` (c, r, q) is the derivative by its values, and `spreads` (q, q) their covariance.
 
     """
 

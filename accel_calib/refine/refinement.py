@@ -92,11 +92,6 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     sensor, date : str
         Name of the sensor and date for the refined calibration.
 
-    Returns
-    -------
-    Refinement
-        The verdict, the added effects and the refined calibration.
-
     Raises
     ------
     RefusedFitError
@@ -152,7 +147,6 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
 
 def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str
             ) -> Refinement:
-    """Return the record of a search."""
     start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
     steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
     verdict = verdict_of(found, bool(steps))
@@ -198,22 +192,9 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
 
-    Parameters
-    ----------
-    poses : Poses
-        Poses in the unit of the readings.
-    units : Units
-        Unit of the readings, not native.
-    fleet : FleetPrior
-        Typical values of sensors of the same model.
-    sensor, date : str
-        Name of the sensor and date for the refined calibration.
-
-    Returns
-    -------
-    Refinement
-        The refined calibration has the method ``fleet``, and its covariance includes the prior.
-        Its steps have the residuals of the search, which does not use the fleet.
+    Arguments as `refine`; `fleet` has the typical values of sensors of the same model. The refined
+    calibration has the method ``fleet``, and its covariance includes the prior. The steps have the
+    residuals of the search, which does not use the fleet.
 
     Raises
     ------
@@ -236,7 +217,6 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
 
 
 def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
-    """Return a refined calibration with the fleet included."""
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
     fit = judge(model, without_orientation(poses_g))

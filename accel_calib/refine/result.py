@@ -298,7 +298,6 @@ def _shown(name: str) -> str:
 
 
 def _p_value(name: str, before: State, found: Found) -> float:
-    """Return the probability that noise alone makes an effect this good."""
     near = found.near
     if name == WANDER:
         return math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0

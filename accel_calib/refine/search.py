@@ -291,7 +291,6 @@ def _is_all_noise(linear: Linear, chosen: Set) -> bool:
 
 
 def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]) -> State | None:
-    """Return the fit of a set, or None if it is not sound."""
     model = {name: part for name, part in state.model.values.items() if name in fixed}
     for number, values in near.linear.values_of(near.chosen).items():
         block = near.linear.blocks[number]

@@ -168,18 +168,9 @@ class Near:
     """
     The equations of all poses near a model, and what was chosen in them.
 
-    Parameters
-    ----------
-    linear : Linear
-        The equations, with candidates; whitened if there is a walk.
-    chosen : Set
-        The chosen effects and outliers.
-    walk : Walk or None
-        The random walk of the offset.
-    plain : Linear
-        The equations before they were whitened.
-    process : Process or None
-        The modes of a walk; None if it is not tried.
+    `linear` has the candidates, whitened if there is a `walk` of the offset; `plain` is not
+    whitened. `chosen` has the effects and outliers. `process` has the modes of a walk; None if it
+    is not tried.
 
     """
 
@@ -201,12 +192,7 @@ class Near:
 
 
 def probabilities(name: str, near: Near) -> dict[str, float]:
-    """
-    Return the probability of a chosen effect, or of `WANDER`, and of each effect in its place.
-
-    The most probable is first; they sum to 1.
-
-    """
+    """Return the probabilities of an effect or `WANDER` and those in its place, largest first."""
     if name != WANDER and name not in near.names:
         return {name: 1.0}
     whole = near.plain.worth + near.plain.dof

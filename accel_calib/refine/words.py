@@ -207,7 +207,6 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
 
 
 def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[str]:
-    """Return what to do about a gap that remains."""
     final, nearest = found.final, ''
     if not found.taken_back and found.curve is None and WANDER not in found.added:
         return [f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their '
@@ -234,7 +233,6 @@ def _other_sensor(found: Found) -> list[str]:
 
 
 def _separating(step: Step) -> str:
-    """Return advice on how to separate an effect from its rivals."""
     families = {effect_named(name).family for name in (step.effect, *step.rivals)
                 if name != EMPIRICAL}
     family = families.pop() if len(families) == 1 else ''
