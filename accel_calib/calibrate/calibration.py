@@ -184,7 +184,6 @@ class Calibration:
         return f'Calibration({"; ".join(filter(None, about))})'
 
     def _repr_html_(self) -> str:
-        """Return offset and gain as a table, for notebooks."""
         rows = [[axis, *(with_sd(value, sd) if value or sd else ''
                          for value, sd in zip(values, deviations))]
                 for axis, values, deviations in zip(

@@ -51,18 +51,7 @@ def of_samples(known: Context, count: int, model: Model,
 
     A single sample does not show the vibration or the previous pose. Both are set to zero, and so
     is a rate that is NaN. Lag and rate of the temperature come from earlier samples, unless they
-    are known already.
-
-    Parameters
-    ----------
-    known : mapping of str to array
-        Known context of the samples.
-    count : int
-        Number of samples.
-    model : Model
-        Model that the context is for.
-    stream : ThermalStream, optional
-        Temperature before these samples; these samples are added.
+    are known already. A `stream` has the temperature before these samples; they are added to it.
 
     """
     none = np.zeros((count, 3))
@@ -97,18 +86,12 @@ _MOVED = np.radians(3.0)
 
 def with_history(poses_g: Poses, model: Model) -> Poses:
     """
-    Return poses with the context that comes from the poses before and after.
+    Return poses in g with the context that comes from the poses before and after.
 
     That is ``previous``, the unit vector towards the previous pose in order of time, or of rows,
     and ``temperature_rate``. If successive poses have the same orientation, the last motion counts
-    for all of them; before the first motion, ``previous`` is zero.
-
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g. Columns that the table has already are kept.
-    model : Model
-        Model whose gain and offset are used to compute the directions.
+    for all of them; before the first motion, ``previous`` is zero. Columns that the table has
+    already are kept. Gain and offset of the model are used to compute the directions.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
@@ -154,16 +137,8 @@ class Outside:
     """
     A column of the context, compared with the range of a calibration.
 
-    Parameters
-    ----------
-    key : str
-        The column.
-    count, samples : int
-        Number of samples outside of the range, and of all samples.
-    low, high : float
-        Range in the poses of the calibration.
-    least, most : float
-        Range of all samples.
+    `count` of all `samples` are outside of the range `low` to `high` of the poses. All samples
+    range from `least` to `most`.
 
     """
 
@@ -202,15 +177,7 @@ class Outside:
 
 
 def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
-    """
-    Compare the context of samples with the range of a calibration.
-
-    Returns
-    -------
-    dict of str to Outside
-        Result for each column with a range; ``count`` is 0 if all samples are inside.
-
-    """
+    """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
     found = {}
     for key, (low, high) in {**calibration.ranges, **_vibration_range(calibration)}.items():
         values = _size(known[key]) if key in known else np.zeros(0)

@@ -64,7 +64,7 @@ _CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
 def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method = 'ml',
               sensor: str = '', date: str = '') -> Calibration:
     """
-    Fit a calibration.
+    Fit a calibration with ΔR = I; for known orientations with the ΔR that they determine.
 
     Parameters
     ----------
@@ -79,12 +79,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     method : {'ml', 'algebraic'}
         Maximum likelihood, or the cost functions of AN5286 and the ESGI'95 report.
     sensor, date : str
-        Name of the sensor and date, stored in the record. By default the name in the poses.
-
-    Returns
-    -------
-    Calibration
-        The calibration with ΔR = I; for known orientations with the ΔR that they determine.
+        Stored in the record. By default the name in the poses.
 
     Raises
     ------
@@ -246,19 +241,10 @@ def uncertainty_g(calibration: Calibration) -> float:
 
 def deviations_g(calibration: Calibration, up: Floats) -> Floats:
     """
-    Return the standard deviation of |force| that the calibration causes.
+    Return the (n,) standard deviations of |force| that the calibration causes [g].
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    up : (n, 3) array
-        Directions of up in the sensor axes, unit vectors.
-
-    Returns
-    -------
-    (n,) array
-        Standard deviations [g]; 0 if the effects need context that the calibration does not have.
+    They are 0 if the effects need context that the calibration does not have. `up` is (n, 3), unit
+    vectors in the sensor axes.
 
     """
     model = calibration.model

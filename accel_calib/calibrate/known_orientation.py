@@ -220,16 +220,8 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
     """
     Return the orientation of the axes of the readings relative to those of the known forces.
 
-    Parameters
-    ----------
-    reading, reference : (n, 3) array
-        Readings and known forces, in any units.
-
-    Returns
-    -------
-    (3, 3) array or None
-        Orthogonal matrix from the known forces to the axes of the readings, with determinant ±1;
-        None if the known forces do not determine it.
+    It is the orthogonal (3, 3) matrix from the (n, 3) known forces to the axes of the (n, 3)
+    readings, both in any units, with determinant ±1. It is None if the forces do not determine it.
 
     """
     scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)

@@ -72,17 +72,7 @@ def flat_direction(frame: str) -> Floats:
 
 
 def mounting(flat: Floats, frame: str = 'ros') -> Floats:
-    """
-    Compute ΔR, (3, 3), from one flat pose.
-
-    Parameters
-    ----------
-    flat : (3,) array
-        Calibrated reading of the flat pose, in the axes of the sensor; any length.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
-
-    """
+    """Return ΔR, (3, 3), from a calibrated flat reading in the sensor axes, of any length."""
     length = np.linalg.norm(flat)
     if not (np.isfinite(length) and length > 0.0):
         raise InputError(f'the flat pose has the force {flat}, expected about 1 g',
@@ -115,17 +105,9 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
     """
     Return a levelled ΔR with the heading from a pose with the nose of the robot down.
 
-    It matches the flat pose exactly, and the second pose in heading.
-
-    Parameters
-    ----------
-    rotation : (3, 3) array
-        ΔR with any heading, as `mounting` returns it.
-    nose_down : (3,) array
-        Calibrated reading with the nose (front of the robot, top of a screen) tilted straight
-        down, by 10° to 170°; in the axes of the sensor, any length.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
+    It matches the flat pose exactly, and the second pose in heading. In that pose the nose (front
+    of the robot, top of a screen) is tilted straight down by 10° to 170°. `nose_down` is its (3,)
+    calibrated reading in the axes of the sensor, of any length.
 
     """
     flat = flat_direction(frame)
@@ -133,13 +115,7 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
 
 
 def with_heading_of(before: Floats, rotation: Floats) -> Floats:
-    """
-    Return the ΔR of a new flat pose with the heading of an earlier one.
-
-    The earlier x axis is rotated into the new horizontal plane. If it is now within 10° of the
-    vertical, `rotation` is returned.
-
-    """
+    """Return ΔR with the heading of `before`, unless its x axis is within 10° of the vertical."""
     up, x = rotation[:, 2], before[:, 0]
     level_x = x - up * (up @ x)
     length = np.linalg.norm(level_x)
@@ -170,20 +146,9 @@ def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str,
     """
     Return a mounting as numbers and as the lines for the URDF and for TF.
 
-    Parameters
-    ----------
-    rotation : (3, 3) array
-        ΔR.
-    sensor : str
-        frame_id of the sensor; empty: ``imu_link``.
-    base : str
-        Frame of the robot; empty: ``base_link``.
-
-    Returns
-    -------
-    dict
-        ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, ``quaternion``
-        (x, y, z, w), ``urdf`` and ``static_transform_publisher``.
+    The numbers are ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, and
+    ``quaternion`` (x, y, z, w). The lines are ``urdf`` and ``static_transform_publisher``, for the
+    frame_id `sensor` (if empty ``imu_link``) and the frame `base` (if empty ``base_link``).
 
     """
     roll, pitch, yaw = (round(angle, _DIGITS) + 0.0 for angle in rpy_of(rotation.T))
@@ -207,12 +172,7 @@ def mounting_words(rotation: Floats, sensor: str, base: str = '') -> str:
 
 
 def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
-    """
-    Return whether the heading of `mounting` depends on the noise of the flat pose.
-
-    The axis that defines the heading is then within 10° of the vertical: x, for ``win8`` y.
-
-    """
+    """Return whether x (win8: y), which defines the heading, is within 10° of the vertical."""
     axis = 1 if frame == 'win8' else 0
     return bool(np.hypot(*np.delete(rotation[:, 2], axis)) < np.sin(_LEAST_HEADING_ANGLE))
 
@@ -220,19 +180,10 @@ def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
                   nose_down: int | None) -> Calibration:
     """
-    Return a calibration with the mounting from rows of a pose table.
+    Return a calibration with the mounting from rows of a pose table in its unit.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration, with any ΔR.
-    poses : Poses
-        The table, in the unit of the calibration.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
-    flat, nose_down : int or None
-        Row of a pose with the robot level, and of one with its nose tilted straight down, which
-        determines the heading; 1-based.
+    Row `flat` is a pose with the robot level. Row `nose_down` is a pose with the nose of the robot
+    tilted straight down, and determines the heading. Both are 1-based.
 
     Raises
     ------
@@ -260,7 +211,7 @@ def _reading_in(poses: Poses, row: int) -> Floats:
 def level(calibration: Calibration, reading: Floats, frame: FrameName,
           context: Context | None = None) -> Calibration:
     """
-    Return a calibration with the mounting from one flat pose.
+    Return a calibration with ΔR of one flat pose, and a finding if the wiring may be wrong.
 
     Parameters
     ----------
@@ -272,11 +223,6 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
         The levelled frame.
     context : mapping of str to array, optional
         Columns that the effects need, one row.
-
-    Returns
-    -------
-    Calibration
-        The calibration with ΔR of this pose, and a finding if the wiring may be wrong.
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)

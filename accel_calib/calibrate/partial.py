@@ -50,15 +50,10 @@ from ..units import MG, Units
 def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = ''
                   ) -> Calibration:
     """
-    Return a calibration without offset and gain, to be levelled.
+    Return a calibration named ``ideal``, without effects and with ΔR = I, to be levelled.
 
+    `level` adds the mounting. A warning states the error that is left in a common sensor.
     Parameters as in `fit_partial`.
-
-    Returns
-    -------
-    Calibration
-        A calibration with the name ``ideal``, no effects and ΔR = I. `level` adds the mounting.
-        Its warning states the error that is left in a common sensor.
 
     Raises
     ------
@@ -88,18 +83,18 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     """
     Fit model 10 to poses near one direction, with the spread of common sensors as the prior.
 
-    Only |force| = 1 g is used, even if the orientations are known.
+    Use this function if a fit is refused and `lies_in_cone` is true for the directions. If the
+    sensor can be turned, a fit with more poses is better. Only |force| = 1 g is used, even if the
+    orientations are known.
 
     Parameters
     ----------
     poses : Poses
-        Still poses, one or more, in the unit of the readings. Use this function if a fit is
-        refused and `lies_in_cone` is true for their directions. If the sensor can be turned, a
-        fit with more poses is better.
+        Still poses, one or more, in the unit of the readings.
     units : Units
         Unit of the readings, not native.
     sensor, date : str
-        Name of the sensor and date, stored in the record. By default the name in the poses.
+        Stored in the record. By default the name in the poses.
 
     Returns
     -------
@@ -135,23 +130,8 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
     """
     Fit model 10 with the typical values of a fleet as the prior.
 
-    Only |force| = 1 g is used, even if the orientations are known.
-
-    Parameters
-    ----------
-    poses : Poses
-        Still poses, one or more, in the unit of the readings.
-    units : Units
-        Unit of the readings, not native.
-    fleet : FleetPrior
-        Typical values of sensors of the same model.
-    sensor, date : str
-        Name of the sensor and date, stored in the record. By default the name in the poses.
-
-    Returns
-    -------
-    Calibration
-        The calibration with ΔR = I and the method ``fleet``. Its covariance includes the prior.
+    Only |force| = 1 g is used, even if the orientations are known. The calibration has ΔR = I and
+    the method `FLEET`. Its covariance includes the prior. Parameters as in `fit_partial`.
 
     Raises
     ------
@@ -232,23 +212,10 @@ class Carried:
     """
     What the poses of a partial fit determine, and what they leave open.
 
-    Parameters
-    ----------
-    count : int
-        Number of poses used.
-    cone : Cone
-        Mean direction of the poses in the sensor axes, and their largest angle from it.
-    along_g, among_g, elsewhere_g : float
-        Standard deviation of |force| along this direction; the largest among the poses; the
-        largest over the sphere [g].
-    offset_along_g, offset_across_g : float
-        Standard deviation of the offset along this direction, and the largest across it [g].
-    tilt_deg : float
-        Standard deviation of the direction of up, before the mounting is levelled [°].
-    gain : (3,) array
-        Standard deviation of the gain of each axis.
-    cross_axis : float
-        Largest standard deviation of a cross-axis gain.
+    All fields but `count` and `cone` are standard deviations. Those of |force| are along the mean
+    direction of the poses, and the largest among the poses and over the sphere [g]. Those of the
+    offset are along this direction, and the largest across it [g]. `tilt_deg` is that of up before
+    the mounting is levelled [°], `gain` is (3,), and `cross_axis` is the largest.
 
     """
 

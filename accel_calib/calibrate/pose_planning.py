@@ -108,7 +108,7 @@ def _mean_information(name: str) -> Floats:
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
               noise_g: float | None = None) -> NextPose:
     """
-    Return the pose that improves the fit most.
+    Return the pose that improves the fit most: a face, edge or corner not taken yet, or none.
 
     Parameters
     ----------
@@ -120,11 +120,6 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
         Noise of each pose in any unit; by default equal for all poses.
     noise_g : float, optional
         Median noise of the poses [g], for the sentence.
-
-    Returns
-    -------
-    NextPose
-        One of the 6 faces, 12 edges and 8 corners of the sensor that is not taken yet, or none.
 
     """
     count = len(directions)
@@ -162,15 +157,7 @@ def _planned(name: str, directions: Floats, information: Floats, spare: int) -> 
 
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
-    """
-    Return the poses to add until they determine a model well; parameters as in `next_pose`.
-
-    Returns
-    -------
-    list of str
-        Sides, edges and corners to point up in this order, such as ``the left side (+y)``.
-
-    """
+    """Return the sides, edges and corners to point up next, until a model is determined well."""
     information = information_of(name, directions, relative_weights(noise, len(directions)))
     return [f'{words_of(up)} ({_axes(up)})'
             for up in _planned(name, directions, information, 0)]
@@ -231,15 +218,9 @@ class Outlook:
     """
     What the poses of a calibration determine, and the pose that improves it most.
 
-    Parameters
-    ----------
-    identifiability : Identifiability
-        For the requested model; for the largest model if the choice was ``auto``.
-    next_pose : NextPose
-        The next pose for the same model.
-    uncertainty_mg : float or None
-        Stated uncertainty of the corrected |force| (model 12: of the force), RMS over the sphere
-        [mg]; None if it is not known.
+    `identifiability` and `next_pose` are for the requested model; for the largest model if the
+    choice was ``auto``. `uncertainty_mg` is the stated one of the corrected |force| (model 12: of
+    the force), RMS over the sphere [mg]; None if it is not known.
 
     """
 
@@ -328,24 +309,7 @@ def determines(name: str, directions: Floats, noise: Floats | None = None) -> bo
 
 
 def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) -> None:
-    """
-    Check that poses determine a model.
-
-    Parameters
-    ----------
-    name : {'4', '7', '9', '10', '12'}
-        The model.
-    directions : (n, 3) array
-        Unit vectors of force in the sensor axes.
-    noise : (n,) array, optional
-        Noise of each pose, in any unit; by default equal for all poses.
-
-    Raises
-    ------
-    RefusedFitError
-        If the poses do not determine the model.
-
-    """
+    """Raise RefusedFitError if poses do not determine a model; parameters as in `next_pose`."""
     if determines(name, directions, noise):
         return
     smaller = [other for other in NORM_MODELS if poses_needed(other) < poses_needed(name)

@@ -107,16 +107,9 @@ _LEAST_FACTOR = 1e-6
 @dataclass(frozen=True)
 class FleetPrior:
     """
-    The typical values of the sensors of one model.
+    Mean and covariance of the values over a number of sensors of one model.
 
-    Parameters
-    ----------
-    model : str
-        Model of the sensors; empty if it is not known.
-    sensors : int
-        Number of sensors that the values are from.
-    prior : Prior
-        Mean and covariance over the sensors.
+    The name of the model is empty if it is not known.
 
     """
 
@@ -160,22 +153,11 @@ def priors_of(fleet: FleetPrior | None = None) -> tuple[Candidate, ...]:
 @dataclass(frozen=True)
 class PriorFit:
     """
-    The fit with the most probable variance factor, and the poses kept.
+    The fit with the most probable variance factor to the poses kept.
 
-    Parameters
-    ----------
-    fit : Fit
-        The fit to the poses kept.
-    factor : float
-        The variance factor.
-    kept : (k,) array of int
-        Indices of the poses kept, without copies.
-    log_evidence : float
-        Logarithm of the evidence, with the probability of the prior.
-    original : (n,) array of int
-        For each pose, the index of the first equal one.
-    is_unlike : bool
-        Whether the prior is one for sensors unlike the fleet.
+    `kept` are their indices, without copies, and `original` has, for each pose, the index of the
+    first equal one. The logarithm of the evidence includes the probability of the prior.
+    `is_unlike` is for a prior of sensors unlike the fleet.
 
     """
 
@@ -192,21 +174,8 @@ def most_probable(poses_g: Poses, priors: Sequence[Candidate], noise_g: float, s
     """
     Return the fit with the most probable prior, without knocked poses.
 
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g.
-    priors : sequence of Candidate
-        Distributions of the values over sensors.
-    noise_g : float
-        Largest noise that is tried [g].
-    share : float
-        Largest share of knocked poses.
-
-    Raises
-    ------
-    NotConvergedError
-        If the readings contradict every prior.
+    The noise that is tried is at most `noise_g` [g], and knocked poses are at most a `share` of
+    all. NotConvergedError is raised if the readings contradict every prior.
 
     """
     found, original = [], originals(poses_g)
@@ -291,9 +260,10 @@ def _log_evidence(fit: Fit, factor: float, prior: Prior) -> float:
 def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
               ) -> tuple[Floats, Floats, tuple[Finding, ...]]:
     """
-    Return fitted values with the typical values of a fleet included.
+    Return fitted values and their covariance with the typical values of a fleet included.
 
     The covariance of the fleet or of common sensors is chosen that makes the values most probable.
+    There is a finding if the sensor is unlike the fleet.
 
     Parameters
     ----------
@@ -303,11 +273,6 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
         Their covariance, without a prior.
     fleet : FleetPrior
         Typical values of sensors of the same model.
-
-    Returns
-    -------
-    (p,) array, (p, p) array, tuple of Finding
-        The values, their covariance, and a finding if the sensor is unlike the fleet.
 
     """
     count = len(fleet.prior.mean)

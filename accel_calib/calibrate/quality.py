@@ -87,25 +87,12 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
 
 
 def _without_orientation(poses_g: Poses) -> Poses:
-    """Return the poses without columns about their orientation."""
     return Poses({key: values for key, values in poses_g.columns.items()
                   if key not in ('reference', 'orientation')}, poses_g.row)
 
 
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
-    """
-    Return residuals and other figures of a fit.
-
-    Parameters
-    ----------
-    fit : Fit
-        The fit.
-    units : Units
-        Unit of the sensor's readings.
-    directions : (n, 3) array
-        Direction of up in each pose of the fit, unit vectors.
-
-    """
+    """Return figures of a fit; `directions` are up in each of its poses, (n, 3) unit vectors."""
     vectors = 'reference' in fit.poses_g
     before = errors_before(fit.poses_g, units, vectors=vectors)
     errors = errors_after(fit.model, fit.poses_g, vectors=vectors)
@@ -133,18 +120,12 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
         The fit, to the poses that are not rejected.
     poses : Poses
         All poses, in the unit of the readings.
-    units : Units
-        Unit of the readings.
     directions : (n, 3) array
         Direction of up in each pose of the fit, unit vectors.
-    name, method : str
-        Name of the model and method.
     covariance : (p, p) array, optional
         Covariance of the values; by default that of the fit.
-    rejected : tuple of Rejected
-        Rows that the fit does not use, in any order.
-    reason, noted, sensor, date
-        As in `Calibration`.
+    units, name, method, rejected, reason, noted, sensor, date
+        As in `Calibration`; `rejected` in any order.
 
     """
     return Calibration(

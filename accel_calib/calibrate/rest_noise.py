@@ -179,12 +179,7 @@ def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
 
 
 def sample_noise_of(poses: Poses) -> SampleNoise | None:
-    """
-    Return the white noise of one sample, by axis; None if the rests state no noise.
-
-    An axis whose samples never change has no known noise.
-
-    """
+    """Return the noise of one sample, NaN on an axis that never changes; None if not stated."""
     force, rate = (_median(poses, key) for key in ('std', 'rate_std'))
     if 'rate' in poses and len(poses) and not _in_rad_s(poses['rate']):
         rate = np.full(3, np.nan)

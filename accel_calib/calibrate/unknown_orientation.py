@@ -66,19 +66,10 @@ _MOST_NAMED = 3
 
 def directions_of(poses: Poses, units: Units) -> Floats:
     """
-    Return the approximate direction of up in each pose, before a fit.
+    Return approximate directions of up before a fit, (n, 3) unit vectors in the sensor axes.
 
-    Parameters
-    ----------
-    poses : Poses
-        Poses, in the unit of the readings.
-    units : Units
-        Unit of the readings. Native readings are measured from the centre of their sphere.
-
-    Returns
-    -------
-    (n, 3) array
-        Unit vectors in the sensor axes, from the centre of the readings if the poses determine it.
+    They start from the centre of the readings if the poses determine it. Native readings always
+    start from the centre of their sphere.
 
     """
     raw = unit(poses.reading)
@@ -90,26 +81,11 @@ def directions_of(poses: Poses, units: Units) -> Floats:
 @dataclass(frozen=True)
 class NormFit:
     """
-    The fit of poses of unknown orientation.
+    The fit of poses of unknown orientation, with the reason for the choice of the model.
 
-    Parameters
-    ----------
-    name : str
-        Name of the model.
-    reason : str
-        Reason for the choice of the model.
-    fit : Fit
-        Fit to the poses kept.
-    kept : (k,) array of int
-        Indices of the poses kept, without copies.
-    left_out : (d,) array of int
-        Indices of the outliers, with their copies.
-    directions : (k, 3) array
-        Approximate directions of up of the poses kept.
-    findings : tuple of Finding
-        What is worth knowing about the fit.
-    rivals : tuple of Rival
-        Poses that may be wrong instead of those left out.
+    `kept` are the indices of the k poses kept, without copies, and `directions` are (k, 3), their
+    approximate directions of up. `left_out` are the indices of the outliers, with their copies.
+    `rivals` are poses that may be wrong instead of them.
 
     """
 
@@ -154,28 +130,10 @@ def own_scale(poses: Poses, units: Units) -> Units:
 
 def solve_unknown(poses_g: Poses, directions: Floats, model: str, method: Method) -> NormFit:
     """
-    Fit poses by |force| = 1 g.
+    Fit model 4, 7, 9, 10 or ``auto`` to poses in g by |force| = 1 g; method as in `fit_poses`.
 
-    Parameters
-    ----------
-    poses_g : Poses
-        Poses in g.
-    directions : (n, 3) array
-        Approximate direction of up in each pose, unit vectors.
-    model : {'auto', '4', '7', '9', '10'}
-        The model, or the smallest that the data support.
-    method : {'ml', 'algebraic'}
-        As in `fit_poses`.
-
-    Returns
-    -------
-    NormFit
-        The fit and the poses used.
-
-    Raises
-    ------
-    RefusedFitError
-        If the poses do not determine the model.
+    `directions` are (n, 3), the approximate direction of up in each pose, unit vectors.
+    RefusedFitError is raised if the poses do not determine the model.
 
     """
     poses_g = only_norm(poses_g)
@@ -219,17 +177,7 @@ def _rivals(name: str, fit: Fit, kept: NDArray[np.intp], distinct: NDArray[np.in
 
 
 def copies(original: NDArray[np.intp], poses: Poses) -> Iterator[Finding]:
-    """
-    Yield a finding about the rows that count as one pose.
-
-    Parameters
-    ----------
-    original : (n,) array of int
-        As `accel_calib.estimate.outliers.originals` returns it.
-    poses : Poses
-        The poses, with their rows.
-
-    """
+    """Yield a finding about the rows that count as one pose, from the result of `originals`."""
     first, count = np.unique(original, return_counts=True)
     groups = [poses.row[original == each].tolist() for each in first[count > 1]]
     if groups:
@@ -280,7 +228,6 @@ def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
-    """Fit a model to all these poses."""
     if method == 'ml':
         return estimate(start_of(name, poses_g.reading), poses_g)
     mat_w, vec_v = closed_form(name, poses_g.reading)

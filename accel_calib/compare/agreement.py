@@ -77,18 +77,10 @@ class RotationFree:
     """
     The parameters of a calibration that do not depend on its axes.
 
-    Parameters
-    ----------
-    names : tuple of str
-        `NAMES`, and the parameters of effects with bending terms.
-    values : (t,) array
-        Values of the parameters [g].
-    slope : (t, p) array
-        Derivative of the parameters by ``calibration.model.vector``.
-    axes : (3, 3) array
-        Q ΔR, the rotation from the levelled frame to the axes of S.
-    reading_scale, force_scale : float
-        Factors from readings and forces in the local g of the calibration to the common unit.
+    `names` are `NAMES` and the parameters of effects with bending terms, `values` are (t,) [g].
+    `slope` is (t, p), their derivative by ``calibration.model.vector``. `axes` is Q ΔR, the (3, 3)
+    rotation from the levelled frame to the axes of S. The scales are factors from readings and
+    forces in the local g of the calibration to the common unit.
 
     """
 
@@ -116,14 +108,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     """
     Return the parameters of a calibration that do not depend on its axes.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        A calibration with any model.
-    context : mapping of str to array
-        Columns that the effects need, one row.
-    per_g : float
-        Native reading that counts as 1 g; not used for other units.
+    The context has one row. `per_g` is the native reading that counts as 1 g; other units do not
+    use it.
 
     """
     model = calibration.model
@@ -192,16 +178,9 @@ class Scatter:
     """
     How well the poses of a calibration repeat.
 
-    Parameters
-    ----------
-    covariance : (p, p) array
-        Stated covariance of ``model.vector`` [g²].
-    chi2, dof : float, int
-        Squared residuals over their variances, and their degrees of freedom.
-    stated : float
-        Factor of the stated covariance.
-    belief : float
-        Degrees of freedom for which the measured noise counts; 0 if it is not known.
+    `covariance` is (p, p), as stated for ``model.vector`` [g²], and `stated` is its factor. `chi2`
+    is the sum of the squared residuals over their variances. The measured noise counts as `belief`
+    degrees of freedom; 0 if it is not known.
 
     """
 
@@ -292,22 +271,13 @@ class Comparable:
 
 
 def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
-    """
-    Prepare two or more calibrations of one sensor for any number of comparisons among them.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two, or they cannot be compared.
-
-    """
+    """Prepare two or more calibrations of one sensor for any number of comparisons among them."""
     _refuse_if_unlike(calibrations)
     return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in
                  zip(calibrations, _with_largest_model(calibrations), strict=True))
 
 
 def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
-    """Raise InputError if calibrations cannot be compared."""
     if len(calibrations) < 2:
         raise InputError(f'found {counted(len(calibrations), "calibration")}, expected at least 2',
                          'select two or more calibrations of the same sensor')

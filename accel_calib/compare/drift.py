@@ -63,22 +63,11 @@ KINDS: dict[str, Callable[[Floats], Floats]] = {
 @dataclass(frozen=True)
 class LastingChange:
     """
-    A lasting change.
+    A lasting change: its more likely kind, and the number of rests since it began.
 
-    Parameters
-    ----------
-    rests : int
-        Number of rests since the change.
-    kind : str
-        More likely kind of `KINDS`.
-    clear : bool
-        Whether the orientations of the rests clearly distinguish this kind from the other.
-    shift : (q,) array
-        The change [g].
-    covariance : (q, q) array
-        Covariance of the shift [g²].
-    error : float
-        Effect on |a| at these rests, RMS [g]; signed if the sign is the same for all.
+    `clear` is whether the orientations of the rests clearly distinguish the kind from the other.
+    `shift` is the (q,) change [g], and `covariance` is its (q, q) covariance [g²]. `error` is the
+    effect on |a| at these rests, RMS [g]; signed if the sign is the same for all.
 
     """
 
@@ -94,14 +83,8 @@ def change(error: Floats, covariance: Floats, up: Floats) -> LastingChange | Non
     """
     Return a lasting change, or None if the stated uncertainty or knocks explain the errors.
 
-    Parameters
-    ----------
-    error : (n,) array
-        |force| - 1 of the last rests, in order of time [g].
-    covariance : (n, n) array
-        Covariance of these errors without a change [g²].
-    up : (n, 3) array
-        Direction of up in each rest, unit vectors in the sensor axes.
+    `error` is (n,): |force| - 1 of the last rests in order of time [g]. `covariance` is (n, n),
+    that of these errors without a change [g²]. `up` is (n, 3), unit vectors in the sensor axes.
 
     """
     most = 0.5 * float(error @ np.linalg.solve(covariance, error))
@@ -181,20 +164,10 @@ _WARMER = 2.0         # temperatures outside of the range by more cause an advic
 @dataclass(frozen=True)
 class RestError:
     """
-    One rest of the sensor.
+    One rest: its error |force| - 1 [g], and the variance from the noise of the mean [g²].
 
-    Parameters
-    ----------
-    error : float
-        |force| - 1 [g].
-    variance : float
-        Variance of the error from the noise of the mean [g²].
-    slope : (p,) array
-        Derivative of the error by the values of the model.
-    up : (3,) array
-        Direction of up, unit vector in the sensor axes.
-    temperature : float
-        Temperature [°C]; NaN if not known.
+    `slope` is the (p,) derivative of the error by the values of the model, `up` the (3,) unit
+    vector in the sensor axes. The temperature [°C] is NaN if it is not known.
 
     """
 
@@ -208,7 +181,7 @@ class RestError:
 @dataclass(frozen=True)
 class Drift:
     """
-    The state of the monitor: the rests since a calibration.
+    The state of the monitor: the last rests since a calibration, and the number of all.
 
     Parameters
     ----------
@@ -218,10 +191,6 @@ class Drift:
         Variance of the poses of the calibration beyond the noise of their samples [g²].
     temperatures : tuple of float
         Lowest and highest temperature of these poses [°C]; empty if not known.
-    rests : tuple of RestError
-        The last rests.
-    count : int
-        Number of rests so far.
     scatter : float
         Factor on the stated scatter of the rests.
     change : LastingChange or None
@@ -357,7 +326,6 @@ def _kind(found: LastingChange) -> str:
 
 
 def _advice(state: Drift) -> str:
-    """Return the advice for a change."""
     if state.temperatures:
         low, high = state.temperatures
         now = state.temperature
