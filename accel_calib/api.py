@@ -90,11 +90,6 @@ class Calibration(calibrate.Calibration):
         """
         Write the calibration as YAML; the previous file is kept as ``<name>.before``.
 
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
         Raises
         ------
         RefusedFitError
@@ -108,11 +103,6 @@ class Calibration(calibrate.Calibration):
     def report(self, path: Source) -> Refinement:
         """
         Refine the calibration on its own poses, and write a report of the result (HTML).
-
-        Parameters
-        ----------
-        path : str or Path
-            File of the report.
 
         Returns
         -------

@@ -44,14 +44,8 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     """
     Write a file through a temporary file, which is flushed to the disk and renamed.
 
-    Parameters
-    ----------
-    path : Path
-        The file; its folder must exist. The target of a link is replaced, not the link.
-    write : callable
-        Function that writes the content to an open file.
-    keep_before : bool
-        Keep the previous file as ``<name>.before``.
+    The function `write` writes the content to an open file. The target of a link is replaced, not
+    the link. With `keep_before` the previous file is kept as ``<name>.before``.
 
     Raises
     ------
@@ -123,19 +117,9 @@ def _replaceable(path: Path) -> os.stat_result | None:
 
 def remove_leftovers(path: Path, older_than: float = 0.0) -> list[OSError]:
     """
-    Remove temporary files that killed processes left beside a file.
+    Remove temporary files of killed processes beside a file, at least `older_than` old [s].
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    older_than : float
-        Least age of the temporary files [s].
-
-    Returns
-    -------
-    list of OSError
-        One error per temporary file that could not be removed, with its name.
+    Return one OSError, with its name, per file that could not be removed.
 
     """
     name = glob.escape(path.name[:_LONGEST_NAME])
@@ -168,17 +152,7 @@ _KINDS = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe (FIFO)', stat.S_IFSOCK
 
 
 def check_regular(path: Path) -> None:
-    """
-    Check that a path is a regular file, or a link to one.
-
-    Raises
-    ------
-    InputError
-        If it is a folder, a pipe, a socket or a device.
-    OSError
-        If it is missing or cannot be reached.
-
-    """
+    """Check that a path is a regular file or a link to one; InputError if not, OSError if none."""
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), 'a special file')

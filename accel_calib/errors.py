@@ -4,7 +4,8 @@
 """
 Errors that a user can fix, and the last resort for those that nobody expected.
 
-Each message has three parts: what was found, what was expected, and what to do.
+An error has a `message` (one line: what was found, what was expected) and an `advice` (one line:
+what to do).
 
 """
 
@@ -21,17 +22,7 @@ from . import __version__
 
 
 class AccelCalibError(Exception):
-    """
-    The input is not valid.
-
-    Parameters
-    ----------
-    message : str
-        One line: what was found, and what was expected.
-    advice : str
-        One line: what to do.
-
-    """
+    """The input is not valid."""
 
     def __init__(self, message: str, advice: str) -> None:
         super().__init__(message, advice)
@@ -85,16 +76,7 @@ def crash_words(error: BaseException) -> str:
     """
     Write the traceback of an error to a temporary file, and return one line about it.
 
-    Parameters
-    ----------
-    error : BaseException
-        The error.
-
-    Returns
-    -------
-    str
-        What happened, with the name of the file, which contains an id; without the file if it
-        cannot be written.
+    The line names the file, if it could be written; the name contains an id.
 
     """
     what = f'internal error: {type(error).__name__}: {error}'

@@ -85,14 +85,8 @@ class NextStep:
     """
     What to do next.
 
-    Parameters
-    ----------
-    kind : str
-        One of `STEPS`.
-    text : str
-        What to do, without a full stop.
-    rows : tuple of int
-        Row of the flat pose that is suggested, 1-based; may be empty.
+    `kind` is one of `STEPS`, `text` has no full stop, and `rows` may have the row of the suggested
+    flat pose, 1-based.
 
     """
 

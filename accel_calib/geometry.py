@@ -18,12 +18,9 @@ _VERTICAL = 1e-9
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """
-    Return the rotation matrix of fixed-axis roll, pitch and yaw [rad], as in URDF.
+    Return the (3, 3) rotation of fixed-axis roll, pitch and yaw [rad], as in URDF.
 
-    Returns
-    -------
-    (3, 3) array
-        It transforms from the axes of the rotated body to the fixed axes.
+    It transforms from the axes of the rotated body to the fixed axes.
 
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
@@ -76,15 +73,7 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def spread_directions(count: int) -> Floats:
-    """
-    Return directions that are spread evenly over the sphere (Fibonacci lattice).
-
-    Returns
-    -------
-    (count, 3) array
-        Unit vectors.
-
-    """
+    """Return (count, 3) unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     radius, angle = np.sqrt(1.0 - z ** 2), _GOLDEN_ANGLE * np.arange(count)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])

@@ -21,18 +21,10 @@ from .units import Units
 @dataclass(frozen=True)
 class Intake:
     """
-    Poses from a log.
+    Poses of a table or captured from a recording, with the unit of their readings.
 
-    Parameters
-    ----------
-    poses : Poses
-        The poses of a table, or those captured from a recording.
-    units : Units
-        Unit of the readings.
-    read_as : str
-        How the log was read, in one line; empty if nothing was assumed.
-    notes : tuple of str
-        What was left out of the log, and how the poses were captured.
+    `read_as` is how the log was read, in one line, empty if nothing was assumed. `notes` are what
+    was left out of the log, and how the poses were captured.
 
     """
 

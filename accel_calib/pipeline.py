@@ -74,16 +74,10 @@ class Plan:
 @dataclass(frozen=True)
 class Outcome:
     """
-    A calibration with its rating.
+    A fitted or refined calibration with its rating.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The fitted or refined calibration.
-    refinement : Refinement or None
-        The search for effects; None if it was not asked for, or not possible.
-    line : str
-        What was done beyond the fit, and why.
+    `refinement` is None if the search for effects was not asked for, or not possible. `line` is
+    what was done beyond the fit, and why.
 
     """
 
@@ -99,16 +93,7 @@ class Outcome:
 
 def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
     """
-    Fit, refine if the poses can carry it, and level.
-
-    Parameters
-    ----------
-    poses : Poses
-        The poses.
-    units : Units
-        Unit of the readings.
-    plan : Plan
-        The model, the mounting, and whether to refine.
+    Fit, refine if the poses can carry it, and level, as planned.
 
     Raises
     ------
@@ -134,7 +119,6 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
 
 
 def _row(poses: Poses, flat: Flat) -> int | None:
-    """Return the row of the flat pose."""
     if isinstance(flat, str):
         return int(poses.row[0 if flat == 'first' else -1])
     return flat

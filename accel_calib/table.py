@@ -186,19 +186,8 @@ def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
     """
     Return columns under the keys of `COLUMNS`, from columns under their names in a file.
 
-    Parameters
-    ----------
-    given : mapping of str to array
-        n values for each name; other names than those of `COLUMNS` are ignored.
-    needed : sequence of str
-        Required keys.
-    source : str
-        Name of the source in error messages.
-
-    Raises
-    ------
-    InputError
-        If a required column is missing, part of a column is missing, or a value is not valid.
+    `given` has n values for each name; other names are ignored. Raise InputError if a key of
+    `needed` or a part of a column is missing, or a value is not valid. `source` is for the error.
 
     """
     columns: dict[str, NDArray[Any]] = {}
@@ -227,16 +216,7 @@ def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[s
 
 
 def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
-    """
-    Check the values of columns.
-
-    Raises
-    ------
-    InputError
-        If a number is not finite or beyond any sensor, a count not above 0, or a standard
-        deviation below 0.
-
-    """
+    """Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0."""
     for key, values in columns.items():
         if key != 'label' and not np.all(np.abs(values) < LARGEST):
             raise _beyond(key, values.reshape(len(values), -1), source)
@@ -251,7 +231,6 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
 
 
 def _beyond(key: str, values: NDArray[Any], source: str) -> InputError:
-    """Return the error for a number that is not finite, or beyond any sensor."""
     sound = np.abs(values) < LARGEST
     row = int(np.argmin(sound.all(axis=1)))
     number = float(values[row][~sound[row]][0])
@@ -277,19 +256,7 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     Check that readings at rest and known forces have a length of about 1 g.
 
-    Parameters
-    ----------
-    poses : Poses or Recording
-        The readings.
-    units : Units
-        Their unit.
-    source : str
-        What they were read from, for the error.
-
-    Raises
-    ------
-    InputError
-        If they have another length; the advice names the likely unit.
+    Raise InputError otherwise; its advice names the likely unit, and its message the `source`.
 
     """
     if len(poses) == 0:

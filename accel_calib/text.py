@@ -21,12 +21,7 @@ def short(value: float) -> str:
 
 
 def with_sd(value: float, sd: float) -> str:
-    """
-    Return ``value ± sd`` with two significant digits of the standard deviation.
-
-    A value without a standard deviation has six significant digits.
-
-    """
+    """Return ``value ± sd`` to two significant digits of the sd; six digits if there is no sd."""
     if not sd > 0.0:
         return '0' if abs(value) < _ZERO else f'{value:.6g}'
     decimals = max(0, 1 - math.floor(math.log10(sd)))

@@ -79,16 +79,9 @@ def is_native(name: str) -> bool:
 
 def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:
     """
-    Return the unit with this name.
+    Return the unit with this name; `gravity` is the local gravity [m/s²], used by ``m/s2``.
 
     The sensitivity of native units is 1 until a fit estimates it.
-
-    Parameters
-    ----------
-    name : {'m/s2', 'g', 'native'}
-        The unit.
-    gravity : float
-        Local gravity [m/s²], used by ``m/s2``.
 
     """
     return Units(name, gravity if name == 'm/s2' else 1.0)

@@ -174,17 +174,11 @@ def summed(records: Records, size: int) -> Records:
 
 def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Records:
     """
-    Return the sums over the samples from each start to the next, (m,) records of SUMS.
+    Return the (m,) records of SUMS over the samples from each start to the next.
 
-    Parameters
-    ----------
-    samples : (k, n) array
-        Time and reading (k = 4), with rate (7), with context (WIDTH). Sums of a missing rate are
-        NaN.
-    starts : (m,) array of int
-        Index of the first sample of each chunk.
-    epoch, origin : float, (6,) array
-        Subtracted from time, and from reading and rate.
+    `samples` are (k, n): time and reading (k = 4), with rate (7), with context (WIDTH). `epoch`
+    and `origin` (6,) are subtracted from time, and from reading and rate. Sums of a missing rate
+    are NaN.
 
     """
     sums = blank(SUMS, len(starts))

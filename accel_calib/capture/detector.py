@@ -170,7 +170,6 @@ class Tracker:
 
 
 def _records(judged: Judged) -> Records:
-    """Return chunks with their verdicts as records."""
     chunks = judged.chunks
     found = np.empty(len(judged.still), _JUDGED)
     for name in chunks.sums.dtype.names or ():
@@ -187,7 +186,6 @@ def _tail(chunks: Records, size: int) -> Records:
 
 
 def _without_windows(chunks: Records) -> Records:
-    """Return the chunks without the variances of their windows."""
     found = chunks.copy()
     found['sums']['level'] = found['sums']['windows'] = 0.0
     return found
@@ -218,16 +216,7 @@ class StillDetector:
     Find the dwells of one sensor, block by block.
 
     The dwells do not depend on the division into blocks; a stream and a recording have the same
-    dwells.
-
-    Parameters
-    ----------
-    settings : CaptureSettings
-        Settings of the detector.
-    units : Units
-        Unit of the readings.
-    keep : int or None
-        Number of finished dwells to keep; None: all.
+    dwells. `keep` is the number of finished dwells to keep; None: all.
 
     """
 
@@ -296,9 +285,9 @@ class StillDetector:
     @property
     def threshold(self) -> float:
         """
-        Return the standard deviation below which a window is still now, the largest over the axes.
+        Return the largest standard deviation of a still window now [unit of the readings].
 
-        It is in the unit of the readings, and infinite before the first samples of a sensor in
+        It is the largest over the axes, and infinite before the first samples of a sensor in
         native units.
 
         """

@@ -71,12 +71,7 @@ FIGURES = np.dtype([
 
 
 def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
-    """
-    Return the figures of finished dwells, one record per dwell.
-
-    With known units the mean reading is nearly vertical.
-
-    """
+    """Return one record of figures per dwell; with known units the mean is nearly vertical."""
     found = np.empty(len(dwells), FIGURES)
     if not dwells:
         return found
@@ -138,12 +133,7 @@ def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats,
 
 def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
                ) -> None:
-    """
-    Set the slopes of the first, the middle and the last half, and their strengths.
-
-    They reveal a turn that begins or ends within a dwell better than the slope of the whole dwell.
-
-    """
+    """Set slopes and strengths of first, middle and last half, to detect a turn in a part."""
     half = sizes // 2
     inside = np.arange(int(half.max())) < half[:, np.newaxis]
     for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):

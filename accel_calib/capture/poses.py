@@ -43,8 +43,6 @@ class Captured:
 
     Parameters
     ----------
-    poses : Poses
-        The poses.
     samples, recorded : int
         Number of samples in the poses, and in the recording.
     threshold : float

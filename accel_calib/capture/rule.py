@@ -177,21 +177,11 @@ class Rule:
 
     def rounding(self, mean: Floats, level: Floats) -> tuple[Floats, Floats]:
         """
-        Return the effect of rounding on samples and on their mean.
+        Return the (n,) rounding std of a sample, and the (3, n) rounding variance of the means.
 
-        Parameters
-        ----------
-        mean : (3, n) array
-            Mean readings of dwells.
-        level : (3,) array
-            Mean variance of the samples of each axis, over many dwells.
-
-        Returns
-        -------
-        std : (n,) array
-            Standard deviation of the rounding error of a sample; always above 0.
-        variance : (3, n) array
-            Variance of the rounding error of the mean; averaging does not remove it.
+        `mean` are the (3, n) mean readings of dwells, and `level` the (3,) mean variance of the
+        samples over many dwells. The std is always above 0. Averaging does not remove the
+        variance.
 
         """
         step = float(self._step[0])
@@ -245,18 +235,10 @@ class Rule:
               strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
               ) -> NDArray[np.bool_]:
         """
-        Return whether a slope is significant and larger than a drift.
+        Return whether a slope is significant and larger than a drift of `drift_g` [g/s].
 
-        Parameters
-        ----------
-        found : Trend
-            The slope.
-        scale : (...) array
-            Reading of 1 g.
-        variance : (3, ...) array
-            Variance of the samples.
-        strength, drift_g : float or array
-            Strength above which the slope is significant, and largest drift [g/s].
+        `scale` (...) is the reading of 1 g, and `variance` (3, ...) that of the samples. A slope
+        is significant if its strength is above `strength`.
 
         """
         drift = drift_g * scale
@@ -350,14 +332,8 @@ def clipped(average: Floats, at_limit: Floats, step: Floats, mean: Floats) -> ND
     """
     Return which axes end at a limit while another axis varies by more than rounding.
 
-    Parameters
-    ----------
-    average : (axes, n) array
-        Variances.
-    at_limit : (3, n) array
-        Share of samples that repeat the extreme of their axis so far.
-    step, mean : (2, n) array, (axes, n) array
-        Smallest steps so far; mean readings and rates.
+    `average` are (axes, n) variances, and `at_limit` the (3, n) share of samples that repeat the
+    extreme of their axis so far; `step` (2, n) and `mean` (axes, n) are as in `at_least`.
 
     """
     reading = mean[:3]

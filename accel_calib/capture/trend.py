@@ -174,16 +174,10 @@ def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
     """
-    Return the largest share of the residuals of the lines that one frequency explains.
+    Return the (m,) largest shares, 0 to 1, of the residuals that one frequency explains.
 
-    Parameters
-    ----------
-    values : (axes, n) array
-        Values of the axes; the (m,) shares, 0 to 1, are over all axes together.
-    length : int
-        Length of the windows.
-    index : (m,) array of int
-        First value of each window.
+    `values` are (axes, n); a share is over all axes together. `index` (m,) are the first values of
+    the windows of this length.
 
     """
     line, waves = _waves(length)
@@ -266,14 +260,9 @@ def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
     Return the (k,) excess of series: the variance of the mean over that of white noise.
 
-    Parameters
-    ----------
-    centred : (3, k, K) array
-        Means of consecutive cells minus their common mean, and 0 after the end of a series.
-    sizes : (k,) array
-        Lengths of the series; the excess is 1 for fewer than 4 cells.
-    white : (3, k) array
-        Variance of a cell mean for independent samples; axes with 0 are ignored.
+    `centred` (3, k, K) are means of cells minus their common mean, and 0 after the end of a
+    series. `sizes` (k,) are the lengths; the excess is 1 for fewer than 4 cells. `white` (3, k) is
+    the variance of a cell mean for independent samples; axes with 0 are ignored.
 
     """
     axes = white > 0.0

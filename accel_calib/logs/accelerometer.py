@@ -84,7 +84,7 @@ class Rests:
 
     @property
     def unit(self) -> tuple[UnitName, float] | None:
-        """Return the unit of the readings and the factor to it; None if it is not common."""
+        """Return the common unit of the readings and the factor to it, or None."""
         if self.near(STANDARD_GRAVITY):
             return 'm/s2', 1.0
         if self.near(1.0):
@@ -94,12 +94,7 @@ class Rests:
         return None
 
     def lack_gravity(self, per_g: float | None) -> bool:
-        """
-        Return whether gravity is not in the readings: they are small and on no sphere.
-
-        `per_g` is 1 g in the stated unit of the readings, or None if the unit is not known.
-
-        """
+        """Return whether the readings are small and on no sphere; `per_g` is 1 g if stated."""
         small = _SMALL if per_g is None else _SMALL_G * per_g
         return self.length < small and self.unit is None and math.isnan(self.radius)
 
@@ -115,7 +110,6 @@ def rests_of(reading: Floats, *, samples: bool) -> Rests:
 
 
 def _quiet(reading: Floats) -> Floats:
-    """Return the means of the windows with the least scatter."""
     size = int(np.clip(len(reading) // _WINDOWS, _SHORTEST, _LONGEST))
     count = len(reading) // size
     if count < 2:
@@ -174,22 +168,10 @@ class ReadingUnit:
 def unit_of_reading(columns: Chosen, raw: Floats, options: LogOptions, *, samples: bool
                     ) -> ReadingUnit:
     """
-    Return the unit of the readings.
+    Return the unit of readings; `raw` are the first (n, 3), in the unit of the file.
 
-    Parameters
-    ----------
-    columns, options
-        The columns, and what the user states.
-    raw : (n, 3) array
-        The first readings, in the unit of the file.
-    samples : bool
-        Whether rows are samples; otherwise each row is a pose at rest.
-
-    Raises
-    ------
-    InputError
-        If the units that are stated contradict each other or the readings, or gravity is not in
-        the readings.
+    If not `samples`, each row is a pose at rest. Raise InputError if stated units contradict each
+    other or the readings, or the readings lack gravity.
 
     """
     named, factor = _named(columns)
@@ -223,7 +205,6 @@ def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
 
 
 def _stated(columns: Chosen, options: LogOptions) -> UnitName | Literal['']:
-    """Return the unit that the user or a comment states."""
     path, of_file = columns.layout.path, columns.layout.about.get('units', '')
     if options.units and of_file and options.units != of_file:
         raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
@@ -270,7 +251,6 @@ def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
 
 def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool
            ) -> tuple[str, ...]:
-    """Return how the readings are read."""
     words, name = compact(columns.names(READING)), units.name
     if units.is_native and not stated:
         value = f'{_size(rests.per_g)}{" counts" if rests.whole else ""}'

@@ -92,15 +92,8 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     Read the accelerations of one sensor of an ArduPilot log.
 
     By default the message is IMU if it is dense enough, otherwise ACC, and the sensor the lowest
-    number. Another text for the sensor is a name.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged or has no such message, or pymavlink is not installed (binary logs
-        only).
-    OSError
-        If the file cannot be read.
+    number. Another text for the sensor is a name. Raise InputError if the file is damaged or has
+    no such message, or pymavlink is not installed (binary logs only).
 
     """
     kind = _kind(path)
@@ -173,7 +166,6 @@ def _corrected(tables: Mapping[str, _Table]) -> list[str]:
 
 
 def _parameters(table: _Table) -> dict[str, float]:
-    """Return the parameters by name."""
     if 'Name' not in table or 'Value' not in table:
         return {}
     names = [name.decode('latin-1') if isinstance(name, bytes) else str(name)

@@ -235,8 +235,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
     ------
     InputError
         If the bag is damaged; also later, while it is read.
-    FileNotFoundError
-        If the file is missing.
 
     """
     from .bounded_bags import readable, Reader1, Reader2

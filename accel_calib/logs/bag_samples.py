@@ -217,10 +217,8 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
 
     Parameters
     ----------
-    bag : Bag
-        The open bag.
-    imu, sensor : str
-        Topic and frame_id of the readings.
+    bag, imu, sensor
+        The open bag; topic and frame_id of the readings.
     temperature_topic, supply_topic : str
         Topics to use, as ``TOPIC`` or ``TOPIC:FIELD``. By default, the temperature is that of the
         only topic of type sensor_msgs/Temperature, or of the only one with the frame_id or in the
@@ -245,7 +243,6 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
 
 
 def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
-    """Return the topic and field that the user names."""
     topic, _, field = asked.partition(':')
     known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
@@ -257,7 +254,6 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
 
 
 def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> str:
-    """Return the path of the field of a quantity."""
     numbers = bag.numbers(connection)
     last = {path: path.rpartition('.')[2].lower() for path in numbers}
     choices = [[path for path in numbers if path == asked]] if asked else [
@@ -289,7 +285,6 @@ def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
 
 
 def _frame_id(bag: Bag, topic: str) -> str:
-    """Return the frame_id of the first Temperature of a topic."""
     raws = [raw for _, _, raw in bag.first(topic, TEMPERATURE)]
     return frame_ids(bag.joined(raws, topic, 0, _TEMPERATURE_DOUBLES))[0] if raws else ''
 

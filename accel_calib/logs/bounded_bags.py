@@ -95,12 +95,7 @@ def largest(compressed: int, always: int = _ALWAYS) -> int:
 
 
 def decompressed(make: Callable[[], Any], data: bytes, stated: int | None = None) -> bytes:
-    """
-    Return the data of one or more compressed frames; `make` is the class of the decompressor.
-
-    Data that are larger than stated [bytes] or than `largest`, or end early, are a ValueError.
-
-    """
+    """Return decompressed frames; ValueError if cut, or over `stated` or `largest` [bytes]."""
     size = len(data)
     _check_size(stated or 0, size)
     left = largest(size) if stated is None else stated
@@ -134,15 +129,11 @@ class _File(io.BufferedReader):
         self._size = path.stat().st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return at most so many bytes."""
         return super().read(size if size is None else min(size, self._size))
 
 
 class _BoundedPath(PosixPath):
-    """A path whose file is a `_File`."""
-
     def open(self, *_: Any, **__: Any) -> Any:  # noqa: A003
-        """Open the file for reading bytes."""
         return _File(Path(self))
 
 
@@ -175,8 +166,6 @@ class Reader1(rosbag1.Reader):
 
 
 class _Mcap(storage_mcap.McapReader):
-    """Reader of MCAP files."""
-
     def __init__(self, path: Any) -> None:
         super().__init__(_BoundedPath(path))
         # `rosbags` looks its decompressors up in this table, also when it scans a file to open it.
@@ -184,7 +173,6 @@ class _Mcap(storage_mcap.McapReader):
                                           zstd=partial(decompressed, zstd.ZstdDecompressor))
 
     def open(self) -> None:  # noqa: A003
-        """Open the file, and check the sizes that its index states."""
         super().open()
         with ExitStack() as stack:
             stack.callback(self.close)
@@ -221,8 +209,6 @@ def _check_together(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:
 
 
 class _Sqlite(Sqlite3Reader):
-    """Reader of db3 files."""
-
     def open(self) -> None:  # noqa: A003
         """Open the file, and check that it consists of plain tables."""
         self._size = self.path.stat().st_size
@@ -290,14 +276,11 @@ def _stored_size(row: Iterable[Any]) -> int:
 
 
 class _Folder(rosbag2_reader.DirectoryReader):
-    """Reader of rosbag2 folders."""
-
     STORAGE_PLUGINS = {'mcap': _Mcap, 'sqlite3': _Sqlite}  # noqa: RUF012
     by_message = False
     """Whether each message is compressed."""
 
     def open(self) -> None:  # noqa: A003
-        """Check the files of the folder, and open them."""
         folder = Path(str(self.path))
         words = _checked_metadata(folder / 'metadata.yaml')
         for each in sorted(folder / name for name in {Path(word).name for word in words} if name):
@@ -312,7 +295,6 @@ class _Folder(rosbag2_reader.DirectoryReader):
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
                  stop: int | None = None) -> _Messages:
-        """Yield the messages, decompressed."""
         for connection, stamp, data in super().messages(connections, start, stop):
             yield connection, stamp, (decompressed(zstd.ZstdDecompressor, data)
                                       if self.by_message else data)
@@ -346,12 +328,7 @@ def _check_compressed(path: Path) -> None:
 
 
 def _checked_metadata(path: Path) -> set[str]:
-    """
-    Return the words in metadata.yaml, which `rosbags` parses recursively.
-
-    A file that is too large, also with its aliases replaced, or nested too deep is a ValueError.
-
-    """
+    """Return the words of metadata.yaml; ValueError if too large or deep to parse recursively."""
     check_regular(path)
     if path.stat().st_size > _LARGEST_METADATA:
         raise ValueError(f'{path.name} has more than {_LARGEST_METADATA} bytes')
@@ -427,7 +404,6 @@ def _needs_copy(path: Path) -> bool:
 
 
 def _recovered(stored: Sequence[Path]) -> list[str]:
-    """Return a note about the journals of these files."""
     names = [each.name for path in stored for each in _journals(path)]
     return [f'the recorder was killed; its last messages are read from {", ".join(names)}'
             ] if names else []

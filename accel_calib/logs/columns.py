@@ -149,8 +149,7 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     """
     Return the columns of a log that are used.
 
-    If there is no accelerometer, or there are several, or a given column is not there, that is an
-    InputError.
+    Raise InputError if there is not exactly one accelerometer, or a given column is not there.
 
     """
     header, maker = layout.header, None

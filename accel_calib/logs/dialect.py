@@ -100,20 +100,11 @@ class Layout:
     """
     Where the table of a text file begins, and how its cells are parted.
 
-    Parameters
-    ----------
-    decimal : {'.', ',', ''}
-        Decimal mark; empty if the first rows have whole numbers only.
-    header, units_row : tuple of str
-        Names of the columns, and cells of a row of units below them; empty if there are none.
-    width, start : int
-        Number of cells in a row, and of lines before the first row.
-    about : mapping
-        Units and sensor from the comments.
-    notes : tuple of str
-        What was skipped before the table.
-    sample : tuple of tuple of str
-        Cells of the first rows.
+    `decimal` is the decimal mark, empty if the first rows have whole numbers only. `header` are
+    the names of the columns, and `units_row` the cells of a row of units below them; both are
+    empty if there are none. `width` is the number of cells in a row, and `start` that of lines
+    before the first row. `about` has units and sensor from the comments, `notes` what was skipped
+    before the table, and `sample` the cells of the first rows.
 
     """
 
@@ -174,12 +165,7 @@ def has_date(text: str) -> bool:
 
 
 def seconds_of(texts: Sequence[str], path: Path, rows: Sequence[int]) -> Floats:
-    """
-    Return the seconds since 1970 of dates, or since midnight of times of the day.
-
-    File and rows are for the InputError for a text that is no date or time.
-
-    """
+    """Return the seconds of dates since 1970, or of times since midnight; else InputError."""
     seconds = [_seconds(text) for text in texts]
     if None in seconds:
         k = seconds.index(None)
@@ -242,20 +228,11 @@ def shown(names: Sequence[str]) -> str:
 def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str, *,
               strict: bool, expected: str) -> Layout:
     """
-    Return where a table begins, and how its cells are parted; an InputError if there is no table.
+    Return where a table begins, and how its cells are parted; raise InputError without a table.
 
-    Parameters
-    ----------
-    path, encoding
-        The file, and its encoding.
-    head : sequence of str
-        The first lines.
-    is_header : function
-        Returns whether cells are the names of the columns of a log.
-    strict : bool
-        Whether the first line must be the header; otherwise other lines may come before it.
-    expected : str
-        Example of a header line, for error messages.
+    `head` are the first lines, and `is_header` returns whether cells are the names of columns of a
+    log. If `strict`, the first line must be the header; otherwise other lines may come before it.
+    `expected` is an example of a header line for error messages.
 
     """
     _check_text(path, head, expected)
@@ -308,7 +285,6 @@ class _Finder:
         self.monitor = timed > len(self.plain) / 2
 
     def strict(self) -> _Found:
-        """Return the names in the first line."""
         first = next(k for k in self.filled if self.head[k][0] != '#')
         fitting = [each for each in DELIMITERS if self.is_header(split(self.head[first], each))]
         delimiter = fitting[0] if fitting else ','
@@ -397,7 +373,6 @@ class _Finder:
 
 
 def _are_names(cells: Sequence[str]) -> bool:
-    """Return whether cells can be names: three or more, and no numbers."""
     return len(cells) >= 3 and not any(map(_LIKE_NUMBER.fullmatch, cells))
 
 
@@ -435,7 +410,6 @@ def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
 
 
 def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
-    """Return units and sensor from the comments."""
     about = {}
     for line in comments:
         name, colon, text = line[1:].partition(':')

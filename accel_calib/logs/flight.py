@@ -149,19 +149,11 @@ class Choice:
 def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
            source: str) -> Choice:
     """
-    Choose the message to read; an InputError if there is no such message.
+    Return the message to read, from those `found`; raise InputError if there is none.
 
-    Parameters
-    ----------
-    found, preferred
-        As in `Choice`.
-    topic : str
-        Name of the message that the user names; empty: by preference.
-    sensor : str
-        Number of the sensor, alone or after the name of its message. Other texts are a name for
-        the sensor, and do not choose.
-    source : str
-        Name of the log in error messages.
+    `topic` is the name of the message; empty: the first of `preferred` that is dense. `sensor` is
+    the number of the sensor, alone or after the name of its message; any other text is a name for
+    the sensor, and does not choose.
 
     """
     usable = [message for message in found if message.name in preferred and len(message.time)]
@@ -276,7 +268,6 @@ class _WholeReads(io.BufferedReader):
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes: at the end of the file fewer than `size`."""
         data = super().read(size)
         if size is not None and 0 < len(data) < size:
             self.seek(size - len(data), io.SEEK_CUR)
@@ -297,14 +288,8 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     Read the accelerations of one sensor of a PX4 log.
 
     By default the message is the first of `PREFERRED` that is dense enough, and the sensor the
-    lowest number. Another text for the sensor is a name.
-
-    Raises
-    ------
-    InputError
-        If pyulog is not installed, the file is damaged, or it has no such message.
-    OSError
-        If the file cannot be read.
+    lowest number. Another text for the sensor is a name. Raise InputError if pyulog is not
+    installed, or the file is damaged or has no such message.
 
     """
     found, notes = _messages(path)

@@ -257,13 +257,7 @@ def recognise(header: Sequence[str]) -> LogFormat | None:
 
 
 def named(name: str, header: Sequence[str], source: str) -> LogFormat:
-    """
-    Return the layout of a maker that a header has; `name` is one of `NAMES`.
-
-    A name that is not known, or a header with none of the layouts, is an InputError; `source`
-    names the file there.
-
-    """
+    """Return the layout of a maker, one of `NAMES`, that a header has; InputError if none."""
     layouts = [each for each in FORMATS if each.name == name]
     if not layouts:
         close = get_close_matches(name, NAMES, 1)
@@ -281,7 +275,6 @@ def named(name: str, header: Sequence[str], source: str) -> LogFormat:
 
 
 def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
-    """Return the layout with most names."""
     found = max(fitting, key=lambda each: len(each.needed))
     # Logs of ArduPilot before version 4.1 have no column with the number of the sensor.
     there = folded(found.instance) in {folded(name) for name in header}
@@ -315,5 +308,4 @@ def record_instead(header: Sequence[str], path: Path) -> str:
 
 
 def _is_named(path: Path, names: Sequence[str]) -> bool:
-    """Return whether a file has one of these names, case and spaces aside."""
     return folded(path.name).replace(' ', '') in {folded(each).replace(' ', '') for each in names}

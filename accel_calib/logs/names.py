@@ -117,16 +117,9 @@ class Meaning:
     """
     What a name means.
 
-    Parameters
-    ----------
-    quantity, unit : str
-        Key of `WORDS`, and text of the unit; empty if the name does not state it.
-    axis : int or None
-        Number of the axis, 0 to 2 (or 1 to 3 where a log counts so).
-    group : tuple of str
-        The other words.
-    free : bool
-        Whether the name says that there is no gravity in it.
+    `quantity` is a key of `WORDS`, and `unit` the text of the unit; both are empty if the name
+    does not state them. `axis` is 0 to 2 (or 1 to 3 where a log counts so), `group` are the other
+    words, and `free` is whether the name says that gravity is not in the values.
 
     """
 

@@ -180,18 +180,9 @@ class Quantities:
     """
     The conversion of the columns of a log; `decided` makes it.
 
-    Parameters
-    ----------
-    chosen : Chosen
-        The columns.
-    units : Units
-        Unit of the readings.
-    scales : mapping of str to (float, float)
-        Factor to our unit, and our value at 0.
-    instance : float or None
-        Number of the sensor whose rows are read, where rows of several alternate.
-    said, notes : list of str
-        What is assumed, and what is not used.
+    `scales` are the factor to our unit and our value at 0, by column. `instance` is the number of
+    the sensor whose rows are read, where rows of several alternate. `said` is what is assumed, and
+    `notes` what is not used.
 
     """
 
@@ -257,7 +248,6 @@ class Quantities:
 
 
 def _of_instance(columns: Chosen, cells: Cells, instance: float) -> Cells:
-    """Return the rows of one sensor."""
     which = columns.numbers(cells, 'instance') == instance
     texts = [[text for text, own in zip(part, which) if own] for part in cells.texts]
     return Cells(cells.numbers[which], texts, cells.row[which])
@@ -284,7 +274,6 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
 
 
 def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
-    """Return the number of the sensor to read."""
     there = np.unique(columns.numbers(first, 'instance')).tolist()
     words = ', '.join(f'{each:g}' for each in there)
     if options.sensor:

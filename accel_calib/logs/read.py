@@ -38,9 +38,9 @@ Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
 @dataclass(frozen=True)
 class Log:
     """
-    A log: its rows, with time in s and angular rate in rad/s, and the unit of the readings.
+    A log: rows with time in s and angular rate in rad/s, the unit of the readings, and notes.
 
-    `read_as` is how it was read, in one line, empty if nothing was assumed; notes state what was
+    `read_as` is how it was read, in one line, empty if nothing was assumed; `notes` state what was
     left out.
 
     """
@@ -145,7 +145,6 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
 
 
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
-    """Return an open bag as a log."""
     topic = bag.imu_topic(options.topic)
     sensor = options.sensor or bag.first_frame_id(topic)
     context = context_of(bag, topic, sensor, options.temperature_topic, options.supply_topic)
@@ -159,7 +158,6 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
-    """Return a flight log that is read."""
     recording = log.recording(str(path))
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
@@ -178,7 +176,6 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
 
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
-    """Return an open text log."""
     columns = chosen(text.layout, options)
     text.choose(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
     cells = text.blocks()
@@ -266,8 +263,6 @@ class LineReader:
         The first complete lines; `first` are their samples.
     seconds : float
         Time in which they arrived, for lines without times [s].
-    options : LogOptions
-        How to read the lines; by default it is recognised.
 
     Raises
     ------
@@ -318,5 +313,4 @@ class LineReader:
 
 
 def _ended(lines: Sequence[str]) -> list[str]:
-    """Return lines with their ends, as in a file."""
     return [f'{line}\n' for line in lines]

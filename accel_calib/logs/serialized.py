@@ -154,18 +154,8 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     """
     Copy messages into one writable buffer.
 
-    Parameters
-    ----------
-    raws : sequence of bytes
-        One message or more, of a type with a header and this number of doubles.
-    doubles : int
-        Number of doubles.
-    name : str
-        Name of the topic, for error messages.
-    ros2 : bool
-        Whether the messages are CDR; otherwise they have the serialization of ROS 1.
-    before : int
-        Number of earlier messages of the topic, for error messages.
+    The messages have a header and this number of doubles, in CDR, or as in ROS 1 if not `ros2`.
+    For errors, `name` is the topic, and `before` the number of its earlier messages.
 
     Raises
     ------

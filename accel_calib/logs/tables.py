@@ -73,13 +73,8 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
     """
     Write poses or samples block by block, and return the number of rows.
 
-    The memory needed is that of one block. The tables have the same columns, units and sensor.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. An earlier file is then unchanged, as after an error of the
-        iterable.
+    The memory needed is that of one block. The tables have the same columns, units and sensor. If
+    the file cannot be written (OSError), or the iterable fails, an earlier file is unchanged.
 
     """
     rows = 0

@@ -136,12 +136,7 @@ class TextTable:
 
     def choose(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
                *, skip_bad: bool = False) -> None:
-        """
-        Set which columns are read: of numbers, of text, and those of text that must be dates.
-
-        A row that cannot be read is skipped if `skip_bad`; otherwise it is an error.
-
-        """
+        """Set the columns of numbers, text and dates to read; bad rows raise unless `skip_bad`."""
         self._numeric, self._text, self._dates = tuple(numeric), tuple(text), tuple(dates)
         self._skip_bad = skip_bad
 
@@ -155,16 +150,7 @@ class TextTable:
         return (*notes, self._cut) if self._cut else tuple(notes)
 
     def blocks(self) -> Iterator[Cells]:
-        """
-        Yield the rows, in blocks.
-
-        Raises
-        ------
-        InputError
-            If there is no row, or a row has a wrong number of cells, or a cell is no number or no
-            date.
-
-        """
+        """Yield blocks of rows; InputError without rows, or for a bad cell or number of cells."""
         found = 0
         lines = list(islice(self._lines, ROWS))
         while lines:
@@ -287,13 +273,11 @@ class TextTable:
         return good
 
     def _error(self, words: str) -> InputError:
-        """Return the error for a bad row."""
         mark = ',' if words.startswith('line') else ':'
         return InputError(f'{self.layout.path}{mark} {words}', 'correct the row or remove it'
                           + ('' if self.strict else ', or add --skip-bad'))
 
     def _fault(self, line: str) -> str | None:
-        """Return what is wrong with a row, or None."""
         layout = self.layout
         cells = layout.dialect.cells(line)
         if len(cells) != layout.width:

@@ -182,12 +182,7 @@ class Guide:
 
     @property
     def plan(self) -> Plan | None:
-        """
-        Return the next pose; None before the first choice.
-
-        While poses of a refinement are followed, it is the next of them.
-
-        """
+        """Return the next pose, or that of a followed refinement; None before the first choice."""
         if self._plan is None or not self._planned:
             return self._plan
         return replace(self._plan, asked=_as_asked(self._planned, self._plan))
@@ -231,16 +226,9 @@ class Guide:
 
     def line(self, poses: Poses, units: Units, *, added: bool) -> str:
         """
-        Return the line about a captured pose; empty if there is nothing new to report.
+        Return the line about the latest pose; empty if there is nothing new to report.
 
-        Parameters
-        ----------
-        poses : Poses
-            The poses; the captured one is the latest.
-        units : Units
-            Unit of the readings.
-        added : bool
-            Whether the number of poses has increased; otherwise the rest repeats a pose.
+        `added`: the number of poses has increased; otherwise the rest repeats a pose.
 
         """
         if self.plan is None:

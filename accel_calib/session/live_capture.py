@@ -237,14 +237,9 @@ class LiveCapture:
 
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
-        Add samples, and yield the changes, each before the next samples are added.
+        Add (n, 9) samples as in `StillDetector.push`; yield each change before the next samples.
 
-        Parameters
-        ----------
-        samples : (n, 9) array
-            As in `StillDetector.push`.
-        capture : bool
-            Whether every rest becomes a pose.
+        `capture`: every rest becomes a pose.
 
         """
         for piece in _pieces(samples):
@@ -312,7 +307,6 @@ class LiveCapture:
         return self.book.holds(dwell) or (capture and not declined)
 
     def _end(self, ended: list[Dwell], capture: bool) -> Change:
-        """Add rests that ended."""
         captured = [dwell for dwell in ended if self._is_captured(dwell, capture)]
         for dwell in captured:
             self.book.end(dwell)
@@ -346,7 +340,6 @@ class LiveCapture:
 
 
 def _pieces(samples: Floats) -> list[Floats]:
-    """Split samples into pieces of at most `_PIECE`."""
     times = samples[:, 0]
     if 0.0 <= times[-1] - times[0] < _PIECE:
         return [samples]

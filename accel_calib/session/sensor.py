@@ -197,7 +197,6 @@ class Sensor:
         self._compare(least)
 
     def _compare(self, least: float) -> None:
-        """Update the drift with the ongoing rest."""
         part = None if self.rest is None else self._uncounted(self.rest)
         self.drift = self._past if part is None else self._with(part, least)
 
@@ -315,7 +314,6 @@ def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
 
 
 def _only_levelled(before: Calibration | None, after: Calibration | None) -> bool:
-    """Return whether two calibrations differ only in the mounting."""
     return (before is not None and after is not None
             and before.model.effects == after.model.effects
             and np.array_equal(before.model.vector, after.model.vector)

@@ -133,12 +133,7 @@ class SensorFiles:
 
 @dataclass(frozen=True)
 class Loaded:
-    """
-    The content of a store: what is usable of it, and notes for the user.
-
-    `problem` is why the calibration cannot be used, or empty.
-
-    """
+    """What is usable of a store, notes, and `problem`: why the calibration cannot be used."""
 
     calibration: Calibration | None
     poses: Poses | None
@@ -190,7 +185,6 @@ def _words(error: Exception) -> str:
 
 
 def _renamed(path: Path) -> str:
-    """Rename a file that cannot be used, and return a text about it."""
     try:
         return f'kept as {aside(path, "damaged")}'
     except OSError as error:

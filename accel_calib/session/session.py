@@ -219,7 +219,6 @@ class Session:
             self._events.append(Still(self.still))
 
     def _process(self, change: Change) -> None:
-        """Update the drift monitor and the poses."""
         sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
         before = sensor.has_changed
         if change.rest is not None:
@@ -294,7 +293,6 @@ class Session:
         return ''
 
     def _adopt_loaded(self, loaded: Loaded) -> None:
-        """Use the stored poses and calibration."""
         self.sensor.owners = {each.sensor for each in (loaded.calibration, loaded.poses)
                               if each is not None and each.sensor}
         if loaded.poses is not None:

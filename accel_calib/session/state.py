@@ -39,17 +39,7 @@ _NOT_KNOWN: Newest = (), math.nan, math.nan
 
 
 def progress(session: Session, reading: Triple | None = None) -> Progress:
-    """
-    Return the progress of the calibration.
-
-    Parameters
-    ----------
-    session : Session
-        The session.
-    reading : (float, float, float), optional
-        The newest reading; by default the last one that was pushed.
-
-    """
+    """Return the progress; `reading` is the newest one, by default the last that was pushed."""
     sensor, statistics = session.sensor, session.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
     up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
@@ -67,13 +57,7 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
 
 
 def _newest(session: Session, reading: Triple | None) -> Newest:
-    """
-    Describe the newest reading; the parameter is as in `progress`.
-
-    Native readings have a direction only if their zero is known: from a calibration, or about from
-    the poses so far.
-
-    """
+    """Describe the newest reading; a native one has a direction only if its zero is known."""
     sensor, newest = session.sensor, session.statistics.newest
     if reading is None:
         if newest is None:
@@ -228,7 +212,6 @@ def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
 
 
 def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
-    """Yield the mounting, the bias of the gyro, and the noise."""
     calibration, gyro, noise = (
         session.sensor.calibration, session.sensor.gyro, session.sensor.noise)
     yield 'mounting', 'not known' if calibration is None or not calibration.is_levelled else (

@@ -72,10 +72,9 @@ def here(function: Callable[..., Found], *given: object) -> Found:
 @dataclass(frozen=True)
 class Identity:
     """
-    The identity of a sensor, which determines its files.
+    The identity of a sensor: its topic with namespace and frame_id, or the name set by the user.
 
-    `sensor` is the frame_id of the messages, or the name set by the user (`named`). The topic,
-    with namespace, is then ignored.
+    `named`: `sensor` is that name, and the topic is ignored.
 
     """
 

@@ -202,7 +202,6 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
 
 
 def _dropped(statistics: StreamStatistics) -> dict[str, str]:
-    """Return which messages were dropped lately, and what to do."""
     if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
         return {}
     words = {'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
