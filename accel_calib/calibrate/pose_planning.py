@@ -174,15 +174,26 @@ def _is_poor(name: str, information: Floats) -> bool:
 
 def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
     """Return the untaken attitude that increases det M most, or None if all are taken."""
-    up = ATTITUDES[:6] if name == ORIENTED else ATTITUDES
+    up = _attitudes(name)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
     if not np.any(free):
         return None
-    rows = rows_of(name, up)
+    rows = _attitude_rows(name)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
     found: Floats = up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
     return found
+
+
+def _attitudes(name: str) -> Floats:
+    """Return the attitudes that a person can set by eye for a model, (n, 3) unit vectors."""
+    return ATTITUDES[:6] if name == ORIENTED else ATTITUDES
+
+
+@lru_cache(maxsize=8)
+def _attitude_rows(name: str) -> Floats:
+    """Return the rows of a pose in each of the attitudes."""
+    return rows_of(name, _attitudes(name))
 
 
 def _error(name: str, information: Floats, count: int) -> float:

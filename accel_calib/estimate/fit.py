@@ -122,7 +122,7 @@ class Fit:
         """Whether the noise of the poses was measured."""
         return self.equations.noise_known
 
-    @property
+    @cached_property
     def dof(self) -> int:
         """Return the number of independent equations minus that of free, determined values."""
         if self.prior is None:
@@ -135,12 +135,12 @@ class Fit:
         """Sum of the squared residuals in units of the noise."""
         return float(self.residual @ self.residual)
 
-    @property
+    @cached_property
     def variance(self) -> float:
         """Variance of a residual in units of the noise, moderated towards 1."""
         return (belief_in(self.noise_known) + self.chi2) / self.variance_dof
 
-    @property
+    @cached_property
     def variance_dof(self) -> float:
         """Degrees of freedom of `variance`."""
         return belief_in(self.noise_known) + self.dof
