@@ -150,11 +150,12 @@ def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
     guide = Guide()
     guide_at(guide, [(0, 0, -1)])
     guide.follow([planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
-    assert guide.advice == ('hold the top side up (+z), to separate cubic from odd_quadratic')
+    assert guide.action.words == (
+        'hold the top side up (+z), to separate cubic from odd_quadratic')
     guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
-    assert guide.advice.startswith('hold the left side up (+y) at 40 °C')
+    assert guide.action.words.startswith('hold the left side up (+y) at 40 °C')
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
     guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
-    assert guide.advice == 'all poses of the plan are taken; call ~/refine'
+    assert guide.action.words == 'all poses of the plan are taken; call ~/refine'
     guide_at(guide, [])
-    assert guide.advice == 'turn the sensor, or call ~/fit'
+    assert guide.action.words == 'turn the sensor, or call ~/fit'

@@ -128,7 +128,7 @@ def process() -> Iterator[WorkerProcess]:
 def test_worker_process_computes_what_this_process_computes(
         process: WorkerProcess, stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
-    given = calibration.poses, calibration.units, CalibratorSettings(model='10'), '', None, {}
+    given = calibration.poses, calibration.units, CalibratorSettings(model='10'), '', None
     found, here = process.call(fitted, *given), fitted(*given)
     np.testing.assert_array_equal(found.model.vector, here.model.vector)
     np.testing.assert_array_equal(found.covariance, here.covariance)
@@ -149,9 +149,9 @@ def test_errors_in_the_worker_process_are_raised_here(
     calibration = read_calibration(stored())
     few = calibration.poses.take(slice(0, 2)), calibration.units, CalibratorSettings(model='10')
     with pytest.raises(RefusedFitError) as here:
-        fitted(*few, '', None, {})
+        fitted(*few, '', None)
     with pytest.raises(RefusedFitError) as there:
-        process.call(fitted, *few, '', None, {})
+        process.call(fitted, *few, '', None)
     assert str(there.value) == str(here.value)
     with pytest.raises(ValueError, match='math domain'):
         process.call(math.sqrt, -1.0)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import replace
 import errno
 from pathlib import Path
@@ -15,13 +15,15 @@ from typing import Any
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, checks, Level, Log, Session, state, Task
+from accel_calib.session import Level, state
 from accel_calib.stored import read_calibration, write_calibration
+from driven import Driver, RATE
 from inside import (
     Identity,
     LARGEST_NUMBER_OF_STEPS,
     load_store,
     Model,
+    next_action,
     rotation_from_rpy,
     SensorStore,
     spread_directions,
@@ -31,62 +33,15 @@ from inside import (
 )
 import numpy as np
 import pytest
-from shared import answer_of, with_effects
+from shared import with_effects
 
 GRAVITY = 9.80665
-RATE = 50.0
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 
 pytestmark = pytest.mark.usefixtures('home')
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
-
-
-class Driver:
-    """A session whose jobs are done at once, with its own clock and a stored log."""
-
-    def __init__(self, topic: str = '/imu/data_raw', **parameters: Any) -> None:
-        self.now = 0.0
-        self.stamp = 1000.0
-        self.log: list[Log] = []
-        self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
-        self.handle()
-
-    def handle(self) -> None:
-        for event in self.session.events():
-            if isinstance(event, Generator):
-                words = self.done(event)
-                self.log += [Log('info', words)] if words else []
-            elif isinstance(event, Log):
-                self.log.append(event)
-
-    def done(self, task: Task) -> str:
-        """Return the answer of a command."""
-        answer: str = answer_of(task)
-        self.handle()
-        return answer
-
-    def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
-        """Push readings [m/s²], and return the number of accepted messages."""
-        accepted = 0
-        for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
-            self.now += len(block) / RATE
-            if self.session.accepts(frame_id):
-                rows = np.full((len(block), 9), np.nan)
-                rows[:, 0] = self.stamp + np.arange(len(block)) / RATE
-                rows[:, 1:4], rows[:, 7] = block, temperature
-                self.session.push(rows, self.now)
-                accepted += len(block)
-            self.stamp += len(block) / RATE
-            self.handle()
-        return accepted
-
-    def logged(self, severity: str = 'error') -> str:
-        return '\n'.join(line.words for line in self.log if line.severity == severity)
-
-    def finding(self, name: str) -> Any:
-        return next(each for each in checks(self.session) if each.name == name)
 
 
 @pytest.mark.parametrize(('one', 'other'), [
@@ -422,21 +377,19 @@ def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
 def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(5)))
-    before = driver.session.sensor.advice
+    before = next_action(driver.session)
     driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
-    assert driver.session.sensor.advice == before
+    assert next_action(driver.session) == before
     assert driver.logged('info').count('this rest repeats an earlier pose') == 1
 
 
 def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
     driver = Driver()
-    for count, direction in enumerate(spread_directions(12), 1):
+    for direction in spread_directions(12):
         driver.feed(readings([direction]))
-        if 'call ~/fit' not in driver.session.sensor.advice:
-            assert count < 12
-            continue
-        assert driver.done(driver.session.commands.fit())
-    assert driver.session.sensor.advice == 'the calibration uses these poses'
+        if next_action(driver.session).command == 'fit':
+            assert driver.done(driver.session.commands.fit())
+    assert next_action(driver.session).kind == 'level'
 
 
 def test_findings_are_logged_by_their_level(stored: Stored) -> None:

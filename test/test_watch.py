@@ -18,7 +18,7 @@ from typing import Any
 from accel_calib.calibrate import next_pose
 from accel_calib.errors import InputError
 from accel_calib.session import Progress
-from inside import changes, COMMAND, next_action, screen, state, unit, words_of
+from inside import changes, COMMAND, Guide, Plan, screen, state, unit, words_of
 import numpy as np
 import pytest
 from rich.console import Console
@@ -34,10 +34,14 @@ def guided() -> Iterator[Progress]:
     while True:
         asked = next_pose(directions, noise_g=NOISE_G)
         up = () if asked.direction is None else tuple(asked.direction.tolist())
+        guide = Guide()
+        guide.plan = Plan(asked, len(directions), directions, NOISE_G, len(directions) / 20)
+        action = guide.action
+        assert action is not None
         yield Progress(
             still=True, stillness=0.5, dwell=0.6, min_dwell=1.0, poses=len(directions),
             total=asked.total, coverage=len(directions) / 20, accuracy=asked.error * NOISE_G,
-            advice=next_action(asked), direction=up)
+            step=action.kind, advice=action.words, command=action.command, direction=up)
         if asked.direction is None:
             return
         directions = np.vstack([directions, asked.direction])
@@ -45,7 +49,7 @@ def guided() -> Iterator[Progress]:
 
 STEPS = list(guided())
 START, MIDDLE, ENOUGH = STEPS[0], STEPS[7], STEPS[-1]
-FITTED = replace(MIDDLE, advice='the calibration uses these poses')
+FITTED = replace(MIDDLE, step='done', advice='use the calibration', command='', direction=())
 
 
 def drawn(view: Any, width: int = 80, height: int = 24, encoding: str = 'utf-8') -> str:
@@ -62,7 +66,7 @@ def row(shown: str, label: str) -> str:
 
 
 @pytest.mark.parametrize('progress', [*STEPS, FITTED, replace(
-    START, still=False, stillness=math.nan, accuracy=math.nan, advice=''), replace(
+    START, still=False, stillness=math.nan, accuracy=math.nan, step='', advice=''), replace(
     START, up=(0.6, 0.0, 0.8), length=1.0213, corrected=1.0002, temperature=-3.5)])
 def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
     figures = dict(progress.figures())
@@ -73,8 +77,10 @@ def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
     assert found.accuracy == pytest.approx(progress.accuracy, rel=0.01, nan_ok=True)
     assert (found.length, found.corrected, found.temperature) == pytest.approx(
         (progress.length, progress.corrected, progress.temperature), nan_ok=True)
-    assert (found.still, found.poses, found.total, found.advice) == (
-        progress.still, progress.poses, progress.total, progress.advice)
+    assert (found.still, found.poses, found.total) == (
+        progress.still, progress.poses, progress.total)
+    assert (found.step, found.advice, found.command) == (
+        progress.step, progress.advice, progress.command)
 
 
 @pytest.mark.parametrize(('name', 'text', 'words'), [
@@ -141,6 +147,16 @@ def test_end_of_the_poses_is_clear() -> None:
     assert 'more poses no longer help' in line
     assert line.endswith(f'~/fit: ros2 service call {NODE}/fit std_srvs/srv/Trigger')
     assert list(state(NODE, ENOUGH))[-1] == f'ros2 service call {NODE}/fit std_srvs/srv/Trigger'
+
+
+@pytest.mark.parametrize(('step', 'words'), [
+    ('refine', 'CALL REFINE'), ('level', 'SET LEVEL'), ('accept', 'ACCEPT'), ('done', 'DONE')])
+def test_every_step_that_is_no_pose_is_shown_in_large_words(step: str, words: str) -> None:
+    shown = drawn(screen(NODE, replace(FITTED, step=step)), height=14)
+    assert f'│ {words} ' in shown
+    large = drawn(screen(NODE, replace(FITTED, step=step)))
+    assert words not in large
+    assert '██' in large or '▀' in large
 
 
 def test_missing_ros_is_one_line(tmp_path: Path) -> None:

@@ -53,13 +53,23 @@ _OTHER_ROWS = 16
 
 _LETTERS = {
     'A': '.#. #.# ### #.# #.#', 'B': '##. #.# ##. #.# ##.', 'C': '### #.. #.. #.. ###',
+    'D': '##. #.# #.# #.# ##.',
     'E': '### #.. ##. #.. ###', 'F': '### #.. ##. #.. #..', 'G': '### #.. #.# #.# ###',
     'H': '#.# #.# ### #.# #.#', 'I': '# # # # #', 'K': '#.# #.# ##. #.# #.#',
     'L': '#.. #.. #.. #.. ###', 'M': '#...# ##.## #.#.# #...# #...#',
     'N': '#..# ##.# #.## #..# #..#', 'O': '### #.# #.# #.# ###', 'P': '### #.# ### #.. #..',
-    'R': '##. #.# ##. #.# #.#', 'T': '### .#. .#. .#. .#.', ' ': '. . . . .',
+    'R': '##. #.# ##. #.# #.#', 'S': '### #.. ### ..# ###', 'T': '### .#. .#. .#. .#.',
+    'V': '#.# #.# #.# #.# .#.', ' ': '. . . . .',
 }
 """Rows of pixels of each letter, from the top."""
+
+
+_CALLS = {'fit': 'CALL FIT', 'refine': 'CALL REFINE', 'level': 'SET LEVEL', 'accept': 'ACCEPT',
+          'save': 'SAVE', 'done': 'DONE'}
+"""Large words for each kind of step that is not a pose."""
+
+_SAME = math.cos(math.radians(10.0))
+"""A direction within 10° of a side, an edge or a corner is named after it."""
 
 
 class _Row(NamedTuple):
@@ -182,14 +192,14 @@ def screen(node: str, progress: Progress | None, problem: str = '') -> Renderabl
 
 
 def state(node: str, progress: Progress) -> Iterator[str]:
-    """Yield the lines of a progress: its rows, the next pose, and the call of ~/fit."""
+    """Yield the lines of a progress: its rows, the next step, and the call of its service."""
     for row in _rows(progress):
         yield f'{row.label}: {row.words}'
     yield f'next: {progress.advice or "wait"}'
     if _sides(progress):
         yield _direction(progress)
-    if _is_enough(progress):
-        yield fit_call(node)
+    if progress.command:
+        yield service_call(node, progress.command)
 
 
 def captured(before: Progress | None, now: Progress) -> bool:
@@ -202,14 +212,21 @@ def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
     if before is None or (before.poses, before.advice) != (now.poses, now.advice):
         what = 'captured pose' if captured(before, now) else 'poses:'
         yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
-               f'next: {now.advice or "wait"}{f": {fit_call(node)}" if _is_enough(now) else ""}')
+               f'next: {now.advice or "wait"}{_end(node, now)}')
     if before is None or before.still != now.still:
         yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
 
 
-def fit_call(node: str) -> str:
-    """Return the command that calls ~/fit."""
-    return f'ros2 service call {node}/fit std_srvs/srv/Trigger'
+def _end(node: str, progress: Progress) -> str:
+    """Return the end of a line with the call of a service, unless a pose comes first."""
+    if progress.step == 'poses' or not progress.command:
+        return ''
+    return f': {service_call(node, progress.command)}'
+
+
+def service_call(node: str, name: str) -> str:
+    """Return the command that calls a service of a node."""
+    return f'ros2 service call {node}/{name} std_srvs/srv/Trigger'
 
 
 def _rows(progress: Progress) -> list[_Row]:
@@ -259,11 +276,6 @@ def _length(progress: Progress) -> str:
     return f'{raw}corrected {progress.corrected:.4f} g'
 
 
-def _is_enough(progress: Progress) -> bool:
-    """Return whether more poses no longer help, and the fit is not made yet."""
-    return not progress.direction and '~/fit' in progress.advice
-
-
 def _direction(progress: Progress) -> str:
     return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
 
@@ -271,24 +283,25 @@ def _direction(progress: Progress) -> str:
 def _next(node: str, progress: Progress) -> Iterator[RenderableType]:
     """Yield the next action, in large words if it is a pose or the fit."""
     sides = _sides(progress)
-    if _is_enough(progress):
-        yield from (_Large('CALL FIT', f'bold {GOOD}'), '')
+    if progress.step in _CALLS:
+        yield from (_Large(_CALLS[progress.step], f'bold {GOOD}'), '')
     elif sides:
         yield from (_Large(sides, NEXT), '')
     yield Text(progress.advice or 'wait', style='bold')
     if sides:
         yield Text(_direction(progress), style='dim')
-    if '~/fit' in progress.advice:
-        yield Text(fit_call(node), style='dim')
+    if progress.command:
+        yield Text(service_call(node, progress.command), style='dim')
 
 
 def _sides(progress: Progress) -> str:
-    """Return the sides to point up, such as ``FRONT LEFT``; empty if the advice is another."""
+    """Return the sides to point up, such as ``FRONT LEFT``; empty for another direction."""
     if not progress.direction:
         return ''
-    words = words_of(np.sign(np.round(np.array(progress.direction), 1)))
-    sides = words.removeprefix('the ').rsplit(' ', 1)[0]
-    return sides.upper() if words in progress.advice else ''
+    signs = np.sign(np.round(np.array(progress.direction), 1))
+    if signs @ progress.direction < _SAME * np.linalg.norm(signs):
+        return ''
+    return words_of(signs).removeprefix('the ').rsplit(' ', 1)[0].upper()
 
 
 def _table(rows: Iterable[_Row]) -> Table:

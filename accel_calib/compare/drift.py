@@ -225,6 +225,18 @@ class Drift:
         return self.count - self.since + 1 if self.since else 0
 
     @property
+    def remedy(self) -> tuple[str, str]:
+        """Return what to do after a change, and the service with which it begins."""
+        if self.temperatures:
+            low, high = self.temperatures
+            now = self.temperature
+            if now < low - _WARMER or now > high + _WARMER:
+                return (f'the temperature is {now:.1f} °C, but the sensor was calibrated at '
+                        f'{low:.1f} to {high:.1f} °C: capture poses at this temperature and call '
+                        '~/refine', 'refine')
+        return 'call ~/reset, capture poses and call ~/fit', 'reset'
+
+    @property
     def temperature(self) -> float:
         """Temperature of the last rest [°C]; NaN if not known."""
         return self.rests[-1].temperature if self.rests else np.nan
@@ -312,7 +324,7 @@ def status(state: Drift) -> str:
     found = state.change
     return (f'|a| at rest has differed by {found.error * MG:+.2f} mg from 1 g for '
             f'{counted(state.lasted, "rest")}, stated uncertainty {state.stated * MG:.2f} mg'
-            f'{_kind(found)}: {_advice(state)}')
+            f'{_kind(found)}: {state.remedy[0]}')
 
 
 def _kind(found: LastingChange) -> str:
@@ -323,14 +335,3 @@ def _kind(found: LastingChange) -> str:
         return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
     x, y, z = found.shift * MG
     return f'; the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'
-
-
-def _advice(state: Drift) -> str:
-    if state.temperatures:
-        low, high = state.temperatures
-        now = state.temperature
-        if now < low - _WARMER or now > high + _WARMER:
-            return (f'the temperature is {now:.1f} °C, but the sensor was calibrated at '
-                    f'{low:.1f} to {high:.1f} °C: capture poses at this temperature and call '
-                    '~/refine')
-    return 'call ~/reset, capture poses and call ~/fit'

@@ -30,7 +30,7 @@ from .messages import PERIOD
 from .server import PageServer
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
-from ..findings import rate, Rating
+from ..findings import rate
 from ..messages.one_reading import Triple
 from ..report.page import calibration_page, STORED
 from ..session import (
@@ -91,7 +91,6 @@ class Exchange:
         self.show: Show = lambda message: None
         self.problem = ''
         self._shown: Calibration | None = None
-        self._rating: Rating | None = None
         self._number = 0
         self._page: tuple[int, str] = (-1, '')
         self._drawing = -1
@@ -117,25 +116,10 @@ class Exchange:
         """Show the state; the server sends it only if it has changed."""
         session = self._session
         if session.sensor.present is not self._shown:
-            self._take(session.sensor.present)
+            self._shown = session.sensor.present
+            self._number += 1
         self.show(messages.state(
-            session, self.problem, shown=self._shown, preview=session.sensor.offered is not None,
-            busy=next(iter(self._worker.running), ''), rating=self._rating, page=self._number))
-
-    def _take(self, calibration: Calibration | None) -> None:
-        """Show another calibration, and rate it in the worker process."""
-        self._shown, self._rating = calibration, None
-        self._number += 1
-        if calibration is not None:
-            self._worker.run(self._rated(calibration), lambda success, words: (
-                success or self._log(Log('warning', words))))
-
-    def _rated(self, calibration: Calibration) -> Task:
-        """Show the rating of a calibration."""
-        rating: Rating = yield Compute(rate, calibration)
-        if self._shown is calibration:
-            self._rating = rating
-            self.show_state()
+            session, self.problem, busy=next(iter(self._worker.running), ''), page=self._number))
 
     # The page asks; these are called in the thread of the server
 
@@ -301,6 +285,7 @@ class Host:
 
     def _end(self, severity: Severity, words: str) -> None:
         """Show why no more samples come."""
+        self.session.ended = True
         self._show_problem(words, Log(severity, words))
 
     def _report_source(self) -> None:
@@ -369,8 +354,12 @@ class Host:
                 self.exchange.show_poses(event)
                 self.exchange.show_state()
             elif isinstance(event, Generator):
-                self._worker.run(event, lambda success, words: self._log(
-                    Log('info' if success else 'warning', words)))
+                self._worker.run(event, self._on_done)
+
+    def _on_done(self, success: bool, words: str) -> None:
+        """Show and log the end of a task."""
+        self._log(Log('info' if success else 'warning', words))
+        self.exchange.show_state()
 
     def _log(self, line: Log) -> None:
         if self._filter.passes(line):

@@ -23,7 +23,6 @@ import numpy as np
 from .. import __version__
 from ..calibrate import Calibration, words_of
 from ..errors import InputError
-from ..findings import Rating
 from ..session import checks, Level, Progress, Session, Severity, title, words_of_state
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
@@ -124,7 +123,8 @@ def progress(time: float, now: Progress) -> Message:
         'stillness': _fixed(now.stillness), 'dwell': _fixed(now.dwell),
         'min_dwell': now.min_dwell, 'poses': now.poses, 'total': now.total,
         'coverage': _fixed(now.coverage), 'accuracy_mg': _fixed(now.accuracy * MG),
-        'advice': now.advice, 'direction': list(now.direction),
+        'step': now.step, 'advice': now.advice, 'command': now.command,
+        'direction': list(now.direction),
         'up': [round(part, _DECIMALS) for part in now.up], 'raw': _fixed(now.length),
         'corrected': _fixed(now.corrected), 'temperature': _fixed(now.temperature)}
 
@@ -146,37 +146,33 @@ def answer(number: int, success: bool, words: str) -> Message:
     return {'kind': 'answer', 'id': number, 'success': success, 'words': words}
 
 
-def state(session: Session, problem: str, *, shown: Calibration | None, preview: bool, busy: str,
-          rating: Rating | None, page: int) -> Message:
+def state(session: Session, problem: str, *, busy: str, page: int) -> Message:
     """
     Return the state of a session.
 
     Parameters
     ----------
     session : Session
-        The session.
+        The session; the calibration that is offered, or otherwise the one in use, is shown.
     problem : str
         What the user must know before all else; empty: the most severe finding.
-    shown : Calibration or None
-        The calibration that is offered or in use.
-    preview : bool
-        Whether it is only offered.
     busy : str
         Name of the command that runs; may be empty.
-    rating : Rating or None
-        Rating of the calibration; None while it is not known.
     page : int
         Number of the calibration page.
 
     """
-    in_use = session.sensor.calibration
+    sensor = session.sensor
+    in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
     return {
         'kind': 'state', 'sensor': session.name, 'source': session.topic,
         'state': words_of_state(session), 'problem': problem or _problem(session),
         'calibration': '' if in_use is None else title(in_use),
-        'preview': preview, 'levelled': shown is not None and shown.is_levelled,
+        'preview': sensor.offered is not None,
+        'levelled': shown is not None and shown.is_levelled,
         'file': session.files.path, 'busy': busy,
-        'rating': None if rating is None else _rating(rating),
+        'rating': None if shown is None or rating is None else {
+            'rating': rating.name, 'reason': rating.reason},
         'result': None if shown is None else _result(shown),
         'page': '' if shown is None else f'/calibration.html?{page}'}
 
@@ -186,12 +182,6 @@ def _problem(session: Session) -> str:
     found = [each for each in checks(session) if each.level > Level.OK and (
         each.name != 'calibration' or session.sensor.calibration or session.problem)]
     return max(found, key=lambda each: each.level).words if found else ''
-
-
-def _rating(rating: Rating) -> Message:
-    """Return a rating; with a good one, the page itself knows the next action."""
-    return {'rating': rating.name, 'reason': rating.reason,
-            'advice': rating.next.text if rating.name != 'GOOD' else ''}
 
 
 def _result(calibration: Calibration) -> Message:

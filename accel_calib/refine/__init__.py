@@ -14,8 +14,10 @@ separate effects from their rivals, and `words` makes the sentences.
 
 """
 
+from .calibrations import refitted
 from .plan import PlannedPose, PosePlan
 from .refinement import refine, refine_with_fleet
 from .result import Refinement, Stage, Step
 
-__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine', 'refine_with_fleet']
+__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine',
+           'refine_with_fleet', 'refitted']

@@ -17,12 +17,11 @@ of the context compete with these changes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import State
+from .base import fitted_state, State
 from .words import plain_name
 from ..calibrate import (
     BASES,
@@ -36,19 +35,26 @@ from ..calibrate import (
     record_of,
     refuse_if_unfit,
     Rejected,
+    sound_rows,
+    sure_rows,
     uncertainty_g,
+    with_history,
     with_rest_noise,
 )
 from ..effects import CHANGES, included, Model, parameter_names, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import estimate, fit_sphere, judge, LARGEST_DILUTION, variance_factor
+from ..estimate import (
+    estimate,
+    fit_sphere,
+    judge,
+    LARGEST_DILUTION,
+    outliers,
+    variance_factor,
+)
 from ..finding import Finding, has, without
 from ..geometry import unit
-from ..table import COLUMNS, Floats, Poses
+from ..table import check_units, COLUMNS, Floats, Poses
 from ..units import Units
-
-if TYPE_CHECKING:
-    from .search import Found
 
 _DIGITS = 7
 """Number of decimals [g] in which two readings of the same pose are equal."""
@@ -58,6 +64,9 @@ _SAME = 0.999
 
 _EITHER = ('temperature', 'supply_voltage', 'rate', 'previous')
 """Context that is set to NaN if the stored poses do not have it."""
+
+_ROUNDS = 6
+"""Largest number of fits after which outliers are left out."""
 
 _NAMED = 4
 """Largest number of undetermined values that are named."""
@@ -219,10 +228,65 @@ class Given:
         return 'new' in self.poses_g
 
 
-def refined_calibration(base: Calibration, found: Found, given: Given,
+def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str = ''
+             ) -> Calibration:
+    """
+    Fit the values of a calibration anew to other poses, with the same effects.
+
+    Parameters
+    ----------
+    before : Calibration
+        The calibration; its unit is that of the readings.
+    poses : Poses
+        Poses with the columns that the effects need.
+    sensor, date : str
+        Name of the sensor and date for the result.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses do not determine the values, or the result is not plausible.
+    InputError
+        If the readings are clearly in another unit.
+
+    """
+    check_units(poses, before.units)
+    sure, doubts = sure_rows(poses)
+    sound, unsound = sound_rows(sure, before.units)
+    poses_g = with_history(in_g(sound, before.units), before.model)
+    lacking = [key for key in before.model.needs if key not in poses_g]
+    if lacking:
+        raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
+                              'in use corrects for', 'record it, or call ~/reset')
+    given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound), notes=())
+    final = _settled(before.model, poses_g)
+    out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
+           if row not in final.poses_g.row]
+    rejected = tuple(sorted((*given.rejected, *out), key=lambda each: each.row))
+    calibration, refusal = refined_calibration(before, final, (), given, rejected)
+    if refusal:
+        raise RefusedFitError(*refusal)
+    return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
+
+
+def _settled(model: Model, poses_g: Poses) -> State:
+    """Return the state of a model fitted to poses without the outliers."""
+    kept, out = poses_g, np.zeros(0, np.intp)
+    for _ in range(_ROUNDS):
+        kept = kept.take(np.setdiff1d(np.arange(len(kept)), out))
+        state = fitted_state(Model(model.values), kept)
+        if state is None:
+            break
+        out = outliers(state.fit, len(poses_g)).poses
+        if not len(out):
+            return state
+    raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
+                          'expected a fit that converges', TAKE_ALL_SIDES)
+
+
+def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given,
                         rejected: tuple[Rejected, ...]) -> tuple[Calibration, tuple[str, ...]]:
     """Return the refined calibration, and the refusal if it must not be used."""
-    final = found.final
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
     unchanged = final.model.effects == model.effects
@@ -232,7 +296,7 @@ def refined_calibration(base: Calibration, found: Found, given: Given,
         kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
                      else without_orientation(kept))
-    names = ', '.join(plain_name(name) for name in found.added)
+    names = ', '.join(plain_name(name) for name in added)
     others = without(base.noted, *OF_A_FIT)
     findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
     refined = replace(

@@ -153,7 +153,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     rejected = _rejected(found, given)
     clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
     outliers = tuple(each.row for each in rejected if each.row not in clipped)
-    refined, refusal = refined_calibration(calibration, found, given, rejected)
+    refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
     missing, plan = untestable(found, steps), plan_poses(found)

@@ -198,8 +198,12 @@ class Calibrator:
         elif isinstance(event, Mounting):
             self._broadcast(event)
         else:
-            self._worker.run(event, lambda success, words: self._log(
-                Log('info' if success else 'warning', words)))
+            self._worker.run(event, self._on_done)
+
+    def _on_done(self, success: bool, words: str) -> None:
+        """Log the end of a task, and show what has changed with it."""
+        self._log(Log('info' if success else 'warning', words))
+        self._page.show_state()
 
     def _broadcast(self, event: Mounting) -> None:
         """Publish the levelled frame as a child of the frame of the sensor."""

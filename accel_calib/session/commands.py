@@ -19,10 +19,10 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import next_action, Plan
+from .guidance import next_action
 from .sensor import Sensor
 from .store import Store, writing_advice
-from .work import at_rest, change_words, fit, is_partial, plan_for, refined
+from .work import at_rest, change_words, fit, Fitted, is_partial, plan_for, refined
 from .worker import Calibrations, Compute, Files, Found, Part, Task
 from ..calibrate import (
     Calibration,
@@ -38,6 +38,8 @@ from ..text import counted, now
 
 if TYPE_CHECKING:
     from .session import Session
+    from ..findings import Rating
+    from ..refine import Refinement
 
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
@@ -78,8 +80,16 @@ class Commands:
         if session.computing:
             yield Files()
             return f'{words}; {_NEXT_LATER}'
-        plan: Plan = yield Compute(plan_for, poses, session.units, session.settings.model)
-        return f'{words}; {next_action(plan.asked)}'
+        sensor = session.sensor
+        plan = yield Compute(plan_for, poses, session.units, session.settings.model)
+        if session.sensor is sensor:
+            sensor.guide.plan = plan
+        return f'{words}{self._next()}'
+
+    def _next(self) -> str:
+        """Return the end of an answer: the next step."""
+        action = next_action(self._session)
+        return '' if action is None else f'; next: {action.words}'
 
     def undo_pose(self) -> Task:
         """Remove the last pose."""
@@ -97,8 +107,15 @@ class Commands:
 
     def fit(self, *, offered: bool = False) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        calibration, words, _ = yield from self._fitted()
-        return (yield from self._use(calibration, words, offered=offered))
+        fitted = yield from self._fitted()
+        return (yield from self._use_fit(fitted, offered=offered))
+
+    def _use_fit(self, fitted: Fitted, *, offered: bool = False) -> Part[str]:
+        """Store and use, or offer, a fit or a refinement; return the answer."""
+        answer = yield from self._use(fitted.calibration, fitted.words, fitted.refinement,
+                                      fitted.rating, offered=offered)
+        waits = self._session.sensor.offered is not None  # then the answer says so
+        return answer if waits else f'{answer}{self._next()}'
 
     def due(self) -> list[Task]:
         """Return an automatic fit if one is due."""
@@ -116,7 +133,7 @@ class Commands:
         if self._session.sensor is not sensor:
             return ''
         try:
-            calibration, words, differs = yield from self._fitted()
+            fitted = yield from self._fitted()
         except ChangedError:
             sensor.auto_fit_waits = True
             return ''
@@ -126,35 +143,42 @@ class Commands:
                 return ''
             raise
         self._refused = ''
-        return (yield from self._use(calibration, words)) if differs else ''
+        return (yield from self._use_fit(fitted)) if fitted.differs else ''
 
-    def _fitted(self) -> Part[tuple[Calibration, list[str], bool]]:
-        """Return a fit, what to answer, and whether it differs from the calibration before."""
+    def _fitted(self) -> Part[Fitted]:
+        """Return a fit to the poses; the values of a refined calibration are fitted anew."""
         session = self._session
+        return (yield from self._sound('fit', fit, session.units, session.settings, session.name,
+                                       session.sensor.present))
+
+    def _sound(self, name: str, function: Callable[..., Fitted], *given: Any) -> Part[Fitted]:
+        """Return what a function makes of the poses, if it is fit for use."""
+        session, sensor = self._session, self._session.sensor
         session.files.usable()
-        session.sensor.live.refresh()
-        poses = session.sensor.live.book.poses()
-        found = yield from self._unless_changed(
-            'fit', fit, poses, session.units, session.settings, session.name,
-            session.sensor.present, session.statistics.context)
-        session.sensor.fitted_poses = len(poses)
-        return found
+        sensor.live.refresh()
+        poses = sensor.live.book.poses()
+        try:
+            fitted = yield from self._unless_changed(name, function, poses, *given)
+            if fitted.refusal:
+                session.rate(fitted.refinement)
+                raise RefusedFitError(f'{fitted.words[0]}; not used: {fitted.refusal[0]}',
+                                      fitted.refusal[1])
+            if fitted.rating.name == 'BAD':
+                raise RefusedFitError(f'{fitted.words[0]}; not used: {fitted.rating.reason}',
+                                      fitted.rating.next.text)
+        except RefusedFitError as error:
+            sensor.refuse(error.advice)
+            raise
+        sensor.fitted_poses = len(poses)
+        return fitted
 
     def refine(self, *, offered: bool = False) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
-        session.files.usable()
-        session.sensor.live.refresh()
-        refinement, words = yield from self._unless_changed(
-            'refine', refined, session.sensor.live.book.poses(), session.units, session.name,
-            session.sensor.present)
-        if refinement.refusal:
-            raise RefusedFitError(f'{words[0]}; not used: {refinement.refusal[0]}',
-                                  refinement.refusal[1])
-        session.sensor.guide.follow(refinement.plan.poses)
-        if refinement.plan.poses:
-            session.sensor.fitted_poses = 0  # more poses are asked for
-        return (yield from self._use(refinement.calibration, words, offered=offered))
+        fitted = yield from self._sound('refine', refined, session.units, session.name,
+                                        session.sensor.present)
+        session.sensor.guide.follow(fitted.planned)
+        return (yield from self._use_fit(fitted, offered=offered))
 
     def _unless_changed(self, name: str, function: Callable[..., Found], *given: Any
                         ) -> Part[Found]:
@@ -224,10 +248,12 @@ class Commands:
         words = [*words, change_words(self._session.sensor.present, calibration), *(
             each.words for each in calibration.noted
             if each.kind in ('flat_pose', 'heading'))]
-        return (yield from self._use(calibration, words, offered=offered))
+        return (yield from self._use(calibration, words, self._session.sensor.refinement,
+                                     offered=offered))
 
-    def _use(self, calibration: Calibration, words: list[str], *, offered: bool = False
-             ) -> Part[str]:
+    def _use(self, calibration: Calibration, words: list[str],
+             refinement: Refinement | None = None, rating: Rating | None = None, *,
+             offered: bool = False) -> Part[str]:
         """Store and use, or offer, a calibration; return the answer."""
         session, store = self._session, self._session.files.usable()
         offered = offered or session.settings.confirm
@@ -235,12 +261,13 @@ class Commands:
         mounting = [] if not calibration.is_levelled else [mounting_words(
             calibration.rotation, session.frame_id or '', session.settings.base_frame)]
         if offered:
-            session.sensor.offer(calibration)
+            session.offer(calibration, refinement, rating)
             end = ('published on ~/preview only: call ~/save to use and store it, or ~/undo to '
                    'discard it')
             return '; '.join(filter(None, [*words, end, *mounting]))
-        session.adopt(calibration)
+        session.adopt(calibration, refinement, rating)
         if not_stored is not None:
+            session.sensor.unsaved = True
             raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
                              f'{writing_advice(not_stored)}, and call ~/save')
         stored = f'stored in {store.calibration}'
@@ -265,8 +292,9 @@ class Commands:
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
         yield Calibrations(store.save, calibration, session.sensor.live.book.poses())
+        session.sensor.unsaved = False
         if session.sensor.offered is calibration:
-            session.adopt(calibration)
+            session.adopt(calibration, session.sensor.refinement, session.sensor.rating)
         return f'stored in {store.calibration} and {store.poses}'
 
     def load(self) -> Task:
@@ -283,7 +311,8 @@ class Commands:
         """Discard the offered calibration, or return to the one before the last stored one."""
         session = self._session
         if session.sensor.offered is not None:
-            session.sensor.offer(None)
+            session.sensor.fitted_poses = 0
+            session.offer(None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
         calibration = yield from self._with_files(session.files.usable().step_back)
         before = session.sensor.calibration

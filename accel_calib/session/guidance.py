@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Guidance for the person who turns the sensor: one line per pose, and the progress.
+Guidance for the person who turns the sensor: the next step, one line per pose, and the progress.
+
+`next_action` is the one answer to what comes next. The log, ``~/progress``, the diagnostics, the
+answers of the services and the pages all show it.
 
 The next pose is chosen again only when a pose is added or removed. While a rest lasts, the advice
 therefore stays the same, although the average of its pose still changes.
@@ -14,15 +17,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from .stream import stream_faults
 from ..calibrate import NextPose
+from ..compare import status
 from ..errors import InputError
+from ..finding import NextStep
 from ..refine import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
+
+if TYPE_CHECKING:
+    from .sensor import Sensor
+    from .session import Session
 
 _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
@@ -47,7 +57,9 @@ _FIGURES = {
     'coverage': _Figure('coverage', '{:.3f}'.format, float),
     'accuracy': _Figure('expected accuracy [mg]', lambda accuracy: f'{accuracy * MG:.3g}',
                         lambda text: float(text) / MG),
-    'advice': _Figure('next pose', str, str),
+    'step': _Figure('step', str, str),
+    'advice': _Figure('next', str, str),
+    'command': _Figure('service', str, str),
     'direction': _Figure('next direction',
                          lambda parts: ' '.join(f'{part:.4f}' for part in parts),
                          lambda text: tuple(map(float, text.split()))),
@@ -81,8 +93,12 @@ class Progress:
     accuracy : float
         Expected error of |a| after a fit now [g]; infinite if the poses do not determine it, NaN
         if the noise is not known.
+    step : str
+        Kind of the next step, one of `accel_calib.finding.STEPS`; empty before it is known.
     advice : str
-        What to do next.
+        The next step in words.
+    command : str
+        Name of the service for it; empty if there is none.
     direction : tuple of float
         Direction to point up, a unit vector in the sensor axes; empty: none.
     up : tuple of float
@@ -103,7 +119,9 @@ class Progress:
     total: int
     coverage: float
     accuracy: float
+    step: str
     advice: str
+    command: str
     direction: tuple[float, ...]
     up: tuple[float, ...] = ()
     length: float = math.nan
@@ -202,11 +220,23 @@ class Guide:
         self._planned, self._all_taken, self._begun = tuple(planned), False, self.poses
 
     @property
-    def advice(self) -> str:
-        """Return what to do next; empty before the first choice."""
+    def follows(self) -> bool:
+        """Whether the poses of a refinement are asked for, or have just been taken."""
+        return bool(self._planned) or self._all_taken
+
+    @property
+    def action(self) -> Action | None:
+        """Return what to do next with the poses; None before the first choice."""
         if self._all_taken:
-            return 'all poses of the plan are taken; call ~/refine'
-        return '' if self.plan is None else next_action(self.plan.asked)
+            return _calling('refine', 'all poses of the plan are taken')
+        plan = self.plan
+        if plan is None:
+            return None
+        asked = plan.asked
+        if asked.direction is None:
+            return _calling('fit', asked.words)
+        return (Action('poses', f'{asked.words}, or call ~/fit', 'fit') if asked.fits
+                else Action('poses', asked.words))
 
     @property
     def poses(self) -> int:
@@ -224,26 +254,25 @@ class Guide:
         self._rest = max(start, self._rest)
         return new
 
-    def line(self, poses: Poses, units: Units, *, added: bool) -> str:
+    def line(self, poses: Poses, units: Units, action: Action | None, *, added: bool) -> str:
         """
         Return the line about the latest pose; empty if there is nothing new to report.
 
         `added`: the number of poses has increased; otherwise the rest repeats a pose.
 
         """
-        if self.plan is None:
+        if self.plan is None or action is None:
             return ''
-        asked = self.plan.asked
-        done = asked.direction is None
+        more, total = action.kind == 'poses', self.plan.asked.total
         if not added:
-            return '' if done else f'this rest repeats an earlier pose; next: {self.advice}'
+            return f'this rest repeats an earlier pose; next: {action.words}' if more else ''
+        count = f'{len(poses)} of about {total}' if more else f'{len(poses)}'
         noise = ''
         if poses.noise is not None and not units.is_native:
             latest = poses.noise[int(np.argmax(poses['time']))]
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
-        if done and len(poses) > asked.total:
-            return f'pose {len(poses)}{noise}'
-        return f'pose {len(poses)} of about {asked.total}{noise}, next: {self.advice}'
+        then = '' if action.kind == 'done' else f', next: {action.words}'
+        return f'pose {count}{noise}{then}'
 
 
 def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
@@ -254,8 +283,79 @@ def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
                     plan.asked.error, plan.poses + len(planned), fits=False)
 
 
-def next_action(asked: NextPose) -> str:
-    """Return a text about the next action of the user."""
-    if asked.direction is None:
-        return f'{asked.words}; call ~/fit'
-    return f'{asked.words}, or call ~/fit' if asked.fits else asked.words
+@dataclass(frozen=True)
+class Action:
+    """
+    The next step of the person.
+
+    `kind` is one of `accel_calib.finding.STEPS`, `words` are without a full stop, and `command` is
+    the service that does it; empty if there is none.
+
+    """
+
+    kind: str
+    words: str
+    command: str = ''
+
+
+_SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
+"""Service for each kind of step that has one."""
+
+_NEEDS_SAMPLES = ('poses', 'level', 'done')
+"""Kinds of steps that wait for the stream; the others use the poses so far."""
+
+_FAULTS = {'connect': ('mismatches', 'no_publisher', 'silence', 'publishers', 'stamps'),
+           'unit': ('unit',)}
+"""Faults of the stream that come before all else, by kind of step."""
+
+
+def _calling(kind: str, text: str) -> Action:
+    """Return a step with the call of its service."""
+    command = _SERVICES.get(kind, '')
+    return Action(kind, f'{text}; call ~/{command}' if command else text, command)
+
+
+def next_action(session: Session) -> Action | None:
+    """Return the next step; None while it is not known."""
+    action = _with_sensor(session.sensor)
+    if action is not None and action.kind not in _NEEDS_SAMPLES:
+        return action
+    if session.ended:  # nothing can be levelled any more
+        done = action is not None and action.kind == 'level'
+        return Action('done', 'use the calibration') if done else action
+    faults = stream_faults(session)
+    for kind, names in _FAULTS.items():
+        words = '; '.join(faults[name] for name in names if name in faults)
+        if words:
+            return Action(kind, words)
+    return action
+
+
+def _with_sensor(sensor: Sensor) -> Action | None:
+    """Return the next step with the poses and calibrations of a sensor."""
+    rating = sensor.rating
+    if sensor.offered is not None:
+        verdict = '' if rating is None else f', {rating.name}: {rating.reason}'
+        return Action('accept', f'a new calibration waits{verdict}; call ~/save to use and store '
+                      'it, or ~/undo to discard it', 'save')
+    if sensor.unsaved:
+        return _calling('save', 'the calibration in use is not stored')
+    if sensor.drift is not None and sensor.has_changed:
+        return Action('poses', status(sensor.drift), sensor.drift.remedy[1])
+    if sensor.calibration is not None and rating is None:
+        return None
+    if rating is not None and rating.name == 'GOOD':
+        return _after_good(sensor, rating.next)
+    if sensor.refused_advice:
+        return Action('poses', sensor.refused_advice)
+    if rating is None or not sensor.all_fitted:
+        return sensor.guide.action
+    return _calling(rating.next.kind, rating.next.text)
+
+
+def _after_good(sensor: Sensor, after: NextStep) -> Action:
+    """Return the step after a good fit."""
+    if sensor.calibration is not None and not sensor.calibration.is_levelled:
+        return Action('level', 'place the robot level, hold it still and call ~/set_level; a '
+                      'sensor alone is done', 'set_level')
+    return Action('done', after.text if after.kind == 'done' else 'use the calibration')

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -40,6 +40,10 @@ from ..messages import output_scale
 from ..messages.one_reading import Known, OneReading, Triple
 from ..table import Floats
 from ..units import Units
+
+if TYPE_CHECKING:
+    from ..findings import Rating
+    from ..refine import Refinement
 
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
@@ -66,6 +70,12 @@ class Sensor:
         The calibration that corrects messages: without the mounting if `rotates` is false.
     offered : Calibration or None
         A calibration that waits for ~/save or ~/undo.
+    rating : Rating or None
+        Rating of the calibration that is offered or in use; None while it is not known.
+    refinement : Refinement or None
+        The refinement that this calibration is from.
+    unsaved : bool
+        Whether the calibration in use could not be stored.
     changes : int
         Number of changes of the calibration in use or offered.
     fitted_poses : int
@@ -91,8 +101,10 @@ class Sensor:
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None
         self.offered: Calibration | None = None
+        self.rating: Rating | None = None
+        self.refinement: Refinement | None = None
         self.changes = self.fitted_poses = 0
-        self.auto_fit_waits = False
+        self.auto_fit_waits = self.unsaved = False
         self.owners: set[str] = set()
         self.drift: Drift | None = None
         self.scale = 1.0
@@ -102,6 +114,7 @@ class Sensor:
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
+        self._refused = 0, ''
         self._prepared: tuple[Calibration, OneReading] | None = None
 
     @property
@@ -112,12 +125,17 @@ class Sensor:
     @property
     def all_fitted(self) -> bool:
         """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
-        return 0 < self.guide.poses == self.fitted_poses
+        return 0 < self.guide.poses == self.fitted_poses and not self.guide.follows
+
+    def refuse(self, advice: str) -> None:
+        """Note that a fit to the present poses is refused, and what to do."""
+        self._refused = len(self.live.book.poses()), advice
 
     @property
-    def advice(self) -> str:
-        """Return what to do next with the poses."""
-        return 'the calibration uses these poses' if self.all_fitted else self.guide.advice
+    def refused_advice(self) -> str:
+        """Return what to do after a refused fit to the present poses; empty otherwise."""
+        poses, advice = self._refused
+        return advice if poses == self.guide.poses else ''
 
     def stillness(self, statistics: StreamStatistics) -> float:
         """Return the spread of the last samples relative to the largest of a still sensor."""
@@ -135,6 +153,7 @@ class Sensor:
     def adopt(self, calibration: Calibration | None) -> None:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
         self.offer(None)
+        self.unsaved = False
         if not _only_levelled(self.calibration, calibration):
             self._past = None if calibration is None else monitor(calibration)
             self._counted = self.rest

@@ -16,17 +16,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import math
 from time import monotonic
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .commands import Commands
+from .guidance import next_action
 from .live_capture import Change
 from .sensor import Sensor, title
 from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
 from .store import Store, writing_advice
 from .stream import AGAIN, Reports, SILENT, StreamStatistics
-from .work import plan_for
+from .work import plan_for, rated
 from .worker import (
     Calibrations,
     Compute,
@@ -45,6 +47,10 @@ from ..errors import InputError
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import units_of
+
+if TYPE_CHECKING:
+    from ..findings import Rating
+    from ..refine import Refinement
 
 BATCH = 0.3
 """
@@ -85,6 +91,8 @@ class Session:
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     computing : int
         Number of fits and refinements that are running.
+    ended : bool
+        Whether no more samples can come, because a recording has ended.
 
     Raises
     ------
@@ -106,7 +114,7 @@ class Session:
         self.publishers: tuple[str, ...] | None = ()
         self.mismatches: tuple[str, ...] = ()
         self.enabled, self.still, self.still_since = True, False, math.nan
-        self.computing = 0
+        self.computing, self.ended = 0, False
         _check_frames(settings)
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._largest = (_LARGEST_NATIVE if self.units.is_native
@@ -226,7 +234,7 @@ class Session:
         for dwell in change.ended:
             sensor.end(dwell, least)
         if sensor.drift is not None and sensor.has_changed is not before:
-            self.log('warning', status(sensor.drift))
+            self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
         if change.doubted:
             self.log('warning', f'the sensor may have moved during '
                      f'{counted(change.doubted, "pose")}, according to later rests; a fit '
@@ -305,11 +313,18 @@ class Session:
         for line in filter(None, (loaded.problem, *loaded.notes)):
             self.log('error', line)
 
-    def adopt(self, calibration: Calibration | None) -> None:
-        """Use this calibration for the correction, with the given mounting if there is one."""
+    def adopt(self, calibration: Calibration | None, refinement: Refinement | None = None,
+              rating: Rating | None = None) -> None:
+        """
+        Use this calibration for the correction, with the given mounting if there is one.
+
+        The refinement that it is from, and the rating if it is known, are those of `Sensor`.
+
+        """
         self.problem = ''
         if calibration is None:
             self.sensor.adopt(None)
+            self.rate(None)
             return
         stored, calibration = calibration, self.with_given(calibration)
         if stored.is_levelled and not np.allclose(stored.rotation[:, 2],
@@ -317,11 +332,34 @@ class Session:
             self.log('warning', 'the stored mounting differs from the given one by more than 10° '
                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.sensor.adopt(calibration)
+        self.rate(refinement, rating)
         self.log('info', f'correcting with {title(calibration)}')
         for finding in calibration.noted:
             self.log(_SEVERITY[finding.level], finding.words)
         if calibration.is_levelled:
             self._events.append(Mounting(calibration.rotation, self.frame_id or ''))
+
+    def offer(self, calibration: Calibration | None, refinement: Refinement | None = None,
+              rating: Rating | None = None) -> None:
+        """Publish this calibration on ~/preview only; None: discard the offered one."""
+        self.sensor.offer(calibration)
+        self.rate(refinement, rating)
+
+    def rate(self, refinement: Refinement | None, rating: Rating | None = None) -> None:
+        """Note the rating of the present calibration; add a task for it if it is not known."""
+        sensor = self.sensor
+        sensor.refinement = refinement
+        if rating is not None or sensor.present is None:
+            sensor.rating = rating
+        else:
+            self._events.append(self._rated(sensor, sensor.present))
+
+    def _rated(self, sensor: Sensor, calibration: Calibration) -> Task:
+        """Rate a calibration, and note the rating unless another one has replaced it."""
+        rating: Rating = yield Compute(rated, calibration, sensor.refinement)
+        if sensor.present is calibration:
+            sensor.rating = rating
+        return ''
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -330,7 +368,7 @@ class Session:
         self._given = rotation
         self.log('info', mounting_words(rotation, self.frame_id or '', self.settings.base_frame))
         if self.sensor.calibration is not None:
-            self.adopt(self.sensor.calibration)
+            self.adopt(self.sensor.calibration, self.sensor.refinement)
 
     def with_given(self, calibration: Calibration) -> Calibration:
         """Return a calibration with the given mounting, if there is one."""
@@ -371,7 +409,9 @@ class Session:
         if plan is not None and sensor is self.sensor:
             guide.plan = plan
             self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
-        return guide.line(poses, self.units, added=added > 0) if new_rest else ''
+        if not new_rest or sensor is not self.sensor:
+            return ''
+        return guide.line(poses, self.units, next_action(self), added=added > 0)
 
 
 def _check_frames(settings: CalibratorSettings) -> None:

@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import Progress
+from .guidance import next_action, Progress
 from .sensor import title
 from .stream import SILENT, stream_faults
 from .work import is_partial
 from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
+from ..finding import has
 from ..messages.one_reading import Triple
 from ..text import counted
 from ..units import MG
@@ -43,7 +44,9 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
     sensor, statistics = session.sensor, session.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
     up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
-    direction = None if plan is None or sensor.all_fitted else plan.asked.direction
+    action = next_action(session)
+    asked = plan is not None and action is not None and action.kind == 'poses'
+    direction = plan.asked.direction if plan is not None and asked else None
     return Progress(
         still=session.still and not silent,
         stillness=math.nan if silent else sensor.stillness(statistics),
@@ -51,9 +54,19 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
         min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
-        accuracy=math.nan if plan is None else plan.asked.error * plan.noise_g,
-        advice=sensor.advice, direction=() if direction is None else tuple(direction.tolist()),
+        accuracy=_accuracy(session), step='' if action is None else action.kind,
+        advice='' if action is None else action.words,
+        command='' if action is None else action.command,
+        direction=() if direction is None else tuple(direction.tolist()),
         up=up, length=length, corrected=corrected, temperature=statistics.temperature)
+
+
+def _accuracy(session: Session) -> float:
+    """Return the expected error of |a| [g]; NaN if it is not known, or not the noise alone."""
+    plan, rating = session.sensor.guide.plan, session.sensor.rating
+    if plan is None or (rating is not None and has(rating.findings, 'beyond_noise')):
+        return math.nan
+    return plan.asked.error * plan.noise_g
 
 
 def _newest(session: Session, reading: Triple | None) -> Newest:
@@ -140,14 +153,19 @@ def _calibration(session: Session) -> Check:
         return Check('calibration', Level.ERROR, session.problem)
     if sensor.calibration is None:
         count = counted(len(sensor.live.book.poses()), 'pose')
-        return Check('calibration', Level.WARN, f'no calibration yet, captured {count}: '
-                     f'{sensor.advice or "turn the sensor"}')
+        state = '' if sensor.offered else f'no calibration yet, captured {count}: '
+        return Check('calibration', Level.WARN, f'{state}{_advice(session)}')
     left = sensor.limits_left(session.statistics.context)
     words = [each.words for key, each in left.items() if key != 'std']
     if words:
         return Check('calibration', Level.WARN, f'{"; ".join(words)}: {USES_LIMIT}; '
                      'capture poses there and call ~/refine')
     return Check('calibration', Level.OK, title(sensor.calibration))
+
+
+def _advice(session: Session) -> str:
+    action = next_action(session)
+    return 'turn the sensor' if action is None else action.words
 
 
 def _drift(drift: Drift | None) -> Check:
@@ -205,7 +223,7 @@ def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
     doubtful = int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(doubtful)
-    yield 'next pose', session.sensor.advice
+    yield 'next', _advice(session)
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')

@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -26,12 +25,12 @@ from ..calibrate import (
     PRIOR,
 )
 from ..capture import Dwell, poses_from
-from ..effects import Context, LADDER, Model
+from ..effects import LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate import coverage, fit_sphere, pose_noise
-from ..findings import rate, rate_refinement
+from ..findings import rate, rate_refinement, Rating
 from ..geometry import spread_directions
-from ..refine import refine, Refinement
+from ..refine import PlannedPose, refine, Refinement, refitted
 from ..refine.words import residual_words, verdict_words
 from ..table import Floats, Poses
 from ..text import counted, listed, now
@@ -47,41 +46,66 @@ _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """
+    A fit, or a refinement, with its rating and what to answer.
+
+    `differs`: an automatic fit replaces the calibration before it. `refusal` is the reason and
+    the advice if it must not be used, and `planned` are the poses to take next.
+
+    """
+
+    calibration: Calibration
+    rating: Rating
+    words: list[str]
+    differs: bool = True
+    refinement: Refinement | None = None
+
+    @property
+    def refusal(self) -> tuple[str, ...]:
+        """Return the reason and the advice of a refused refinement; empty if it can be used."""
+        return () if self.refinement is None else self.refinement.refusal
+
+    @property
+    def planned(self) -> tuple[PlannedPose, ...]:
+        """Return the poses to take next."""
+        return () if self.refinement is None else self.refinement.plan.poses
+
+
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
-        before: Calibration | None, known: Mapping[str, float]
-        ) -> tuple[Calibration, list[str], bool]:
-    """
-    Return a fit, what to answer, and whether an automatic fit replaces the calibration before it.
-
-    Parameters and errors are as in `fitted`; `known` has the present values of the context.
-
-    """
-    context = {key: np.array([value]) for key, value in known.items()}
-    calibration = fitted(poses, units, settings, sensor, before, context)
-    return (calibration, [summary(calibration), change_words(before, calibration)],
-            replaces(before, calibration))
+        before: Calibration | None) -> Fitted:
+    """Return a fit of all poses with its rating; parameters and errors are as in `fitted`."""
+    calibration = fitted(poses, units, settings, sensor, before)
+    rating = rate(calibration)
+    return Fitted(calibration, rating, [summary(calibration, rating),
+                                        change_words(before, calibration)],
+                  replaces(before, calibration))
 
 
 def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
-           before: Calibration | None, context: Context) -> Calibration:
+           before: Calibration | None) -> Calibration:
     """
     Return a fit of all poses, in the levelled frame of the calibration before.
 
-    `context` has the columns that the effects of that calibration need, one row. RefusedFitError
-    if the poses do not determine the model; the advice is how to turn the sensor next. InputError
-    if the readings are clearly in another unit.
+    Effects that a refinement has added to it are kept, with new values. RefusedFitError if the
+    poses do not determine the model; the advice is how to turn the sensor next. InputError if the
+    readings are clearly in another unit.
 
     """
     full = before is not None and not is_partial(before)
     up = poses_up(poses, units)
     few = not units.is_native and len(up) >= _FEWEST_IN_CONE and lies_in_cone(up)
-    if few and not full:
+    if before is not None and is_refined(before):
+        calibration = refitted(before, poses, sensor=sensor, date=now())
+    elif few and not full:
         calibration = fit_partial(poses, units, sensor=sensor, date=now())
     else:
         calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
                                 sensor=sensor, date=now())
     if before is None or not before.is_levelled:
         return calibration
+    context = before.typical_context(1)
     flat = flat_direction(before.frame) * before.force_per_g
     reading = before.predict(flat[np.newaxis], context)[0]
     headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
@@ -92,6 +116,11 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
 def is_partial(calibration: Calibration) -> bool:
     """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
     return calibration.method == PRIOR or not calibration.model.effects
+
+
+def is_refined(calibration: Calibration) -> bool:
+    """Return whether a calibration has effects beyond offset and gain."""
+    return any(name not in LADDER for name in calibration.model.effects)
 
 
 def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
@@ -132,7 +161,7 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     """
     if before is None:
         return True
-    if any(name not in LADDER for name in before.model.effects):
+    if is_refined(before):
         return False
     if is_partial(before):
         return True
@@ -144,10 +173,9 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
-            ) -> tuple[Refinement, list[str]]:
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Fitted:
     """
-    Return the refinement of a calibration (None: of a fit), and what to answer.
+    Return the refinement of a calibration (None: of a fit).
 
     RefusedFitError if there are too few poses; InputError if the readings are clearly in another
     unit.
@@ -155,10 +183,16 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None
     """
     refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
                         date=now())
-    words = [story(refinement)]
+    rating = rate_refinement(refinement)
+    words = [story(refinement, rating)]
     if not refinement.refusal:
         words.append(change_words(before, refinement.calibration))
-    return refinement, words
+    return Fitted(refinement.calibration, rating, words, refinement=refinement)
+
+
+def rated(calibration: Calibration, refinement: Refinement | None) -> Rating:
+    """Return the rating of a calibration, and of the refinement that it is from."""
+    return rate(calibration, refinement=refinement)
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
@@ -200,12 +234,12 @@ def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
     return tuple(fit_sphere(poses.reading)[1].tolist())
 
 
-def summary(calibration: Calibration) -> str:
+def summary(calibration: Calibration, rating: Rating) -> str:
     """Return the rating and the quality of a fit as one line."""
     quality = calibration.quality
     floor = ('' if quality.noise_floor_mg is None
              else f', noise floor {quality.noise_floor_mg:.3f} mg')
-    words = [f'{rate(calibration).name}: model {calibration.name} from '
+    words = [f'{rating.name}: model {calibration.name} from '
              f'{len(calibration.used_poses)} of {counted(len(calibration.poses), "pose")}: '
              f'residual {quality.rms_before_mg:.2f} mg before, {quality.rms_after_mg:.3f} mg after'
              f'{floor}']
@@ -216,9 +250,9 @@ def summary(calibration: Calibration) -> str:
     return '; '.join([*words, *calibration.warnings])
 
 
-def story(refinement: Refinement) -> str:
+def story(refinement: Refinement, rating: Rating) -> str:
     """Return the rating and the result of a refinement as one line."""
-    lines = [f'{rate_refinement(refinement).name}: {verdict_words(refinement).rstrip(".")}; '
+    lines = [f'{rating.name}: {verdict_words(refinement).rstrip(".")}; '
              f'{residual_words(refinement)}']
     for step in refinement.steps:
         rivals = f' (or {", ".join(step.likely_rivals)})' if step.rivals else ''

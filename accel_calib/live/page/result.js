@@ -52,11 +52,10 @@ export class Result {
     const box = element('verdict');
     box.hidden = !rating;
     if (!rating) return;
-    const [name, reason, advice] = box.children;
+    const [name, reason] = box.children;
     box.dataset.rating = rating.rating;
     text(name, rating.rating);
     text(reason, withButtons(rating.reason));
-    text(advice, withButtons(rating.advice));
   }
 
   /** Load the page only when it is looked at, because drawing its maps takes time. */

@@ -1,0 +1,115 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A session without threads, and a person who does what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+from accel_calib.session import CalibratorSettings, checks, Log, Session, state, Task
+from inside import next_action
+import numpy as np
+from shared import answer_of
+
+GRAVITY = 9.80665
+RATE = 50.0
+
+
+class Driver:
+    """A session whose jobs are done at once, with its own clock and a stored log."""
+
+    def __init__(self, topic: str = '/imu/data_raw', **parameters: Any) -> None:
+        self.now = 0.0
+        self.stamp = 1000.0
+        self.log: list[Log] = []
+        self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
+        self.handle()
+
+    def handle(self) -> None:
+        for event in self.session.events():
+            if isinstance(event, Generator):
+                words = self.done(event)
+                self.log += [Log('info', words)] if words else []
+            elif isinstance(event, Log):
+                self.log.append(event)
+
+    def done(self, task: Task) -> str:
+        """Return the answer of a command."""
+        answer: str = answer_of(task)
+        self.handle()
+        return answer
+
+    def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
+        """Push readings [m/s²], and return the number of accepted messages."""
+        accepted = 0
+        for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
+            self.now += len(block) / RATE
+            if self.session.accepts(frame_id):
+                rows = np.full((len(block), 9), np.nan)
+                rows[:, 0] = self.stamp + np.arange(len(block)) / RATE
+                rows[:, 1:4], rows[:, 7] = block, temperature
+                self.session.push(rows, self.now)
+                accepted += len(block)
+            self.stamp += len(block) / RATE
+            self.handle()
+        return accepted
+
+    def logged(self, severity: str = 'error') -> str:
+        return '\n'.join(line.words for line in self.log if line.severity == severity)
+
+    def finding(self, name: str) -> Any:
+        return next(each for each in checks(self.session) if each.name == name)
+
+
+class Person:
+    """
+    Somebody who does what the progress says, and nothing else.
+
+    `sensor` returns the reading [g] of a direction of up at a temperature, and `warming` is the
+    rise of the temperature by rest [°C]. `flat` is the direction of up with the robot level, and
+    `can_reach` whether the robot can be turned so that a direction points up.
+
+    """
+
+    def __init__(self, driver: Driver, sensor: Any, *, warming: float = 0.0,
+                 flat: Any = (0.0, 0.0, 1.0), can_reach: Any = lambda up: True) -> None:
+        self.driver, self.sensor, self.warming, self.flat = driver, sensor, warming, flat
+        self.can_reach = can_reach
+        self.temperature, self.steps = 25.0, []
+        self._up, self._rng = np.array(flat, float), np.random.default_rng(5)
+
+    def rest(self, up: Any, seconds: float = 2.0) -> None:
+        """Turn the sensor, and hold it still."""
+        count = int(seconds * RATE)
+        way = np.linspace(self._up + 1e-3, np.asarray(up, float), 20)
+        turning = way / np.linalg.norm(way, axis=1)[:, np.newaxis]
+        turning = turning + 0.05 * self._rng.normal(size=(20, 3))
+        held = np.repeat([np.asarray(up, float)], count, axis=0)
+        reading = np.array([self.sensor(each, self.temperature)
+                            for each in np.concatenate([turning, held])])
+        reading += 0.0005 * self._rng.normal(size=reading.shape)
+        self.driver.feed(reading * GRAVITY, temperature=self.temperature)
+        self._up = np.asarray(up, float)
+        self.temperature += self.warming
+
+    def follow(self, most: int = 80) -> str:
+        """Do one step after the other; return the kind of the last one."""
+        self.rest(self.flat)
+        for _ in range(most):
+            now, action = state.progress(self.driver.session), next_action(self.driver.session)
+            assert (now.step, now.advice, now.command) == (
+                action.kind, action.words, action.command)
+            self.steps.append(action.kind)
+            if action.kind == 'done':
+                break
+            if now.direction and self.can_reach(np.array(now.direction)):
+                self.rest(now.direction)
+            elif action.command:
+                if action.kind == 'level':
+                    self.rest(self.flat, 4.0)
+                self.driver.done(getattr(self.driver.session.commands, action.command)())
+            else:
+                break
+        return self.steps[-1]
