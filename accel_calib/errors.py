@@ -5,12 +5,14 @@
 Errors that a user can fix, and the last resort for those that nobody expected.
 
 An error has a `message` (one line: what was found, what was expected) and an `advice` (one line:
-what to do).
+what to do). If it is about a log, `read_as` says how the log was read.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import errno
 import os
 import platform
@@ -24,6 +26,8 @@ from . import __version__
 class AccelCalibError(Exception):
     """The input is not valid."""
 
+    read_as = ''
+
     def __init__(self, message: str, advice: str) -> None:
         super().__init__(message, advice)
         self.message = message
@@ -31,6 +35,16 @@ class AccelCalibError(Exception):
 
     def __str__(self) -> str:
         return f'{self.message}; {self.advice}'
+
+
+@contextmanager
+def saying(read_as: str) -> Iterator[None]:
+    """Let the errors inside say how a log was read, unless they do already."""
+    try:
+        yield
+    except AccelCalibError as error:
+        error.read_as = error.read_as or read_as
+        raise
 
 
 class InputError(AccelCalibError):

@@ -110,6 +110,26 @@ def test_an_error_of_every_command_is_in_the_json(arguments, tmp_path, capsys, m
     assert result['advice']
 
 
+@pytest.mark.parametrize(('command', 'kind'), [
+    ('fit', 'poses'), ('refine', 'poses'), ('calibrate', 'poses'), ('fit', 'recording'),
+    ('refine', 'recording'), ('calibrate', 'recording'), ('verify', 'recording')])
+def test_a_refusal_says_how_the_log_was_read(command, kind, calibration, tmp_path, capsys):
+    log, rng = tmp_path / 'log.csv', np.random.default_rng(1)
+    few = rng.normal(size=(2 if kind == 'poses' else 500, 3)) * 9.8
+    time = 'time,' if kind == 'recording' else ''
+    log.write_text(f'{time}ax[g],ay[g],az[g]\n' + ''.join(
+        (f'{0.01 * k},' if time else '') + ','.join(f'{part / 9.8:.4f}' for part in row) + '\n'
+        for k, row in enumerate(few)))
+    more = {'calibrate': ('-o', tmp_path / 'c.yaml'), 'verify': ('-c', calibration)}
+    status, result = run_json(capsys, command, log, *more.get(command, ()))
+    assert status == 2
+    assert 'ax' in result['read_as']
+    assert run(command, log, *more.get(command, ())) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f'read as: {result["read_as"]}'
+    assert second.startswith(f'accel-calib {command}: ')
+
+
 def bad_table(folder, text):
     path = folder / 'bad.csv'
     path.write_text(text)

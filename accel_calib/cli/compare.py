@@ -17,7 +17,7 @@ from rich.table import Table
 
 from .fit import error_line, short_if_known
 from .frame import Done, plain, rated, rating_lines, table, working
-from .inputs import intake_for, rows_between
+from .inputs import intake, rows_between, stored_calibration
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
 from ..findings import (
@@ -39,10 +39,12 @@ FAILED = 1
 
 def run_verify(args: argparse.Namespace) -> Done:
     """Evaluate a calibration on the poses of a log."""
-    found, calibration = intake_for(args, args.poses)
-    poses = found.poses.take(rows_between(found.poses, args.rows))
-    check_units(poses, calibration.units)
-    verification = verify(calibration, poses)
+    stored = stored_calibration(args.calibration)
+    with intake(args, args.poses, stored) as found:
+        calibration = stored.in_units(found.units)
+        poses = found.poses.take(rows_between(found.poses, args.rows))
+        check_units(poses, calibration.units)
+        verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)
     if args.report is not None:
         from ..report import write_calibration_page

@@ -40,8 +40,7 @@ BAD_RATING = 1
 
 def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
-    found = intake(args, args.poses)
-    with working('fitting'):
+    with intake(args, args.poses) as found, working('fitting'):
         outcome = calibrated(found.poses, found.units, plan_of(
             args, refined=False, rows=rows_between(found.poses, args.rows)))
     calibration, rating = outcome.calibration, outcome.rating
@@ -94,8 +93,7 @@ def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
     from .refine import refinement_result
 
-    found = intake(args, args.log)
-    with working('fitting'):
+    with intake(args, args.log) as found, working('fitting'):
         outcome = calibrated(found.poses, found.units, plan_of(args))
     stored = _stored_outcome(args, found, outcome)
     ahead = outlook(outcome.calibration, 'auto')

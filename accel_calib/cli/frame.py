@@ -188,7 +188,8 @@ def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
 
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
     known = system_error(error) if isinstance(error, OSError) else error
-    return {'error': known.message, 'advice': known.advice}
+    read_as = {'read_as': known.read_as} if known.read_as else {}
+    return {'error': known.message, 'advice': known.advice, **read_as}
 
 
 def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 from .frame import Output, progress
 from ..calibrate import Calibration, FleetPrior
 from ..capture import CaptureSettings
-from ..errors import InputError
+from ..errors import InputError, saying
 from ..estimate import NORM_MODELS
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
@@ -45,17 +47,14 @@ def settings(args: argparse.Namespace) -> dict[str, Any]:
     return given(CaptureSettings, args)
 
 
-def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None = None) -> Intake:
-    """Return the poses of a log; a recording is captured."""
+@contextmanager
+def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None = None
+           ) -> Iterator[Intake]:
+    """Yield the poses of a log, captured from a recording; later errors say how it was read."""
     with progress('samples') as moved:
-        return poses_of(path, log_options(args, calibration), settings(args), moved)
-
-
-def intake_for(args: argparse.Namespace, path: Path) -> tuple[Intake, Calibration]:
-    """Return the poses of a log, and the calibration of ``-c`` in their unit."""
-    stored = stored_calibration(args.calibration)
-    found = intake(args, path, stored)
-    return found, stored.in_units(found.units)
+        found = poses_of(path, log_options(args, calibration), settings(args), moved)
+    with saying(found.read_as):
+        yield found
 
 
 def stored_calibration(path: Path) -> Calibration:

@@ -14,9 +14,8 @@ from typing import Any
 from rich.table import Table
 
 from .fit import error_line
-from .frame import Done, Output, rated, rating_lines, working
-from .inputs import intake, intake_for, prior, rows_between
-from ..calibrate import Calibration
+from .frame import Done, rated, rating_lines, working
+from .inputs import intake, prior, rows_between, stored_calibration
 from ..effects import effect_named
 from ..findings import rate_refinement
 from ..intake import Intake
@@ -34,22 +33,16 @@ def run_refine(args: argparse.Namespace) -> Done:
     rating = rate_refinement(result)
     return Done({'file': args.poses, **refinement_result(result), **rated(rating, args),
                  'read_as': found.read_as},
-                [*_shown(args, result, stored), *rating_lines(rating, args)],
+                [*found.lines, *_shown(args, result, stored), *rating_lines(rating, args)],
                 refusal=result.refusal if args.output else ())
 
 
 def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
-    """Refine with one log; print how it was read."""
-    base: str | Calibration = args.base
-    if args.calibration is None:
-        found = intake(args, args.poses)
-    else:
-        found, base = intake_for(args, args.poses)
-    for line in found.lines:
-        Output(stderr=True).print(line)
-    poses = found.poses.take(rows_between(found.poses, args.rows))
-    with working('refining'):
-        fleet = prior(args)
+    """Refine with one log."""
+    stored = args.calibration and stored_calibration(args.calibration)
+    with intake(args, args.poses, stored) as found, working('refining'):
+        poses = found.poses.take(rows_between(found.poses, args.rows))
+        base, fleet = stored.in_units(found.units) if stored else args.base, prior(args)
         if fleet is not None:
             return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
                                             date=now())

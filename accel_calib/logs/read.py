@@ -24,7 +24,7 @@ from .flight import FlightLog, is_ulg, read_ulg
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
 from ..disk import check_regular
-from ..errors import InputError
+from ..errors import InputError, saying
 from ..table import check_units, check_values, Poses, Recording
 from ..units import Units, units_of
 
@@ -132,6 +132,13 @@ def open_log(path: Path, options: LogOptions = LogOptions()) -> Iterator[OpenLog
     """
     if not path.is_dir():
         check_regular(path)
+    with _opened(path, options) as log, saying(log.read_as):
+        yield log
+
+
+@contextmanager
+def _opened(path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    """Open a log; parameters and errors as in `open_log`."""
     if is_bag(path):
         with open_bag(path) as bag:
             yield _bag(bag, options)
@@ -154,7 +161,7 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     # Drivers exist that publish g, although Imu messages are in m/s².
     units = units_of(options.units or 'm/s2', options.gravity)
     return OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
-                   noted=lambda: notes)
+                   f'Imu messages of {topic} in {units.name}', noted=lambda: notes)
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
@@ -181,7 +188,14 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
-    blocks = _timed(path, converted(path, chain((first,), cells), quantities), options.rate)
+    with saying(quantities.read_as):
+        return _decided(path, text, chain((first,), cells), quantities, options)
+
+
+def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities,
+             options: LogOptions) -> OpenLog:
+    """Return a text log whose columns and units are known."""
+    blocks = _timed(path, converted(path, cells, quantities), options.rate)
     head = next(blocks)
     units, sensor = quantities.units, str(text.layout.about.get('sensor', ''))
     check_units(Poses(*head), units, str(path))
