@@ -168,7 +168,7 @@ from accel_calib.report.sheet import snippets
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store
 from accel_calib.session import worker
-from accel_calib.session.guidance import Action, Guide, next_action, Plan
+from accel_calib.session.guidance import Guide, next_action, Plan
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
 from accel_calib.session.sensor_files import load as load_store

@@ -8,7 +8,7 @@ from pathlib import Path
 import tracemalloc
 from typing import Any
 
-from accel_calib.calibrate import fit_poses, joined_ranges, of_samples, outside
+from accel_calib.calibrate import fit_poses, of_samples, outside, SampleContext
 from accel_calib.effects import empirical_name
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.session import CalibratorSettings, Log, Session
@@ -62,13 +62,13 @@ def test_quantities_are_counted_over_blocks():
     calibration = calibrated(TCO)
     warm = np.array([25.0, 29.0, 35.0, np.nan, 41.0])
     whole = outside(calibration, {'temperature': warm})
-    parts = joined_ranges(outside(calibration, {'temperature': warm[:2]}),
-                          outside(calibration, {'temperature': warm[2:]}))
-    assert parts == whole
+    blocks = SampleContext(calibration)
+    for part in (warm[:0], warm[:2], warm[2:]):
+        blocks.of({'temperature': part}, len(part))
+    assert blocks.left == [whole['temperature']]
     found = whole['temperature']
     assert (found.count, found.samples) == (2, 4)
     assert (found.least, found.most) == (25.0, 41.0)
-    assert joined_ranges({}, whole) == joined_ranges(whole, {}) == whole
 
 
 def test_quantities_inside_are_not_counted():

@@ -204,11 +204,25 @@ def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]
                     float(np.min([high for _, high in ends])))}
 
 
-def joined_ranges(one: Mapping[str, Outside], other: Mapping[str, Outside]) -> dict[str, Outside]:
-    """Return the quantities of two blocks of samples as one."""
-    found = {**one, **other}
-    for key in one.keys() & other.keys():
-        a, b = one[key], other[key]
-        found[key] = replace(a, count=a.count + b.count, samples=a.samples + b.samples,
-                             least=min(a.least, b.least), most=max(a.most, b.most))
-    return found
+class SampleContext:
+    """The context of the samples of a log, block by block, and what leaves its ranges."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self._thermal = thermal_stream(calibration.model)
+        self._compared: dict[str, Outside] = {}
+
+    def of(self, known: Context, count: int) -> Context:
+        """Return the context of the next block as `of_samples` does."""
+        context = of_samples(known, count, self._calibration.model, self._thermal)
+        for key, block in outside(self._calibration, context).items():
+            before = self._compared.get(key)
+            self._compared[key] = block if before is None else replace(
+                block, count=before.count + block.count, samples=before.samples + block.samples,
+                least=min(before.least, block.least), most=max(before.most, block.most))
+        return context
+
+    @property
+    def left(self) -> list[Outside]:
+        """Return the quantities that have left the range of the calibration so far."""
+        return [each for each in self._compared.values() if each.count]

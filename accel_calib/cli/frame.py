@@ -141,7 +141,10 @@ def _run_one(args: argparse.Namespace) -> int:
         done = _function('run', args.command)(args)
     except (AccelCalibError, OSError) as err:
         about = {'file': getattr(args, command.about)} if command.about else {}
-        write_json(target, {**about, **_of_error(err)})
+        error = _of_error(err)
+        write_json(target, {**about, **error})
+        if 'read_as' in error and target != STANDARD_OUTPUT:
+            console(args).print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
     output = console(args)

@@ -100,8 +100,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return run(args)
     except AccelCalibError as err:
-        if err.read_as:
-            print(f'read as: {in_one_line(err.read_as)}', file=sys.stderr)
         return _refuse(args.command, str(err))
     except OSError as err:
         return _refuse(args.command, str(system_error(err)))

@@ -20,11 +20,9 @@ from .inputs import log_options, settings, stored_calibration
 from ..calibrate import (
     Calibration,
     check_sensor,
-    joined_ranges,
     of_samples,
     Outside,
-    outside,
-    thermal_stream,
+    SampleContext,
 )
 from ..capture import capture, Captured, settings_from
 from ..effects import Context, parse_effect
@@ -95,36 +93,21 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration,
           progress('samples') as moved):
         calibration = calibration.in_units(log.units)
         check_sensor(calibration, log.sensor)
-        correction = _Correction(calibration)
+        context = SampleContext(calibration)
         blocks = log.watched(moved) if log.poses is None else (log.poses,)
-        count = write_blocks(out, map(correction, blocks))
+        count = write_blocks(out, (corrected(block, calibration,
+                                             context.of(block.columns, len(block)))
+                                   for block in blocks))
         lines += [f'read as: {log.read_as}'] if log.read_as else []
         lines += [f'note: {line}' for line in log.notes]
-    for each in correction.outside.values():
-        if each.count:
-            report(each)
+    for each in context.left:
+        report(each)
     return count
 
 
-class _Correction:
-    """The correction of the blocks of a log, in order."""
-
-    def __init__(self, calibration: Calibration) -> None:
-        self._calibration = calibration
-        self._thermal = thermal_stream(calibration.model)
-        self.outside: dict[str, Outside] = {}
-
-    def __call__(self, block: Poses | Recording) -> Poses | Recording:
-        """Return a corrected block."""
-        calibration = self._calibration
-        known = of_samples(block.columns, len(block), calibration.model, self._thermal)
-        self.outside = joined_ranges(self.outside, outside(calibration, known))
-        return _corrected(block, calibration, known)
-
-
-def _corrected(table: Poses | Recording, calibration: Calibration, known: Context
-               ) -> Poses | Recording:
-    """Return a table with the corrected readings, in m/s² or g."""
+def corrected(table: Poses | Recording, calibration: Calibration, known: Context
+              ) -> Poses | Recording:
+    """Return a table with the corrected readings, in m/s² or g; `known` is its context."""
     columns = {'reading': calibration.correct(table.reading, known)}
     units: UnitName = 'g' if calibration.units.is_native else calibration.units.name
     if 'rate' in table:

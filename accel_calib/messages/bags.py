@@ -26,11 +26,8 @@ from .correction import corrected, output_frame, output_scale
 from ..calibrate import (
     Calibration,
     check_sensor,
-    joined_ranges,
-    of_samples,
     Outside,
-    outside,
-    thermal_stream,
+    SampleContext,
 )
 from ..errors import InputError
 from ..logs import (
@@ -118,9 +115,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
             correction = _Correction(calibration, bag, name, sensor, context,
                                      units_of(units, gravity), gravity)
             count = _copy(bag, folder, out, correction, progress)
-        for each in correction.outside.values():
-            if each.count:
-                report(each)
+        for each in correction.context.left:
+            report(each)
         for line in (*bag.notes, *context.notes, *bag.lost(name, count)):
             note(line)
         return count
@@ -158,9 +154,8 @@ class _Correction:
         self._frame_id = output_frame(calibration, sensor)
         self._units, self._tracks = units, context.tracks()
         self._scale = output_scale(calibration, gravity)
-        self._thermal = thermal_stream(calibration.model)
+        self.context = SampleContext(calibration)
         self.topic, self.done = topic, 0
-        self.outside: dict[str, Outside] = {}
 
     def __call__(self, raws: list[bytes]) -> Messages:
         """Return corrected messages in a new buffer."""
@@ -171,8 +166,7 @@ class _Correction:
         for key, track in self._tracks.items():
             context[key] = track.at(context['time'])
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
-        known = of_samples(context, len(doubles), self._calibration.model, self._thermal)
-        self.outside = joined_ranges(self.outside, outside(self._calibration, known))
+        known = self.context.of(context, len(doubles))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
             put_doubles(messages, corrected(self._calibration, doubles, known,
                                             scale=self._scale))
