@@ -10,6 +10,7 @@ import shlex
 import accel_calib as ac
 from accel_calib.finding import Finding, NextStep, STEPS
 from inside import main
+import numpy as np
 import pytest
 
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.01, 0.005]}
@@ -63,6 +64,21 @@ def test_the_same_poses_have_the_same_verdict_and_next_step_everywhere(effects, 
     assert (rating.next.kind, rating.next.text) == (fit['next']['kind'], fit['next']['text'])
     page = (tmp_path / 'c.html').read_text(encoding='utf-8')
     assert rating.next.text.replace("'", '&#x27;')[1:] in page
+
+
+@pytest.mark.parametrize('noise_known', [False, True])
+def test_after_a_search_without_result_nobody_is_sent_to_search_again(noise_known, tmp_path):
+    path, rng = tmp_path / 'poses.csv', np.random.default_rng(4)
+    table = ac.simulate(COMMON, poses=40, units='g', seed=5)
+    scattered = table.reading + 0.012 * rng.normal(size=table.reading.shape)
+    more = ',std_x,std_y,std_z,count' if noise_known else ''
+    path.write_text('\n'.join([f'ax,ay,az{more}', *(
+        ','.join(map(str, row.tolist())) + (',0.001,0.001,0.001,100' if noise_known else '')
+        for row in scattered)]) + '\n', encoding='utf-8')
+    first = result_of(f'accel-calib fit {path} --units g -o {tmp_path}/c.yaml', tmp_path)
+    assert (first['rating'], first['next']['kind']) == ('USABLE', 'refine')
+    again = result_of(first['next']['command'], tmp_path)
+    assert (again['rating'], again['next']['kind']) == ('USABLE', 'poses')
 
 
 def test_a_finding_names_the_kind_of_its_step() -> None:

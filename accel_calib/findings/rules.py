@@ -36,14 +36,17 @@ if TYPE_CHECKING:
     from ..refine import Refinement
 
 _REFINE = NextStep('refine', 'run refine to find the missing effect')
+_CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '
+                  'poses again')
 
 
 def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:
     """Return what is worth knowing about a calibration, that which decides its rating first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
-    own = [*_refused(expected, refinement), *_too_large(expected), *_limited(expected),
-           *_checked(expected), *named, *_inexact(expected, error), *_left_out(expected)]
+    own = [*_refused(expected, refinement), *_too_large(expected, refinement), *_limited(expected),
+           *_checked(expected), *named, *_inexact(expected, error, refinement),
+           *_left_out(expected)]
     kinds = {each.kind for each in own}
     return ranked((*own, *without(expected.calibration.noted, *kinds)))
 
@@ -55,9 +58,9 @@ def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Find
         yield Finding('refused', message, advice, 'BAD')
 
 
-def _too_large(expected: Expected) -> Iterator[Finding]:
+def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding if the readings are as good without the calibration."""
-    own, remedy = expected.own_mg, _remedy(expected)
+    own, remedy = expected.own_mg, _remedy(expected, refinement)
     before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
@@ -134,8 +137,7 @@ def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator
         advice = 'let the sensor warm up, and take the poses within a few minutes'
     else:
         what = f'{begin}, and no effect explains them'
-        advice = ('check what differs between the poses, clamp the sensor, and take the poses '
-                  'again')
+        advice = _CHECK.text
     yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
 
 
@@ -158,7 +160,8 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
                               'single samples', level='USABLE')
 
 
-def _inexact(expected: Expected, error: float) -> Iterator[Finding]:
+def _inexact(expected: Expected, error: float, refinement: Refinement | None
+             ) -> Iterator[Finding]:
     """Yield a finding if an error that has no name yet is too large [mg]."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
@@ -168,7 +171,7 @@ def _inexact(expected: Expected, error: float) -> Iterator[Finding]:
                           f'determine: the error may be {mg(error)}', _more_poses(expected),
                           'USABLE')
         else:
-            remedy = _remedy(expected)
+            remedy = _remedy(expected, refinement)
             yield Finding('new_orientations', 'the error in new orientations is up to '
                           f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}', remedy.text,
                           'USABLE', step=remedy.kind)
@@ -197,10 +200,12 @@ def _more_poses(expected: Expected) -> str:
     return f'take {counted(more, "more pose") if more > 0 else "more poses"}: {asked.words}'
 
 
-def _remedy(expected: Expected) -> NextStep:
+def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:
     """Return what reduces the larger part of the error."""
     if expected.hidden_mg <= BOUND * expected.stated_mg:
         return NextStep('poses', _more_poses(expected))
+    if refinement is not None:
+        return _CHECK
     if expected.noise_mg is None:
         return NextStep('refine', 'hold the sensor still in each pose, record std and count, and '
                         'run refine to find what is missing')
