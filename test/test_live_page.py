@@ -148,6 +148,7 @@ def test_a_person_who_follows_the_page_gets_a_good_calibration(
         assert frame.locator('img[src=x]').count() == page.locator('img').count() == 0
         assert page.title() != '1'
         assert is_within(page, SIZES[0][0])
+        viewers.close()  # before the server, whose end is an error in the console
     stored = read_calibration(tmp_path / name)
     off = stored.offset / GRAVITY - np.array(TRUTH['offset'])
     assert np.all(np.abs(off) < 5.0 * stored.offset_sd / GRAVITY)
@@ -381,6 +382,7 @@ def test_the_page_is_served_over_ipv6(tmp_path: Path, viewers: Viewers) -> None:
         assert live.link.startswith('http://[::1]:')
         page = viewers.visit(live.link)
         expect(page.locator('#next')).to_have_text(re.compile(' up$'))
+        viewers.close()
 
 
 def test_the_sound_switch_is_remembered(idle: LivePage, viewers: Viewers) -> None:
