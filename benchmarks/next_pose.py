@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from itertools import product
 from pathlib import Path
 import sys
 
@@ -26,6 +25,7 @@ from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate import pose_noise  # noqa: E402
+from accel_calib.geometry import ATTITUDES  # noqa: E402
 from accel_calib.table import Floats, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
 from directions import random_directions  # noqa: E402
@@ -42,13 +42,6 @@ SHOWN = (9, 10, 11, 12, 14, 16, 18, 20, 24)
 Order = Callable[[Poses | None, int, np.random.Generator], Floats]
 
 
-def attitudes() -> Floats:
-    """Return the 6 faces, 12 edges and 8 corners, (26, 3)."""
-    signs = [s for s in product((0, 1, -1), repeat=3) if any(s)]
-    found = np.array(sorted(signs, key=lambda each: sum(map(abs, each))), float)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
 def held(direction: Floats, rng: np.random.Generator) -> Floats:
     """Return a direction as a person holds it."""
     off = rng.normal(size=3) * OFF
@@ -63,12 +56,12 @@ def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
     else:
         directions = directions_of(poses, G)
         found = next_pose(directions, '10', pose_noise(poses.noise, directions))
-    return attitudes()[rng.integers(26)] if found.direction is None else found.direction
+    return ATTITUDES[rng.integers(26)] if found.direction is None else found.direction
 
 
 def in_order(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
     """Return the faces, then the edges, then the corners."""
-    return attitudes()[count % 26]
+    return ATTITUDES[count % 26]
 
 
 def at_random(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
@@ -78,7 +71,7 @@ def at_random(poses: Poses | None, count: int, rng: np.random.Generator) -> Floa
 
 def of_the_26(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
     """Return one of the 26 attitudes."""
-    return attitudes()[rng.integers(26)]
+    return ATTITUDES[rng.integers(26)]
 
 
 ORDERS: dict[str, tuple[Order, bool]] = {

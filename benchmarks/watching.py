@@ -25,7 +25,7 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.compare import compared, monitor, rests_of  # noqa: E402
+from accel_calib.compare import compared, monitor, rest_errors  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
@@ -112,8 +112,8 @@ class Sensor:
         truth, calibration = made
         reading = predict(truth, up, {}) + shift + self.noise * rng.normal(size=up.shape)
         state, reported = monitor(calibration), []
-        for rest in rests_of(calibration, self.scattered(reading, rng),
-                             np.full(up.shape, self.noise), {}):
+        for rest in rest_errors(calibration, self.scattered(reading, rng),
+                                np.full(up.shape, self.noise), {}):
             state = compared(state, rest, LEAST)
             reported.append(state.change is not None)
         return reported

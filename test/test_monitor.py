@@ -9,7 +9,7 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
-from accel_calib.compare import compared, Drift, monitor, rests_of, status
+from accel_calib.compare import compared, Drift, monitor, rest_errors, status
 from accel_calib.logs import read_recording
 from accel_calib.units import units_of
 from inside import DRIFT_MEMORY, Model, predict, simulate_poses, spread_directions
@@ -35,7 +35,7 @@ def rested(before: Drift, calibration: Calibration, truth: Model, up: Any,
     mean = predict(truth, np.atleast_2d(np.asarray(up, float)), {}) + shift
     mean = mean + noise * rng.normal(size=mean.shape)
     context = {} if temperature is None else {'temperature': np.full(len(mean), temperature)}
-    for rest in rests_of(calibration, mean, np.full(mean.shape, noise), context):
+    for rest in rest_errors(calibration, mean, np.full(mean.shape, noise), context):
         before = compared(before, rest, LEAST)
     return before
 
@@ -139,7 +139,7 @@ def test_sensor_that_repeats_worse_than_stated_is_not_reported_as_changed() -> N
     state = monitor(calibration)
     reading = predict(truth, random_directions(1500, rng), {})
     reading = reading + 0.0003 * rng.normal(size=reading.shape)
-    for rest in rests_of(calibration, reading, np.full(reading.shape, 0.0001), {}):
+    for rest in rest_errors(calibration, reading, np.full(reading.shape, 0.0001), {}):
         state = compared(state, rest, LEAST)
         assert state.change is None
     assert state.scatter == pytest.approx(2.5, rel=0.5)
@@ -199,10 +199,10 @@ def test_real_rests_are_not_a_change_unless_shifted(name: str, unit: Any) -> Non
     force = calibration.correct(rests.reading)
     shift = calibration.predict(1.005 * force) - calibration.predict(force)
     state = monitor(calibration)
-    for rest in rests_of(calibration, rests.reading, rests.noise, {}):
+    for rest in rest_errors(calibration, rests.reading, rests.noise, {}):
         state = compared(state, rest, LEAST)
         assert state.change is None
-    for rest in rests_of(calibration, (rests.reading + shift)[:3], rests.noise[:3], {}):
+    for rest in rest_errors(calibration, (rests.reading + shift)[:3], rests.noise[:3], {}):
         state = compared(state, rest, LEAST)
     assert state.change is not None
     assert state.lasted == 3

@@ -175,10 +175,10 @@ def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
     A table of slow samples has the form of a pose table without the columns of a pose.
 
     """
-    from ..noise import joined
+    from ..noise import whole
 
     if log.poses is None:
-        return joined(log.watched(moved))
+        return whole(log.watched(moved))
     if 'time' in log.poses and 'count' not in log.poses:
         return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
     raise InputError(f'{path} is a pose table, expected a recording',

@@ -242,8 +242,8 @@ class Drift:
         return self.rests[-1].temperature if self.rests else np.nan
 
 
-def rests_of(calibration: Calibration, reading: Floats, noise: Floats, context: Context
-             ) -> list[RestError]:
+def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, context: Context
+                ) -> list[RestError]:
     """Return rests from (n, 3) mean readings and the noise of these means, in their unit."""
     model, units = calibration.model, calibration.units
     u = sensor_force(model, units.to_g(reading), context)

@@ -88,7 +88,7 @@ def believable(noise: Floats | None) -> Floats | None:
     return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
-def noise_of(poses_g: Poses) -> Floats | None:
+def noise_of_means(poses_g: Poses) -> Floats | None:
     """Return the believable (n, 3) noise of the pose means [g]; None if it is not known."""
     return believable(poses_g.noise)
 
@@ -100,7 +100,7 @@ def originals(poses_g: Poses) -> Indices:
     Context, such as the temperature, is compared, too.
 
     """
-    reading, noise = poses_g.reading, noise_of(poses_g)
+    reading, noise = poses_g.reading, noise_of_means(poses_g)
     found = np.arange(len(reading))
     cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
     place = reading / cell
@@ -159,7 +159,7 @@ class Measured:
 
 def measured(poses_g: Poses) -> Measured:
     """Return poses in g as the equations use them, without the noise that is not believable."""
-    noise, reading = noise_of(poses_g), poses_g.reading
+    noise, reading = noise_of_means(poses_g), poses_g.reading
     s = np.full(reading.shape, USUAL_NOISE_G) if noise is None else noise
     known, shared, alone = kinds(poses_g)
 

@@ -136,11 +136,12 @@ def rate_verification(verification: Verification, calibration: Calibration,
 
     """
     expected, floor = Expected(calibration), verification.noise_floor_mg
+    own = rate(calibration)
     error = _without_noise(verification.rms_after_mg, floor)
-    found = [*_on_new_poses(verification, expected, error)]
+    found = [*_on_new_poses(verification, expected, own, error)]
     covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
-        found += rate(calibration).findings
+        found += own.findings
     noise = 'noise not known' if floor is None else f'noise {mg(floor)}'
     figures = (f'{number(verification.rms_before_mg)} -> {mg(verification.rms_after_mg)}, '
                f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}')
@@ -150,7 +151,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
     return _rated(found, good, figures, step_after(calibration))
 
 
-def _on_new_poses(verification: Verification, expected: Expected, error: float
+def _on_new_poses(verification: Verification, expected: Expected, own: Rating, error: float
                   ) -> Iterator[Finding]:
     """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
@@ -165,7 +166,7 @@ def _on_new_poses(verification: Verification, expected: Expected, error: float
                       'BAD' if error > MATTERS.value else 'USABLE', step='fit')
     stated = expected.error_mg
     changed = error > max(CHANGED.value * stated, MATTERS.value)
-    if changed and rate(expected.calibration).name == 'GOOD':
+    if changed and own.name == 'GOOD':
         yield Finding('changed', f'the error of these poses is {mg(error)}, and the fit states '
                       f'{mg(stated)}: the sensor has changed', again, 'USABLE')
     elif error > GOOD_ERROR.value:

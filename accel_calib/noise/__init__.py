@@ -11,8 +11,8 @@ returns these by axis, with their limits in words, and as JSON.
 """
 
 from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
-from .curve import check_allantools, joined
+from .curve import check_allantools, whole
 from .figures import duration, noise_of, to_json
 
 __all__ = ['FIGURES', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
-           'duration', 'joined', 'noise_of', 'shown_unit', 'to_json']
+           'duration', 'noise_of', 'shown_unit', 'to_json', 'whole']

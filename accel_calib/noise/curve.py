@@ -334,7 +334,7 @@ def _jitter(step: Floats) -> list[str]:
             f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms']
 
 
-def joined(blocks: Iterable[Recording]) -> Recording:
+def whole(blocks: Iterable[Recording]) -> Recording:
     """Return blocks of a recording as one, with the columns that all have."""
     parts = [block for block in blocks if len(block)]
     if not parts:

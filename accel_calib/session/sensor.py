@@ -33,7 +33,7 @@ from .settings import CalibratorSettings, capture_settings
 from .stream import StreamStatistics
 from ..calibrate import Calibration, GyroBias, Outside, outside, SampleNoise, thermal_stream
 from ..capture import Dwell
-from ..compare import compared, Drift, monitor, rests_of
+from ..compare import compared, Drift, monitor, rest_errors
 from ..effects import Context, Model, ThermalStream
 from ..errors import InputError
 from ..messages import output_scale
@@ -231,7 +231,7 @@ class Sensor:
         if self._past is None or self.calibration is None or context is None:
             return self._past
         noise = rest.std[np.newaxis] / math.sqrt(rest.count)
-        found = rests_of(self.calibration, rest.mean[np.newaxis], noise, context)
+        found = rest_errors(self.calibration, rest.mean[np.newaxis], noise, context)
         return compared(self._past, found[0], least)
 
     def _hold(self) -> None:
