@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from .api import Calibration as Calibration
     from .api import capture as capture
     from .api import compare as compare
+    from .api import Effect as Effect
     from .api import fit as fit
     from .api import load as load
     from .api import Poses as Poses
@@ -70,8 +71,8 @@ if TYPE_CHECKING:
 
 __version__ = '0.1.0'
 
-__all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
-           'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'capture', 'compare',
+           'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
 
 
 class _Package(ModuleType):

@@ -21,7 +21,8 @@ from .capture import capture as find_still
 from .capture import settings_from
 from .compare import compare as compare_calibrations
 from .compare import Comparison
-from .effects import model_with, simulate_poses, simulate_recording
+from .effects import know, model_with, simulate_poses, simulate_recording
+from .effects import OwnEffect as Effect
 from .errors import InputError
 from .finding import Finding
 from .findings import rate, Rating
@@ -37,8 +38,8 @@ from .table import check_units, columns_from, Floats, numbered, Poses, Recording
 from .text import counted, now
 from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
 
-__all__ = ['Calibration', 'Poses', 'Recording', 'Refinement', 'capture', 'compare', 'fit', 'load',
-           'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'capture', 'compare',
+           'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
 
 Source = str | PathLike[str]
 Data = Any
@@ -127,7 +128,7 @@ class Calibration(calibrate.Calibration):
         return result
 
 
-def load(path: Source) -> Calibration:
+def load(path: Source, *, also: Sequence[Effect] = ()) -> Calibration:
     """
     Read a stored calibration.
 
@@ -135,6 +136,8 @@ def load(path: Source) -> Calibration:
     ----------
     path : str or Path
         YAML file written by `Calibration.save`, a command or the node.
+    also : sequence of Effect
+        Own effects that the calibration may have.
 
     Returns
     -------
@@ -149,6 +152,7 @@ def load(path: Source) -> Calibration:
         If the file cannot be read.
 
     """
+    know(also)
     return _public(read_calibration(Path(path)))
 
 
@@ -313,8 +317,8 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
-           units: UnitName | None = None, gravity: float = STANDARD_GRAVITY, sensor: str = ''
-           ) -> Refinement:
+           units: UnitName | None = None, gravity: float = STANDARD_GRAVITY, sensor: str = '',
+           also: Sequence[Effect] = ()) -> Refinement:
     """
     Find effects that a calibration lacks, and add them to it.
 
@@ -330,6 +334,8 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
         Local gravity [m/s²]; not used with a stored calibration.
     sensor : str
         Name of the sensor; by default the name in the poses.
+    also : sequence of Effect
+        Own effects, which are tried beside those of the catalogue.
 
     Returns
     -------
@@ -345,14 +351,17 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
         If the readings are clearly in another unit.
 
     """
+    names = know(also)
     if isinstance(base, calibrate.Calibration):
         table = _poses(poses, _asked(units, base), base.units.per_g)
         stored = _in_units_of(base, table, units)
-        found = find_effects(table, stored.units, base=stored, sensor=sensor, date=now())
+        found = find_effects(table, stored.units, base=stored, sensor=sensor, date=now(),
+                             also=names)
     else:
         table = _poses(poses, units, gravity)
         known = _units(units, gravity, table.units, 'the pose table')
-        found = find_effects(table, known, base=base, sensor=sensor, date=now())
+        found = find_effects(table, known, base=base, sensor=sensor, date=now(),
+                             also=names)
     return replace(found, calibration=_public(found.calibration))
 
 
@@ -430,8 +439,8 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
              rate: float = 100.0, dwell: float = 3.0, turn: float = 1.0,
              temperature: ArrayLike = (), mounting: ArrayLike = (0.0, 0.0, 0.0),
              reference: bool = False, units: UnitName = 'm/s2',
-             gravity: float = STANDARD_GRAVITY, seed: int = 0, **context: ArrayLike
-             ) -> Poses | Recording:
+             gravity: float = STANDARD_GRAVITY, seed: int = 0, also: Sequence[Effect] = (),
+             **context: ArrayLike) -> Poses | Recording:
     """
     Simulate poses, or a recording, of a sensor with known effects.
 
@@ -464,6 +473,8 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         Local gravity [m/s²].
     seed : int
         Seed of the noise.
+    also : sequence of Effect
+        Own effects that `effects` can name.
     **context : array
         Further columns of context, such as ``time`` [s]; n rows each.
 
@@ -478,6 +489,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         If an effect is not in the catalogue, or needs a column that is missing.
 
     """
+    know(also)
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))

@@ -57,6 +57,8 @@ class Plan:
         The levelled frame.
     sensor : str
         Name of the sensor; by default the name in the poses.
+    also : tuple of str
+        Names of own effects of the user, which the search tries beside the catalogue.
 
     """
 
@@ -69,6 +71,7 @@ class Plan:
     nose_down: int | None = None
     frame: FrameName = 'ros'
     sensor: str = ''
+    also: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
         else fit_with_fleet(chosen, units, plan.fleet, sensor=plan.sensor, date=date))
     refinement, line = None, 'not refined, as asked'
     if plan.refined:
-        refinement, line = _refinement(chosen, units, plan.sensor, date, plan.fleet)
+        refinement, line = _refinement(chosen, units, plan, date)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
     calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
@@ -124,14 +127,15 @@ def _row(poses: Poses, flat: Flat) -> int | None:
     return flat
 
 
-def _refinement(poses: Poses, units: Units, sensor: str, date: str,
-                fleet: FleetPrior | None) -> tuple[Refinement | None, str]:
+def _refinement(poses: Poses, units: Units, plan: Plan, date: str
+                ) -> tuple[Refinement | None, str]:
     """Return the search for effects, and a line about it; None if the poses are too few."""
     from .refine import refine, refine_with_fleet  # a fit alone does not load the search
 
+    fleet, named = plan.fleet, {'sensor': plan.sensor, 'date': date}
     try:
-        found = (refine(poses, units, sensor=sensor, date=date) if fleet is None
-                 else refine_with_fleet(poses, units, fleet, sensor=sensor, date=date))
+        found = (refine(poses, units, **named, also=plan.also) if fleet is None
+                 else refine_with_fleet(poses, units, fleet, **named, also=plan.also))
     except RefusedFitError as err:
         return None, f'not refined: {err.message}'
     if found.refusal:

@@ -5,7 +5,9 @@
 Tables of readings with their context: poses and recordings.
 
 `COLUMNS` is the only list of columns. Files, simulation, effects and documentation read names,
-units and meanings there.
+units and meanings there. Any other column of numbers is a quantity, such as ``pressure``: a cause
+that `accel_calib.refine` tries. Its key is its name, with one ``_`` for other characters than
+letters and digits.
 
 """
 
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+import re
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -23,7 +26,7 @@ from .text import counted, table
 from .units import Floats, STANDARD_GRAVITY, UnitName, Units
 
 __all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Recording', 'Table', 'check_values',
-           'columns_from', 'numbered', 'present']
+           'column_of', 'columns_from', 'is_quantity', 'numbered', 'present', 'quantity_key']
 
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
@@ -76,6 +79,26 @@ COLUMNS: dict[str, Column] = {
                   made=True),
 }
 
+_NAMES = {*COLUMNS, 'force', *(name for column in COLUMNS.values() for name in column.names)}
+_KEY = re.compile(r'[^\W\d]\w{0,63}')
+
+
+def quantity_key(name: str) -> str:
+    """Return the key of a column that is not in `COLUMNS`; empty if its name has none."""
+    key = re.sub(r'[\W_]+', '_', name).strip('_')
+    return key if is_quantity(key) and name not in _NAMES else ''
+
+
+def is_quantity(key: str) -> bool:
+    """Return whether a key is that of a quantity, which is not in `COLUMNS`."""
+    return key not in _NAMES and _KEY.fullmatch(key) is not None
+
+
+def column_of(key: str) -> Column:
+    """Return the column of a key: of `COLUMNS`, or a quantity, whose unit is not known."""
+    return COLUMNS.get(key) or Column((key,), '', key.replace('_', ' '))
+
+
 _Self = TypeVar('_Self', bound='Table')
 
 _PREVIEW_ROWS = 20
@@ -90,7 +113,7 @@ class Table:
     Parameters
     ----------
     columns : mapping of str to array
-        Keys of `COLUMNS`; each array has n rows. ``reading`` is always present.
+        Keys of `COLUMNS`, and quantities; each array has n rows. ``reading`` is always present.
     row : (n,) array of int
         Row numbers in the source, from 1.
     units : {'m/s2', 'g', 'native', ''}
@@ -109,7 +132,7 @@ class Table:
         if 'reading' not in self.columns:
             raise ValueError('the table has no readings, expected the column reading')
         for key, values in self.columns.items():
-            width = len(COLUMNS[key].names)
+            width = len(column_of(key).names)
             shape = (len(self.row),) if width == 1 else (len(self.row), width)
             if values.shape != shape:
                 raise ValueError(f'column {key} has shape {values.shape}, expected {shape}')
@@ -130,8 +153,8 @@ class Table:
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table, for notebooks."""
-        keys = [key for key in COLUMNS if key in self]
-        names = [name for key in keys for name in COLUMNS[key].names]
+        keys = [*(key for key in COLUMNS if key in self), *self.quantities]
+        names = [name for key in keys for name in column_of(key).names]
         first = self.take(slice(_PREVIEW_ROWS))
         cells = [[str(row)] for row in first.row]
         for key in keys:
@@ -145,6 +168,11 @@ class Table:
     def reading(self) -> Floats:
         """(n, 3) array, the readings in the unit `units`."""
         return self.columns['reading']
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Keys of the columns that are not in `COLUMNS`."""
+        return tuple(key for key in self.columns if key not in COLUMNS)
 
     def take(self: _Self, which: NDArray[Any] | slice) -> _Self:
         """Return the rows at these indices, or where this mask is true."""
@@ -186,8 +214,9 @@ def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
     """
     Return columns under the keys of `COLUMNS`, from columns under their names in a file.
 
-    `given` has n values for each name; other names are ignored. Raise InputError if a key of
-    `needed` or a part of a column is missing, or a value is not valid. `source` is for the error.
+    `given` has n values for each name. Other columns of finite numbers are quantities, the rest is
+    ignored. Raise InputError if a key of `needed` or a part of a column is missing, or a value is
+    not valid. `source` is for the error.
 
     """
     columns: dict[str, NDArray[Any]] = {}
@@ -196,7 +225,18 @@ def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
         values = np.column_stack(parts) if len(parts) > 1 else parts[0]
         columns[key] = values.astype(str) if key == 'label' else values.astype(float)
     check_values(columns, source)
-    return columns
+    return {**columns, **quantities_of(given)}
+
+
+def quantities_of(given: Mapping[str, Any]) -> dict[str, Floats]:
+    """Return the columns of finite numbers that are not in `COLUMNS`, by key."""
+    found: dict[str, Floats] = {}
+    for name, values in given.items():
+        numbers = np.asarray(values)
+        if quantity_key(name) and numbers.dtype.kind in 'iuf' and np.all(
+                np.abs(numbers) < LARGEST):
+            found.setdefault(quantity_key(name), numbers.astype(float))
+    return found
 
 
 def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
@@ -218,7 +258,7 @@ def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[s
 def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
     """Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0."""
     for key, values in columns.items():
-        if key != 'label' and not np.all(np.abs(values) < LARGEST):
+        if key in COLUMNS and key != 'label' and not np.all(np.abs(values) < LARGEST):
             raise _beyond(key, values.reshape(len(values), -1), source)
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
@@ -235,7 +275,8 @@ def _beyond(key: str, values: NDArray[Any], source: str) -> InputError:
     row = int(np.argmin(sound.all(axis=1)))
     number = float(values[row][~sound[row]][0])
     what = f'the number {number:.3g}' if np.isfinite(number) else 'a number that is not finite'
-    return InputError(f'{source}: row {row + 1} of {", ".join(COLUMNS[key].names)} holds {what}, '
+    names = ', '.join(COLUMNS[key].names)
+    return InputError(f'{source}: row {row + 1} of {names} holds {what}, '
                       f'expected finite numbers below {LARGEST:g}', 'correct the row or remove it')
 
 

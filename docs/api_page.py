@@ -23,7 +23,7 @@ from accel_calib.units import Units
 
 FUNCTIONS = ('capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify', 'compare',
              'simulate', 'load')
-RECORDS = ('Poses', 'Recording', 'Calibration', 'Refinement')
+RECORDS = ('Poses', 'Recording', 'Calibration', 'Refinement', 'Effect')
 """The names of ``accel_calib.__all__``, in the order of the page."""
 
 OTHER_RECORDS = (Quality, Rejected, Units, GyroBias, SampleNoise, Verification, Step, Stage,

@@ -84,7 +84,8 @@ def test_the_name_of_a_curve_is_read_back(carrier, variable):
     f'empirical-offset-temperature-{MODES + 1}', 'empirical-offset-temperature-one',
     'empirical-offset-temperature--1', 'empirical-offset-temperature-1.5',
     'empirical-offset-temperature-\u00b2', 'empirical-offset-temperature-1-1',
-    'empirical-offset-weather-1', 'empirical-mood-temperature-1', 'empirical-offset.q-time-1',
+    'empirical-offset-count-1', 'empirical-offset-ax-1', 'empirical-mood-temperature-1',
+    'empirical-offset.q-time-1',
     'empirical-offset.-time-1', 'empirical-offset.x.y-time-1', 'empirical-gain-force-1',
     'curve-offset-time-1', 'offset-time-1'])
 def test_a_name_that_is_no_curve_is_refused(name):

@@ -1,15 +1,27 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One entry in the catalogue is all that a new effect takes."""
+"""
+A new effect takes one entry in the catalogue, one definition of a user, or one column.
+
+The poses of columns are simulated with numpy alone.
+
+"""
+
+import json
+import os
+import subprocess
+import sys
 
 import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
+from accel_calib.errors import InputError
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
 from bag_files import header, IMU, imu
-from inside import refinement_page
+from inside import COMMAND, main, refinement_page
 import numpy as np
+import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
 from shared import random_directions
@@ -21,6 +33,8 @@ NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO'
 SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
           'cross_axis': [0.004, 0.002, -0.003]}
 VALUES = [0.02, -0.015, 0.01]
+
+TRIALS = int(os.environ.get('ACCEL_CALIB_TRIALS', '3'))
 
 
 @pytest.fixture
@@ -52,3 +66,161 @@ def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tm
     corrected = rewrite(data, float(poses['temperature'][7]))
     force = store.deserialize_cdr(corrected, IMU).linear_acceleration
     np.testing.assert_allclose([force.x, force.y, force.z], forces[7], atol=1e-9)
+
+
+OWN = """
+import accel_calib as ac
+import numpy as np
+
+dead_band = ac.Effect(
+    'dead_band', 'dead band of each axis', typical=0.003, unit='g',
+    form=lambda u: np.clip(u / 0.05, -1.0, 1.0), slope=lambda u: (abs(u) < 0.05) / 0.05)
+field = ac.Effect(
+    'field_of_motor', 'offset by the field of the motor', typical=1e-4, unit='g/A²',
+    variable='motor_current', change=lambda current: current ** 2)
+"""
+
+
+def still(rng, count, added=0.0, **columns):
+    """Return poses of a random sensor in g; `added` is called with the force of each pose."""
+    force = random_directions(count, rng)
+    gain = np.eye(3) + np.diag(rng.uniform(-0.02, 0.02, 3))
+    noise = rng.normal(size=(count, 3)) * 3e-4
+    reading = force @ gain.T + rng.uniform(-0.05, 0.05, 3) + noise + (
+        added(force) if callable(added) else added)
+    named = {f'a{axis}': reading[:, k] for k, axis in enumerate('xyz')}
+    spread = {f'std_{axis}': np.full(count, 3e-3) for axis in 'xyz'}
+    return pd.DataFrame({'time': np.cumsum(rng.uniform(8.0, 25.0, count)), **named, **spread,
+                         'count': 100, **columns})
+
+
+@pytest.mark.parametrize('name', ['offset_covariate', 'gain_covariate'])
+@pytest.mark.parametrize('curved', [False, True])
+def test_any_column_that_varies_is_a_cause(name, curved, tmp_path):
+    rng = np.random.default_rng([7, len(name), curved])
+    current = rng.uniform(0.0, 12.0, 60)
+    away = (current - 6.0) / 6.0
+    course = np.outer(away + 1.2 * curved * away ** 2, [0.004, -0.003, 0.002])
+    poses = still(rng, 60, lambda force: course * (force if name == 'gain_covariate' else 1.0),
+                  **{'motor current': current, 'battery': rng.uniform(11.0, 12.0, 60)})
+    poses.to_csv(tmp_path / 'poses.csv', index=False)
+    found = ac.refine(tmp_path / 'poses.csv', units='g')
+    assert [(step.effect, step.variable) for step in found.steps] == [(name, 'motor_current')]
+    assert found.verdict == 'explained'
+    assert found.remaining_gap_mg < 0.4 < 1.0 < found.gap_mg
+    assert ('x_square' in found.steps[0].parameters) == curved
+
+    found.calibration.save(tmp_path / 'calibration.yaml')
+    stored = ac.load(tmp_path / 'calibration.yaml')
+    readings = poses[['ax', 'ay', 'az']].to_numpy()
+    sizes = np.linalg.norm(stored.apply(readings, motor_current=current), axis=1)
+    assert np.std(sizes) < 5e-4
+    with pytest.raises(InputError, match='need motor_current'):
+        stored.apply(readings)
+
+
+def test_a_hump_over_any_column_is_a_curve_of_it():
+    rng = np.random.default_rng(8)
+    pressure = rng.uniform(950.0, 1050.0, 60)
+    hump = np.exp(-0.5 * ((pressure - 1003.0) / 12.0) ** 2)
+    found = ac.refine(still(rng, 60, np.outer(hump, [0.006, -0.004, 0.005]), pressure=pressure),
+                      units='g')
+    assert [(step.effect, step.variable) for step in found.steps] == [('empirical', 'pressure')]
+    assert found.verdict == 'described'
+
+
+def test_columns_of_noise_are_not_named():
+    named = 0
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([9, trial])
+        noise = {f'noise_{k}': np.cumsum(rng.normal(size=40)) if k % 2 else rng.normal(size=40)
+                 for k in range(25)}
+        named += any(step.variable for step in ac.refine(still(rng, 40, **noise), units='g').steps)
+    assert named <= TRIALS // 100
+
+
+def test_text_and_columns_with_holes_are_no_cause(tmp_path, capsys):
+    rng = np.random.default_rng(10)
+    poses = still(rng, 30, room=['lab'] * 30, pressure=rng.uniform(950.0, 1050.0, 30))
+    poses['humidity'] = [*rng.uniform(30.0, 50.0, 29), np.nan]
+    poses.to_csv(tmp_path / 'poses.csv', index=False)
+    assert ac.read_poses(tmp_path / 'poses.csv').quantities == ('pressure',)
+
+
+def test_a_bag_without_the_column_is_corrected_for_the_rest(tmp_path, capsys):
+    rng = np.random.default_rng(11)
+    current = rng.uniform(0.0, 12.0, 60)
+    poses = still(rng, 60, np.outer(current - 6.0, [0.001, -0.001, 0.001]), current=current)
+    ac.refine(poses, units='g').calibration.save(tmp_path / 'calibration.yaml')
+    poses.drop(columns='current').to_csv(tmp_path / 'samples.csv', index=False)
+    assert main(['apply', str(tmp_path / 'samples.csv'), '-c', str(tmp_path / 'calibration.yaml'),
+                 '-o', str(tmp_path / 'out.csv'), '--units', 'g']) == 0
+    shown = ' '.join(capsys.readouterr().out.split())
+    assert 'the samples have no current: offset_covariate-current is not corrected' in shown
+
+
+def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
+    (tmp_path / 'own.py').write_text(OWN)
+    poses, stored = tmp_path / 'poses.csv', tmp_path / 'calibration.yaml'
+    assert main(['simulate', '-o', str(poses), '--poses', '60', '--units', 'g', '--also',
+                 str(tmp_path / 'own.py'), '--effect', 'dead_band=0.01,-0.008,0.006',
+                 '--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01']) == 0
+    assert main(['refine', str(poses), '--also', str(tmp_path / 'own.py'), '-o', str(stored),
+                 '--json', str(tmp_path / 'refined.json')]) == 0
+    found = json.loads((tmp_path / 'refined.json').read_text())
+    assert [step['effect'] for step in found['steps']] == ['dead_band']
+    values = [found['steps'][0]['parameters'][axis] for axis in AXES]
+    np.testing.assert_allclose(values, [0.01, -0.008, 0.006], atol=1e-3)
+    capsys.readouterr()
+
+    command = [sys.executable, *COMMAND, 'verify', str(poses), '-c', str(stored)]
+    without = subprocess.run(command, capture_output=True, text=True)
+    assert without.returncode == 2
+    assert len(without.stderr.splitlines()) == 1
+    assert 'needs the effect' in without.stderr
+    assert '--also FILE.py' in without.stderr
+    knowing = subprocess.run([*command, '--also', str(tmp_path / 'own.py')], capture_output=True,
+                             text=True)
+    assert knowing.returncode == 0, knowing.stderr
+
+    (tmp_path / 'own.py').write_text(OWN.replace('0.05', '0.06'))
+    other = subprocess.run([*command, '--also', str(tmp_path / 'own.py')], capture_output=True,
+                           text=True)
+    assert other.returncode == 2
+    assert 'another definition' in other.stderr
+
+
+def test_an_own_effect_of_a_column_is_named_in_python():
+    field = ac.Effect('field_of_motor', 'offset by the field of the motor', typical=1e-4,
+                      unit='g/A²', variable='motor_current', change=np.square)
+    rng = np.random.default_rng(12)
+    current = rng.uniform(-10.0, 10.0, 60)
+    poses = still(rng, 60, np.outer(current ** 2, [1e-4, -5e-5, 8e-5]), motor_current=current)
+    found = ac.refine(poses, units='g', also=[field])
+    assert [step.effect for step in found.steps] == ['field_of_motor']
+    assert found.verdict == 'explained'
+    assert 'field_of_motor' not in [step.effect for step in ac.refine(poses, units='g').steps]
+
+
+@pytest.mark.parametrize(('wrong', 'message'), [
+    ({'name': 'Two Words'}, 'no usable name'), ({'typical': 0.0}, 'typical size 0'),
+    ({'form': np.square}, 'only one of form and slope'),
+    ({'form': np.square, 'slope': lambda u: u}, 'the derivative of its form'),
+    ({'variable': 'std'}, "a function of 'std'")])
+def test_an_own_effect_that_cannot_work_is_refused_when_it_is_made(wrong, message):
+    with pytest.raises(InputError, match=message):
+        ac.Effect(**{'name': 'own', 'words': 'own effect', 'typical': 0.001, **wrong})
+
+
+def test_an_own_effect_does_not_hide_one_of_the_catalogue():
+    with pytest.raises(InputError, match='in the catalogue'):
+        ac.load('calibration.yaml', also=[ac.Effect('quadratic', 'mine', typical=0.001)])
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'ZeroDivisionError'),
+    ('def\n', 'SyntaxError')])
+def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
+    (tmp_path / 'own.py').write_text(text)
+    assert main(['refine', 'poses.csv', '--also', str(tmp_path / 'own.py')]) == 2
+    assert message in capsys.readouterr().err

@@ -312,7 +312,8 @@ class Calibration:
         used = ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
-                for key in HELD if key in wanted and key in known and np.any(used)}
+                for key in (*HELD, *self.poses.quantities)
+                if key in wanted and key in known and np.any(used)}
 
     def typical_context(self, count: int) -> Context:
         """Return the middle of `ranges` for `count` samples, without motion and vibration."""
@@ -359,7 +360,7 @@ class Calibration:
             Samples, in the unit of the calibration.
         **known : float or (n,) array, (n, 3) array for ``rate``
             Context that the effects need: ``time`` [s], ``temperature`` [°C], ``supply_voltage``
-            [V], ``rate`` [rad/s].
+            [V], ``rate`` [rad/s], and quantities by name.
 
         Returns
         -------
@@ -377,7 +378,9 @@ class Calibration:
         context = {key: np.broadcast_to(np.asarray(values, float),
                                         (len(rows), 3) if key == 'rate' else (len(rows),))
                    for key, values in known.items()}
-        return self.correct(rows, of_samples(context, len(rows), self.model)).reshape(given.shape)
+        found = {key: values for key, values in of_samples(context, len(rows), self.model).items()
+                 if key in context or key not in self.model.neutral}  # `correct` names the missing
+        return self.correct(rows, found).reshape(given.shape)
 
     def predict(self, force: Floats, context: Context | None = None) -> Floats:
         """Return the (n, 3) readings for an (n, 3) force; the inverse of `correct`."""

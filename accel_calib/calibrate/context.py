@@ -14,7 +14,7 @@ sample does not show its vibration, so that the correction uses the lower limit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -28,9 +28,10 @@ from ..effects import (
     Model,
     rate_at,
     ThermalStream,
+    variable_of,
 )
 from ..geometry import unit
-from ..table import COLUMNS, Floats, Poses
+from ..table import column_of, Floats, Poses
 from ..text import counted
 from ..units import MG
 
@@ -41,7 +42,8 @@ THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 """Context that is computed from time and temperature."""
 
 HELD = ('time', 'temperature', *THERMAL, 'supply_voltage')
-"""Context that is limited to the range of the poses; effects are not extrapolated."""
+"""Context that is limited to the range of the poses, as quantities are; effects are not
+extrapolated."""
 
 
 def of_samples(known: Context, count: int, model: Model,
@@ -50,12 +52,14 @@ def of_samples(known: Context, count: int, model: Model,
     Return the context of single samples that a model needs, ``count`` rows each.
 
     A single sample does not show the vibration or the previous pose. Both are set to zero, and so
-    is a rate that is NaN. Lag and rate of the temperature come from earlier samples, unless they
+    is a rate that is NaN. A quantity that is not recorded has the value of no change, which
+    `SampleContext` notes. Lag and rate of the temperature come from earlier samples, unless they
     are known already. A `stream` has the temperature before these samples; they are added to it.
 
     """
     none = np.zeros((count, 3))
-    found = {**known, 'std': none, 'previous': none,
+    found = {**{key: np.full(count, value) for key, value in model.neutral.items()}, **known,
+             'std': none, 'previous': none,
              'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
     lacking = not all(key in known for key in model.over if key in THERMAL)
     stream = thermal_stream(model) if stream is None and lacking else stream
@@ -129,7 +133,7 @@ _QUANTITIES: dict[str, tuple[str, str, float]] = {
     'time': ('time since the start of the calibration', 'h', 1.0 / 3600.0),
     'temperature_rate': ('rate of temperature', '°C/min', 60.0),
     'std': ('vibration', 'mg', MG)}
-"""Name, unit and factor of the quantities that are not shown as in `COLUMNS`."""
+"""Name, unit and factor of the quantities that are not shown as in `accel_calib.table`."""
 
 
 @dataclass(frozen=True)
@@ -158,10 +162,10 @@ class Outside:
 
     def range_words(self, low: float, high: float) -> str:
         """Return a range, or one value, with its unit; times count from the first pose."""
-        _, unit, factor = _QUANTITIES.get(self.key, ('', COLUMNS[self.key].unit, 1.0))
+        _, unit, factor = _QUANTITIES.get(self.key, ('', column_of(self.key).unit, 1.0))
         start = self.low if self.key == 'time' else 0.0
         first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
-        return f'{first} {unit}' if first == last else f'{first} to {last} {unit}'
+        return f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip()
 
     @property
     def words(self) -> str:
@@ -211,10 +215,12 @@ class SampleContext:
         self._calibration = calibration
         self._thermal = thermal_stream(calibration.model)
         self._compared: dict[str, Outside] = {}
+        self.lacking = ''
 
     def of(self, known: Context, count: int) -> Context:
         """Return the context of the next block as `of_samples` does."""
         context = of_samples(known, count, self._calibration.model, self._thermal)
+        self.lacking = _lacking(self._calibration.model, known)
         for key, block in outside(self._calibration, context).items():
             before = self._compared.get(key)
             self._compared[key] = block if before is None else replace(
@@ -226,3 +232,11 @@ class SampleContext:
     def left(self) -> list[Outside]:
         """Return the quantities that have left the range of the calibration so far."""
         return [each for each in self._compared.values() if each.count]
+
+
+def _lacking(model: Model, known: Iterable[str]) -> str:
+    """Return a line about the quantities that samples do not have; empty if they have all."""
+    lacking = [key for key in model.neutral if key not in known]
+    names = [name for name in model.effects if variable_of(name) in lacking]
+    return (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+            f'{"is" if len(names) == 1 else "are"} not corrected') if lacking else ''

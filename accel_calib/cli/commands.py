@@ -61,8 +61,11 @@ def add_options(made: options.Parser, command: Command) -> None:
     made.epilog = f'example:\n  {command.example}'
     made.formatter_class = argparse.RawDescriptionHelpFormatter
     command.options(made)
-    if {action.dest for action in made._actions} & {'output', 'json'}:
+    known = {action.dest for action in made._actions}
+    if known & {'output', 'json'}:
         options.share(made, '--force')
+    if known & {'calibration', 'calibrations', 'effect', 'refined'}:
+        options.share(made, '--also')
 
 
 _NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force')

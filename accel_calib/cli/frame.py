@@ -28,6 +28,7 @@ from importlib import import_module
 import json
 from pathlib import Path
 import re
+import runpy
 import sys
 from textwrap import wrap
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -138,7 +139,7 @@ def _function(kind: str, command: str) -> Callable[[Any], Any]:
 def _run_one(args: argparse.Namespace) -> int:
     target, command = getattr(args, 'json', None), COMMANDS[args.command]
     try:
-        done = _function('run', args.command)(args)
+        done = _done(args)
     except (AccelCalibError, OSError) as err:
         about = {'file': getattr(args, command.about)} if command.about else {}
         error = _of_error(err)
@@ -165,10 +166,36 @@ def _run_several(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -
     return max(status for status, _ in outcomes)
 
 
+def _done(args: argparse.Namespace) -> Done:
+    """Run the command for one input, with the own effects of the user, ``args.own``."""
+    path = getattr(args, 'also', None)
+    args.own = () if path is None else _own_effects(path)
+    done: Done = _function('run', args.command)(args)
+    return done
+
+
+def _own_effects(path: Path) -> tuple[str, ...]:
+    """Make the effects that a Python file defines known, and return their names."""
+    from ..effects import know, OwnEffect
+
+    try:
+        defined = runpy.run_path(str(path)).values()
+    except (AccelCalibError, OSError):
+        raise
+    except Exception as err:
+        raise InputError(f'{path} cannot be executed ({type(err).__name__}: {err}), expected '
+                         'Python with own effects', 'correct it') from err
+    found = {id(each): each for each in defined if isinstance(each, OwnEffect)}
+    if not found:
+        raise InputError(f'{path} defines no effect, expected at least one accel_calib.Effect',
+                         'see docs/effects.md for an example')
+    return know(found.values())
+
+
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Return exit status and JSON for one of several inputs; an error is a result, too."""
     try:
-        done = _function('run', args.command)(args)
+        done = _done(args)
     except (AccelCalibError, OSError) as err:
         return BAD_INPUT, {'file': str(args.poses), **_of_error(err)}
     refused = dict(zip(('error', 'advice'), done.refusal))

@@ -81,7 +81,8 @@ def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
         If ``--prior`` stands with another model.
 
     """
-    plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': prior(args), **more})
+    plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': prior(args), 'also': args.own,
+                   **more})
     usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
     if plan.fleet is not None and not usual:
         raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '

@@ -58,6 +58,8 @@ _SHARED: dict[str, dict[str, Any]] = {
     '--sensor-model': {'default': '', 'metavar': 'NAME', 'help': 'model of the sensor in the file '
                        'of --prior, if it has several'},
     '--keep-bad': {'action': 'store_true', 'help': 'store a calibration that is BAD, too'},
+    '--also': {'type': Path, 'metavar': 'FILE.py', 'help': 'Python file with own effects '
+               '(accel_calib.Effect), which are known beside the catalogue; it is executed'},
     '--json': {'metavar': 'FILE', 'help': 'JSON file to write with the result; - for standard '
                'output'},
     '--force': {'action': 'store_true', 'help': 'replace files of other kinds, too'}}

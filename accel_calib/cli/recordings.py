@@ -100,6 +100,7 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration,
                                    for block in blocks))
         lines += [f'read as: {log.read_as}'] if log.read_as else []
         lines += [f'note: {line}' for line in log.notes]
+        lines += [f'note: {context.lacking}'] if context.lacking else []
     for each in context.left:
         report(each)
     return count
@@ -125,7 +126,7 @@ def run_simulate(args: argparse.Namespace) -> Done:
         raise InputError(f'--poses is {args.poses}, --samples {args.samples} and --noise '
                          f'{args.noise}, expected at least 1, 1 and 0', 'correct these options')
     chosen = {name: getattr(args, name) for name in signature(simulate).parameters
-              if hasattr(args, name)}
+              if hasattr(args, name) and name != 'also'}
     table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)
     write_table(args.output, table)
     return Done(shown=[f'{counted(len(table), "row")}, stored in {args.output}'])

@@ -45,8 +45,9 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
         base, fleet = stored.in_units(found.units) if stored else args.base, prior(args)
         if fleet is not None:
             return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
-                                            date=now())
-        return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now())
+                                            date=now(), also=args.own)
+        return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
+                             also=args.own)
 
 
 def _stored(args: argparse.Namespace, result: Refinement) -> Iterator[Path]:

@@ -5,8 +5,10 @@
 The catalogue: one entry for each effect with a known cause, and curves without one.
 
 Factors are functions of the context and of the shape of the effect. Shape searches yield the
-shapes that the search tries. An empirical curve is an effect without a known cause, made from its
-name: a part of the reading, the carrier, changes smoothly with a variable (`empirical_name`).
+shapes that the search tries. Two kinds of effects are made from their names: an empirical curve,
+with which a part of the reading, the carrier, changes smoothly with a variable
+(`empirical_name`), and a covariate, which is any quantity that the catalogue does not know
+(`covariate_names`).
 
 """
 
@@ -41,7 +43,7 @@ from .form import (
     WAVE,
 )
 from .thermal import acting_temperature, rate_at
-from ..table import COLUMNS, Floats
+from ..table import column_of, Floats, is_quantity
 from ..units import MG, STANDARD_GRAVITY
 
 REFERENCE_TEMPERATURE = 25.0
@@ -303,6 +305,12 @@ VARIABLES: dict[str, str] = {
     'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis'}
 """Quantities that an empirical curve can be a function of, by column, with their words."""
 
+
+def variable_words(variable: str) -> str:
+    """Return the words of the variable of a curve: of `VARIABLES`, or the name of a quantity."""
+    return VARIABLES.get(variable) or column_of(variable).meaning
+
+
 _CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS, 'force': ALL_AXES}
 
 
@@ -310,17 +318,17 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     """
     Return the name of an empirical curve.
 
-    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` by Σ_k c_k
-    cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the range of the variable in
-    the poses. Outside of it, the curve is constant.
+    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity
+    by Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the range of the
+    variable in the poses. Outside of it, the curve is constant.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
 
 
-def curve_pairs() -> Iterator[tuple[str, str]]:
-    """Yield the carriers and variables of empirical curves."""
-    for variable in VARIABLES:
+def curve_pairs(quantities: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
+    """Yield the carriers and variables of empirical curves; the quantities are variables, too."""
+    for variable in (*VARIABLES, *quantities):
         for carrier in CARRIERS:
             if variable != 'force' or carrier == 'offset':
                 yield carrier, variable
@@ -333,7 +341,8 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
         raise KeyError(name)
     modes = tuple(int(part) for part in rest[2:])
     whole, dot, part = rest[0].partition('.')
-    if ((whole, rest[1]) not in curve_pairs() or (dot and part not in CARRIERS[whole])
+    pairs = curve_pairs(filter(is_quantity, rest[1:2]))
+    if ((whole, rest[1]) not in pairs or (dot and part not in CARRIERS[whole])
             or list(modes) != sorted(set(modes)) or not 1 <= modes[0] <= modes[-1] <= MODES):
         raise KeyError(name)
     return rest[0], rest[1], modes
@@ -354,7 +363,7 @@ def _empirical(name: str) -> Effect:
                                   term.weight))
     each = len(terms) // len(modes)
     names = tuple(f'{own}_{mode}' for mode in modes for own in ((part,) if part else parts))
-    words = f'{carrier.replace("_", "-")} as a smooth function of {VARIABLES[variable]}'
+    words = f'{carrier.replace("_", "-")} as a smooth function of {variable_words(variable)}'
     if variable == 'force':
         return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
                       family='force')
@@ -386,6 +395,74 @@ def _cosines(variable: str, modes: NDArray[np.intp], context: Mapping[str, Any],
     return np.cos(np.pi * np.multiply.outer(modes, share))
 
 
+COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
+              'gain_covariate': ('gain of each axis', FORCE, '1/unit')}
+"""What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
+
+_CURVED = '2'
+
+
+def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
+    """
+    Yield the names of the covariates of quantities.
+
+    ``offset_covariate-pressure`` adds k (pressure - zero), by axis, with the mean over the poses
+    as zero. ``offset_covariate-pressure-2`` adds a square, k₂ (pressure - zero)², too.
+
+    """
+    for quantity in quantities:
+        for kind in COVARIATES:
+            yield f'{kind}-{quantity}'
+            yield f'{kind}-{quantity}-{_CURVED}'
+
+
+def kind_of(name: str) -> str:
+    """Return the name of an effect without the variable, for one made from its name."""
+    return name.partition('-')[0]
+
+
+def variable_of(name: str) -> str:
+    """Return the variable of an effect made from its name; empty for others."""
+    if kind_of(name) == EMPIRICAL:
+        return empirical_parts(name)[1]
+    return name.split('-')[1] if kind_of(name) in COVARIATES else ''
+
+
+def _covariate(name: str) -> Effect:
+    kind, _, rest = name.partition('-')
+    quantity, *curved = rest.split('-')
+    if not is_quantity(quantity) or curved not in ([], [_CURVED]):
+        raise KeyError(name)
+    what, monomial, unit = COVARIATES[kind]
+    terms = by_axis(monomial)
+    names: tuple[str, ...] = AXES
+    if curved:
+        terms += tuple(term._replace(parameter=3 + term.parameter) for term in terms)
+        names += tuple(f'{axis}_square' for axis in AXES)
+    return Effect(
+        f'{what} that changes with {column_of(quantity).meaning}', f'coefficient of {quantity}',
+        names, unit, np.inf, 0.5, terms, partial(_departure, quantity, bool(curved)), (quantity,),
+        ('zero',), partial(_mean, quantity, 3 if curved else 2), (0.0,),
+        includes=(f'{kind}-{quantity}',) if curved else ())
+
+
+def _departure(quantity: str, curved: bool, context: Mapping[str, Any], shape: Floats) -> Any:
+    """Return quantity - zero, and for a curved covariate its square for the later terms."""
+    away = context[quantity] - shape[0]
+    return np.array([away] * 3 + [away ** 2] * 3) if curved else away
+
+
+def _mean(quantity: str, least: int, context: Context) -> Iterator[Floats]:
+    """Yield the mean of a quantity that has at least this number of different values."""
+    values = context[quantity][np.isfinite(context[quantity])]
+    if len(np.unique(values)) >= least:
+        yield np.array([np.mean(values)])
+
+
+OWN: dict[str, Effect] = {}
+"""Effects of the user that this process knows."""
+
+
 def is_effect(name: str) -> bool:
     """Return whether an effect has this name."""
     try:
@@ -397,9 +474,9 @@ def is_effect(name: str) -> bool:
 
 @cache
 def effect_named(name: str) -> Effect:
-    """Return the effect with this name: from the catalogue, or an empirical curve."""
-    found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
-    return found or _empirical(name)
+    """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
+    found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name) or OWN.get(name)
+    return found or (_covariate(name) if kind_of(name) in COVARIATES else _empirical(name))
 
 
 @cache
@@ -421,10 +498,11 @@ _WITHOUT_UNIT = ('of_sensor', 'form')
 def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
     """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
     effect = effect_named(effect_name)
-    curve = effect_name if effect_name.startswith(f'{EMPIRICAL}-') else ''
     if value_name not in effect.parameters:
-        return _shape_unit(value_name, curve), 1.0
-    unit = curve_unit(curve) if curve else effect.unit
+        return _shape_unit(value_name, variable_of(effect_name)), 1.0
+    unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
+    if value_name.endswith('_square'):
+        unit = f'{unit}²'
     return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
 
 
@@ -433,12 +511,12 @@ def curve_unit(name: str) -> str:
     return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
 
 
-def _shape_unit(name: str, curve: str) -> str:
+def _shape_unit(name: str, variable: str) -> str:
     if name in _WITHOUT_UNIT:
         return ''
-    return unit_of(empirical_parts(curve)[1]) if curve else 's'
+    return unit_of(variable) if variable else 's'
 
 
 def unit_of(column: str) -> str:
     """Return the unit of a quantity of the context, with readings in g."""
-    return 'g' if column == 'std' else COLUMNS[column].unit
+    return 'g' if column == 'std' else column_of(column).unit

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .catalogue import EFFECTS
+from .catalogue import CHANGES, effect_named, EFFECTS, is_effect, PROCESSES
 from .form import Context
 from .model import Model, times
 from ..errors import InputError
@@ -99,11 +99,11 @@ def parse_effect(text: str) -> tuple[str, Floats]:
 
 def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
     """Return the values of an effect; one value is used for all axes, and the usual shape."""
-    if name not in EFFECTS:
+    if not is_effect(name) or name in PROCESSES or name in CHANGES:
         raise InputError(f'effect {name!r} is not in the catalogue',
                          f'use one of {", ".join(EFFECTS)}')
-    values, names = np.atleast_1d(np.asarray(given, float)), EFFECTS[name].values
-    effect = EFFECTS[name]
+    effect = effect_named(name)
+    values, names = np.atleast_1d(np.asarray(given, float)), effect.values
     least = len(effect.parameters) if effect.usual else len(names)
     if not np.all(np.isfinite(values)) or values.shape not in ((1,), (least,), (len(names),)):
         count = ' or '.join(map(str, dict.fromkeys((1, least, len(names)))))
@@ -126,7 +126,7 @@ def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None)
 
     """
     values = {name: _values_of(name, given) for name, given in effects.items()}
-    ordered = {name: values[name] for name in EFFECTS if name in values}
+    ordered = {name: values[name] for name in (*EFFECTS, *values) if name in values}
     return Model(ordered) if rotation is None else Model(ordered, rotation)
 
 

@@ -15,7 +15,7 @@ With the context fixed, the terms of all effects sum to an offset, a gain and be
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -23,11 +23,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
-from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
+from .catalogue import (
+    effect_named,
+    EFFECTS,
+    is_effect,
+    OWN,
+    parameter_names,
+    PROCESSES,
+)
+from .form import (
+    AFFINE,
+    Context,
+    difference,
+    Effect,
+    fitted_places,
+    FORCE,
+    MONOMIALS,
+    ONE,
+    OwnEffect,
+)
 from .thermal import Lag
 from ..errors import InputError
-from ..table import COLUMNS, Floats
+from ..table import column_of, Floats, is_quantity
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
@@ -138,6 +155,27 @@ def terms_of(names: tuple[str, ...]) -> Terms:
     place, axis, value, weight = np.array(rows, float).reshape(-1, 4).T
     return Terms(effects, tuple(parts), tuple(used), place.astype(np.intp), axis.astype(np.intp),
                  value.astype(np.intp), weight)
+
+
+def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
+    """
+    Make effects of the user known to this process, and return their names.
+
+    An effect replaces an earlier one of the same name. Raise InputError for a name that the
+    catalogue has.
+
+    """
+    names = []
+    for own in effects:
+        if is_effect(own.name) and own.name not in OWN:
+            raise InputError(f'the effect {own.name!r} is in the catalogue', 'choose another name')
+        OWN[own.name] = own.entry(len(MONOMIALS))
+        MONOMIALS.extend(own.monomials)
+        names.append(own.name)
+    effect_named.cache_clear()
+    parameter_names.cache_clear()
+    terms_of.cache_clear()
+    return tuple(names)
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -289,6 +327,12 @@ class Model:
                                    for key in effect.over_of(shape)))
 
     @cached_property
+    def neutral(self) -> Mapping[str, float]:
+        """Value of each quantity that counts as no change, where it is not recorded."""
+        return {key: float(np.mean(shape)) for effect, shape in self._by_effect
+                for key in effect.needs if is_quantity(key) and len(shape)}
+
+    @cached_property
     def lags(self) -> Mapping[str, Lag]:
         """Lag of the temperature by the column of the temperature that acts; no lag: absent."""
         return {effect.lagged: Lag(float(shape[0]), bool(shape[1]))
@@ -398,7 +442,7 @@ def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
 
 def check_context(model: Model, context: Mapping[str, Any]) -> None:
     """Check that the context holds what the effects of the model need; raise InputError."""
-    missing = [', '.join(COLUMNS[key].names) for key in model.needs if key not in context]
+    missing = [', '.join(column_of(key).names) for key in model.needs if key not in context]
     if missing:
         raise InputError(f'the effects of the model need {" and ".join(missing)}, which the input '
                          'does not have', 'record these columns together with the readings')

@@ -31,7 +31,8 @@ _LEVEL = 0.05
 """Level of the test whether the residual is larger than the noise explains."""
 
 _ONLY_AT_POSES = ('time', 'previous', 'std')
-"""Context that the correction of a later single sample does not have."""
+"""Context that the correction of a later single sample does not have. Messages and logs may not
+have quantities, either."""
 
 
 class Expected:
@@ -163,7 +164,7 @@ class Expected:
         """Return effects that the correction of a later sample cannot use, with size [mg]."""
         values = self.calibration.model.values
         sizes = ((name, self._size_mg(Model({name: values[name]}))) for name in values
-                 if depends_on(name) & set(_ONLY_AT_POSES))
+                 if depends_on(name) & {*_ONLY_AT_POSES, *self.calibration.model.neutral})
         return tuple(sorted(sizes, key=lambda each: -each[1]))
 
     def _size_mg(self, model: Model) -> float:

@@ -156,8 +156,10 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
                               f'({short}), and may change again', 'let the sensor settle, and '
                               'take the poses again', 'USABLE')
             else:
-                yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected in '
-                              'single samples', level='USABLE')
+                columns = ' and '.join(depends_on(name) & {*expected.calibration.model.neutral})
+                where = f'without the column {columns}' if columns else 'in single samples'
+                yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected '
+                              f'{where}', level='USABLE')
 
 
 def _inexact(expected: Expected, error: float, refinement: Refinement | None

@@ -15,7 +15,7 @@ where they are plain.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -23,10 +23,10 @@ import numpy as np
 
 from . import formats
 from .dialect import is_clock, is_number, Layout, shown
-from .names import BARE, is_unit, meaning, OURS, RATE, READING, unit_of, WORDS
+from .names import BARE, is_unit, may_cause, meaning, OURS, RATE, READING, unit_of, WORDS
 from .text import Cells
 from ..errors import InputError
-from ..table import COLUMNS, Floats
+from ..table import COLUMNS, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
@@ -97,7 +97,8 @@ class Chosen:
     """
     The columns of a text log that are used, under our names, and the maker's layout, if any.
 
-    `numeric` and `text` are the indices of columns of numbers and of text, as read.
+    `numeric` and `text` are the indices of columns of numbers and of text, as read. The
+    `quantities` are further columns of numbers, the last ones of `numeric`.
 
     """
 
@@ -106,6 +107,7 @@ class Chosen:
     maker: formats.LogFormat | None
     numeric: tuple[int, ...]
     text: tuple[int, ...]
+    quantities: Mapping[str, int]
 
     @property
     def dates(self) -> tuple[int, ...]:
@@ -177,8 +179,22 @@ def with_indices(layout: Layout, sources: Mapping[str, Source],
         cells = _sample(layout, sources['time'])
         if cells and all(map(is_clock, cells)):
             text.append(sources['time'].index)
-    numeric = sorted({source.index for source in sources.values()} - set(text))
-    return Chosen(layout, sources, maker, tuple(numeric), tuple(text))
+    used = {source.index for source in sources.values()}
+    quantities = {} if maker else _quantities(layout, used, sources)
+    numeric = (*sorted(used - set(text)), *quantities.values())
+    return Chosen(layout, sources, maker, numeric, tuple(text), quantities)
+
+
+def _quantities(layout: Layout, used: Container[int], sources: Mapping[str, Source]
+                ) -> dict[str, int]:
+    """Return the indices of the other columns of numbers that can be a cause, by key."""
+    found: dict[str, int] = {}
+    for k, name in enumerate(layout.header[:MOST]):
+        free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
+        if free and quantity_key(name) and all(
+                is_number(row[k].replace(',', '.')) for row in layout.sample if k < len(row)):
+            found.setdefault(quantity_key(name), k)
+    return found
 
 
 def _sample(layout: Layout, source: Source) -> list[str]:

@@ -52,6 +52,11 @@ OTHER_WORDS = frozenset((
     'setpoint', 'jerk', 'norm', 'error', 'clip', 'angular', 'gps', 'baro', 'pressure'))
 """Words of quantities that are not read."""
 
+CAUSES = frozenset((
+    'mag', 'magn', 'magnetic', 'magnetometer', 'compass', 'angle', 'position', 'pos', 'bias',
+    'offset', 'setpoint', 'gps', 'baro', 'pressure'))
+"""Those of `OTHER_WORDS` that neither the readings nor the orientation determine."""
+
 FREE_WORDS = frozenset(('user', 'free', 'lin', 'nograv', 'nogravity', 'world'))
 """Words of an acceleration without gravity."""
 
@@ -141,6 +146,13 @@ def unit_text(text: str) -> str:
 def unit_of(quantity: str, text: str) -> tuple[str, float] | None:
     """Return a unit of a quantity and the factor to it, or None."""
     return UNITS.get(quantity, {}).get(unit_text(text))
+
+
+def may_cause(name: str) -> bool:
+    """Return whether a column can be a cause, other than what is computed from the readings."""
+    known = meaning(name)
+    return (known.quantity not in ('reading', 'rate', 'time') and not known.free
+            and not (OTHER_WORDS - CAUSES).intersection(known.group))
 
 
 @lru_cache(maxsize=4096)

@@ -226,6 +226,8 @@ class Quantities:
             else:
                 columns[key] = np.column_stack([self._scaled(cells, name)
                                                 for name in column.names])
+        columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
+                    for key, k in self.chosen.quantities.items()}
         return columns, cells.row
 
     def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:

@@ -25,7 +25,7 @@ from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
 from ..disk import check_regular
 from ..errors import InputError, saying
-from ..table import check_units, check_values, Poses, Recording
+from ..table import check_units, check_values, is_quantity, Poses, Recording
 from ..units import Units, units_of
 
 Progress = Callable[[int, int], object]
@@ -184,7 +184,8 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     columns = chosen(text.layout, options)
-    text.choose(columns.numeric, columns.text, columns.dates, skip_bad=options.skip_bad)
+    text.choose(columns.numeric, columns.text, columns.dates, spare=len(columns.quantities),
+                skip_bad=options.skip_bad)
     cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
@@ -205,7 +206,7 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
         samples = (Recording(*block, units.name, sensor) for block in chain((head,), blocks))
         count = _estimated(path, text, head)
     else:
-        poses = Poses(*joined([head, *blocks]), units.name, sensor)
+        poses = Poses(*whole(joined([head, *blocks]), quantities.notes), units.name, sensor)
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
@@ -241,6 +242,15 @@ def joined(blocks: Sequence[Block]) -> Block:
         return blocks[0]
     return ({key: np.concatenate([columns[key] for columns, _ in blocks])
              for key in blocks[0][0]}, np.concatenate([row for _, row in blocks]))
+
+
+def whole(block: Block, notes: list[str]) -> Block:
+    """Return a block without quantities that lack a number in a row; they are noted."""
+    columns, row = block
+    lacking = [key for key in columns if is_quantity(key) and not np.isfinite(columns[key]).all()]
+    if lacking:
+        notes.append(f'not used, because cells are not numbers: {", ".join(lacking)}')
+    return {key: values for key, values in columns.items() if key not in lacking}, row
 
 
 def _estimated(path: Path, text: TextTable, head: Block) -> int:
@@ -293,7 +303,8 @@ class LineReader:
         self._name = name
         columns = chosen(layout, options)
         self._table = TextTable(layout, iter(()), strict=False)
-        self._table.choose(columns.numeric, columns.text, columns.dates, skip_bad=True)
+        self._table.choose(columns.numeric, columns.text, columns.dates,
+                           spare=len(columns.quantities), skip_bad=True)
         first = self._table.read(lines[layout.start:])
         if not len(first.row):
             raise InputError(f'{name} sends no row of numbers, expected one line for each sample',

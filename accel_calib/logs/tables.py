@@ -4,9 +4,9 @@
 """
 Tables with our own names: ``#`` comments, one header line, columns by name.
 
-The column names are those of `accel_calib.table.COLUMNS`; other columns are ignored. Two kinds of
-comments are read, with values in JSON: ``# units: "m/s2"`` and ``# sensor: "imu_link"``. Tables
-are written as CSV, and read in any dialect (`accel_calib.logs`).
+The column names are those of `accel_calib.table.COLUMNS`; other columns of numbers are quantities.
+Two kinds of comments are read, with values in JSON: ``# units: "m/s2"`` and
+``# sensor: "imu_link"``. Tables are written as CSV, and read in any dialect (`accel_calib.logs`).
 
 """
 
@@ -25,10 +25,10 @@ from .columns import check_once, Source, with_indices
 from .dialect import ABOUT
 from .names import OURS, READING
 from .quantities import Quantities
-from .read import converted, joined
+from .read import converted, joined, whole
 from .text import open_text
 from ..disk import check_regular, write_atomically
-from ..table import COLUMNS, numbered, Poses, present, Table
+from ..table import column_of, COLUMNS, numbered, Poses, present, Table
 from ..units import units_of
 
 _DIGITS = '.12g'
@@ -58,9 +58,9 @@ def read_poses(path: Path) -> Poses:
                        ('reading',), str(path))
         columns = with_indices(layout, {name: Source(layout.header.index(name), name)
                                         for key in keys for name in COLUMNS[key].names})
-        text.choose(columns.numeric, columns.text)
+        text.choose(columns.numeric, columns.text, spare=len(columns.quantities))
         blocks = list(converted(path, text.blocks(), Quantities(columns, units_of('g'))))
-        table, _ = joined(blocks)
+        table, _ = whole(joined(blocks), [])
         return Poses(table, numbered(table), **layout.about)
 
 
@@ -86,8 +86,9 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
         for block in blocks:
             if not keys:
                 keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
+                keys += block.quantities
                 _write_head(file, block)
-                writer.writerow([name for key in keys for name in COLUMNS[key].names])
+                writer.writerow([name for key in keys for name in column_of(key).names])
             parts = [_as_text(block[key]) for key in keys]
             writer.writerows(zip(*(column for part in parts for column in part), strict=True))
             rows += len(block)

@@ -135,9 +135,16 @@ class TextTable:
         self.more = False
 
     def choose(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
-               *, skip_bad: bool = False) -> None:
-        """Set the columns of numbers, text and dates to read; bad rows raise unless `skip_bad`."""
+               *, spare: int = 0, skip_bad: bool = False) -> None:
+        """
+        Set the columns of numbers, text and dates to read; bad rows raise unless `skip_bad`.
+
+        In the last columns of numbers, `spare` of them, other cells are NaN.
+
+        """
         self._numeric, self._text, self._dates = tuple(numeric), tuple(text), tuple(dates)
+        self._needed = self._numeric[:len(self._numeric) - spare]
+        self._spare = self._numeric[len(self._needed):]
         self._skip_bad = skip_bad
 
     @property
@@ -182,6 +189,11 @@ class TextTable:
             good = self._good(rows_of, number, where)
             rows_of, number = [rows_of[k] for k in good], number[good]
             values = self._parsed(rows_of)
+        if values is None and self._spare:
+            self._numeric = self._needed
+            values = self._parsed(rows_of)
+        if values is not None and values.shape[1] < len(self._needed + self._spare):
+            values = np.hstack([values, self._spare_cells(rows_of)])
         if values is None:
             raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
                              'check it for stray characters')
@@ -205,6 +217,15 @@ class TextTable:
         except ValueError:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
+
+    def _spare_cells(self, lines: list[str]) -> Floats:
+        """Return the numbers of spare columns, cell by cell; NaN for another cell."""
+        found = np.full((len(lines), len(self._spare)), np.nan)
+        for row, line in zip(found, lines, strict=True):
+            cells = self.layout.dialect.cells(line)
+            texts = [cells[k].replace(',', '.') for k in self._spare]
+            row[:] = [float(text) if is_number(text) else np.nan for text in texts]
+        return found
 
     def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
         """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
@@ -283,7 +304,7 @@ class TextTable:
         if len(cells) != layout.width:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
-        for k in self._numeric:
+        for k in self._needed:
             if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
                         'number')

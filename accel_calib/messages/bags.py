@@ -117,7 +117,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
             count = _copy(bag, folder, out, correction, progress)
         for each in correction.context.left:
             report(each)
-        for line in (*bag.notes, *context.notes, *bag.lost(name, count)):
+        for line in filter(None, (*bag.notes, *context.notes, *bag.lost(name, count),
+                                  correction.context.lacking)):
             note(line)
         return count
 

@@ -210,7 +210,7 @@ class Rewriter:
         self._quaternion = quaternion_of(calibration.rotation)
         self._inverse = calibration.rotation.T @ np.linalg.inv(calibration.gain) * scale
         self._calibration = OneReading(calibration, scale)
-        self._needs = calibration.model.needs
+        self._needs, self._neutral = calibration.model.needs, calibration.model.neutral
         self._thermal = thermal if thermal is not None else thermal_stream(calibration.model)
         self._per_message = bool(_PER_MESSAGE.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
@@ -291,7 +291,7 @@ class Rewriter:
         absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
         time = seconds + nanoseconds * 1e-9
         known: dict[str, Any] = {
-            'time': time, 'std': _NONE, 'previous': _NONE,
+            **self._neutral, 'time': time, 'std': _NONE, 'previous': _NONE,
             'rate': _NONE if absent or not all(map(math.isfinite, rate)) else rate}
         if not math.isnan(temperature):
             known['temperature'] = temperature

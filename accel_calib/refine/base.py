@@ -104,6 +104,14 @@ _RELEVANT = 0.25
 """Smallest part of the variance of a mean that a relevant grid causes."""
 
 
+_EQUAL = 1e-9
+"""Relative difference below which numbers of a quantity are equal."""
+
+_OF_READING = 0.1
+"""Scatter of the ratio of a quantity to the length of the readings below which it is computed from
+them, relative to the scatter of the length."""
+
+
 @dataclass(frozen=True)
 class State:
     """A model fitted to the poses kept."""
@@ -174,6 +182,32 @@ class State:
         rows = self.fit.by_pose.rows[self.fit.equations.pose]
         share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
         return self.gap_mg(share)
+
+
+def causes(poses_g: Poses) -> tuple[str, ...]:
+    """Return the quantities that vary, other than row numbers and lengths of the readings."""
+    length = np.linalg.norm(poses_g.reading, axis=1)
+    return tuple(key for key in poses_g.quantities
+                 if _varies(poses_g[key]) and not _is_even(poses_g[key])
+                 and not _in_proportion(poses_g[key], length))
+
+
+def _varies(values: Floats) -> bool:
+    known = values[np.isfinite(values)]
+    return bool(len(known)) and float(np.ptp(known)) > _EQUAL * float(np.max(np.abs(known)))
+
+
+def _is_even(values: Floats) -> bool:
+    """Return whether values increase by the same step from row to row: they count the rows."""
+    steps = np.diff(values)
+    return bool(np.all(np.abs(steps - steps[:1]) <= _EQUAL * np.abs(steps[:1])))
+
+
+def _in_proportion(values: Floats, length: Floats) -> bool:
+    """Return whether values are in proportion to the length of the readings, and its noise."""
+    ratio = values / length
+    return bool(np.std(ratio) * np.mean(length) < _OF_READING * np.std(length)
+                * np.abs(np.mean(ratio)))
 
 
 def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:

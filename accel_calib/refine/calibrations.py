@@ -53,7 +53,7 @@ from ..estimate import (
 )
 from ..finding import Finding, has, without
 from ..geometry import unit
-from ..table import check_units, COLUMNS, Floats, Poses
+from ..table import check_units, Floats, Poses
 from ..units import Units
 
 _DIGITS = 7
@@ -63,7 +63,7 @@ _SAME = 0.999
 """Quantile of chi² below which a stored calibration agrees with poses of its fit."""
 
 _EITHER = ('temperature', 'supply_voltage', 'rate', 'previous')
-"""Context that is set to NaN if the stored poses do not have it."""
+"""Context that is set to NaN if the stored poses do not have it, as quantities are."""
 
 _ROUNDS = 6
 """Largest number of fits after which outliers are left out."""
@@ -115,8 +115,9 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     if shared or edited:
         stored = _as_calibrated(stored, calibration)
     count = (len(poses_g), len(stored))
-    columns = {key: _joined(key, poses_g, stored) for key in COLUMNS
-               if (key in poses_g and key in stored) or (key in _EITHER and key in poses_g)}
+    either = {*_EITHER, *poses_g.quantities}
+    columns = {key: _joined(key, poses_g, stored) for key in poses_g.columns
+               if key in stored or key in either}
     if 'time' in calibration.ranges:  # limited to the range of the calibration
         held = np.clip(poses_g['time'], *calibration.ranges['time'])
         columns['time'] = np.concatenate([held, stored['time']])

@@ -6,11 +6,11 @@ Gaps without a known form: empirical curves, and an offset that wanders.
 
 **Curves.** They show where the gap lies, if no known effect has its form. A curve changes a
 carrier (offset, gain, cross-axis, |force|, or one axis of them) with a variable (time,
-temperature, its rate, supply, vibration, or the force along the axis). It is a sum of a few
-cosines over the range of the variable (`accel_calib.effects.empirical_name`). For each carrier and
-variable, the cosines are added in the order of their gain while the score of `.linear` rises; each
-costs its values and 2 log k for the choice of the k-th. The best curve is accepted if it is
-significant, and if poses held out agree.
+temperature, its rate, supply, vibration, the force along the axis, or any quantity). It is a sum
+of a few cosines over the range of the variable (`accel_calib.effects.empirical_name`). For each
+carrier and variable, the cosines are added in the order of their gain while the score of `.linear`
+rises; each costs its values and 2 log k for the choice of the k-th. The best curve is accepted if
+it is significant, and if poses held out agree.
 
 **Wander.** The effect `offset_wander` is an offset that changes slowly. It is a random process,
 expanded in its Karhunen-Loève modes
@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .base import State
+from .base import causes, State
 from .linear import Block, held_out, LEVEL, Linear, linearised, outside_of, Set
 from ..effects import (
     CARRIERS,
@@ -105,7 +105,7 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
 
 def _pairs(poses_g: Poses) -> list[tuple[str, str]]:
     """Return the carriers and variables that the poses can show."""
-    return [(carrier, variable) for carrier, variable in curve_pairs()
+    return [(carrier, variable) for carrier, variable in curve_pairs(causes(poses_g))
             if all(key in poses_g for key in
                    effect_named(empirical_name(carrier, variable, _ALL_MODES)).needs)]
 

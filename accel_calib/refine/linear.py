@@ -28,13 +28,16 @@ effects where the poses repeat worse than their samples.
                                         - 2 Σ log(tried) - Σ unusual
 
 for q values (corrected for few equations, McQuarrie and Tsai 1998), with the number of effects and
-of shapes tried, and a penalty if an effect is far larger than in common sensors. Each pose that is
-left out costs 2 log n + 5: it is selected among n poses, and few poses are knocked.
+of shapes tried, and a penalty if an effect is far larger than in common sensors. A covariate
+counts as one effect, and each quantity as one of its shapes: the more quantities, the more each of
+them costs, and the effects of the catalogue cost the same. Each pose that is left out costs
+2 log n + 5: it is selected among n poses, and few poses are knocked.
 
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -44,7 +47,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context, Effect, effect_named, Model
+from ..effects import Context, Effect, effect_named, kind_of, Model
 from ..estimate import by_pose, Equations, Fit, outliers_among
 from ..table import Floats
 
@@ -300,8 +303,7 @@ class Linear:
     def probability(self, chosen: Set, block: int) -> float:
         """Return the probability that noise alone makes a block this good beside the others."""
         chance = self.chance(self.without(chosen, block), chosen)
-        candidates = len({other.effect for other in self.blocks})
-        return min(1.0, chance * candidates * self.blocks[block].tried)
+        return min(1.0, chance * _kinds(self.blocks) * self.blocks[block].tried)
 
     def is_significant(self, chosen: Set) -> bool:
         """Return whether each effect of a set is significant beside the others."""
@@ -373,7 +375,12 @@ def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str] = ()) -> Li
     return Linear(onto, residual, near.pose, blocks, columns, sizes,
                   WORTH if near.noise_known else 0.0, near.count - onto.shape[1],
                   float(residual @ residual), near.columns(_OFFSET),
-                  2.0 * math.log(1.0 + len({block.effect for block in blocks})))
+                  2.0 * math.log(1.0 + _kinds(blocks)))
+
+
+def _kinds(blocks: Iterable[Block]) -> int:
+    """Return the number of effects tried; the covariates of all quantities count as one."""
+    return len({kind_of(block.effect) for block in blocks})
 
 
 def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
@@ -410,14 +417,16 @@ def _blocks(near: Equations, context: Context, present: Model, candidates: dict[
     blocks: list[Block] = []
     columns: list[Floats] = [np.zeros((len(near.pose), 0))]
     start = 0
-    for name, effect in candidates.items():
-        if effect.output is not None or any(key not in context for key in effect.needs):
-            continue
+    usable = {name: effect for name, effect in candidates.items() if effect.output is None
+              and all(key in context for key in effect.needs)}
+    alike = Counter(map(kind_of, usable))
+    for name, effect in usable.items():
         count = len(effect.parameters)
         for shape, searched, tried in _shapes(effect, context, present.values.get(name), poses):
             model = Model({name: np.concatenate([np.zeros(count), shape])})
             columns.append(near.columns(model)[:, :count])
-            blocks.append(Block(name, shape, slice(start, start + count), effect, searched, tried))
+            blocks.append(Block(name, shape, slice(start, start + count), effect, searched,
+                                tried * alike[kind_of(name)]))
             start += count
     return tuple(blocks), np.hstack(columns)
 

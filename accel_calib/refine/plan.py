@@ -35,11 +35,11 @@ from numpy.typing import NDArray
 
 from .base import fitted_state, with_effect
 from .sets import LEAST, Near, probabilities
-from .words import attitude_words, condition_words, percent, plan_lines, versus
+from .words import attitude_words, condition_words, percent, plan_lines, shown_name, versus
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import ATTITUDES, spread_directions
-from ..table import Floats, Poses
+from ..table import Floats, is_quantity, Poses
 
 if TYPE_CHECKING:
     from .search import Found
@@ -52,7 +52,7 @@ NOTHING = (f'there is nothing to separate: no named effect has a rival that leav
 """The line of an empty plan."""
 
 VARIED = ('temperature', 'supply_voltage', 'time', 'std')
-"""Context that a plan can vary, by column."""
+"""Context that a plan can vary, by column; it can vary quantities, too."""
 
 MOST_POSES = 6
 """Largest number of poses of a plan."""
@@ -260,7 +260,7 @@ def _contest(name: str, found: Found) -> _Contest | None:
     fits: dict[str, Fit] = {name: found.final.fit}
     weights = probabilities(name, found.near)
     for rival, weight in weights.items():
-        if rival not in (name, WANDER) and weight > LEAST:
+        if rival != WANDER and shown_name(rival) != shown_name(name) and weight > LEAST:
             fit = _fit_of(rival, name, found)
             if fit is not None:
                 fits[rival] = fit
@@ -292,7 +292,7 @@ def _varied(contests: Sequence[_Contest]) -> tuple[str, ...]:
     """Return the columns that the effects in contest are functions of."""
     needs = {key for contest in contests for name in contest.names
              for key in effect_named(name).needs}
-    return tuple(key for key in VARIED if key in needs)
+    return tuple(key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs)
 
 
 @dataclass(frozen=True)
@@ -346,7 +346,7 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
              ) -> dict[str, NDArray[Any]]:
     """Return the columns of candidates, without their readings."""
     count, found = len(force), {}
-    for key in ('std', 'count', 'temperature', 'supply_voltage', 'rate'):
+    for key in ('std', 'count', 'temperature', 'supply_voltage', 'rate', *poses_g.quantities):
         if key in poses_g:
             usual = np.nanmedian(poses_g[key], axis=0)
             found[key] = np.tile(usual, (count, 1)) if usual.ndim else np.full(count, usual)
@@ -412,7 +412,8 @@ def _in_words(contests: Sequence[_Contest], grid: _Candidates,
 
 def _effort(shown: Mapping[str, float]) -> tuple[float, ...]:
     """Return the key that sorts poses by time, and then by what must be set."""
-    return (shown.get('time', 0.0), *(shown.get(key, 0.0) for key in VARIED if key != 'time'))
+    return (shown.get('time', 0.0), *(shown.get(key, 0.0) for key in VARIED if key != 'time'),
+            *(value for key, value in sorted(shown.items()) if is_quantity(key)))
 
 
 def _triple(vector: Floats) -> tuple[float, float, float]:

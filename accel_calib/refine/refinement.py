@@ -76,7 +76,7 @@ _BASE = '10'
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
-           date: str = '') -> Refinement:
+           date: str = '', also: tuple[str, ...] = ()) -> Refinement:
     """
     Find effects that a model lacks, and add them to it.
 
@@ -91,6 +91,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
         changes of the sensor since then, and then further effects.
     sensor, date : str
         Name of the sensor and date for the refined calibration.
+    also : tuple of str
+        Names of own effects of the user, which are tried beside the catalogue.
 
     Raises
     ------
@@ -109,14 +111,14 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     sure, doubts = sure_rows(poses)
     if doubts:
         try:
-            return _refine(poses, sure, doubts, units, base, sensor, date)
+            return _refine(poses, sure, doubts, units, base, sensor, date, also)
         except RefusedFitError:
             pass  # the fit needs the doubtful poses
-    return _refine(poses, poses, (), units, base, sensor, date)
+    return _refine(poses, poses, (), units, base, sensor, date, also)
 
 
 def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
-            base: str | Calibration, sensor: str, date: str) -> Refinement:
+            base: str | Calibration, sensor: str, date: str, also: tuple[str, ...]) -> Refinement:
     """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
     if len(sound) < _LEAST_POSES:
@@ -130,7 +132,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     total, poses_g = len(poses_g), sampled(poses_g)
     model = Model(calibration.model.values)
     try:
-        found = search(poses_g, model)
+        found = search(poses_g, model, also)
     except NotConvergedError:
         raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses, '
                               'expected a fit that converges', 'check the poses for mistakes, or '
@@ -188,7 +190,7 @@ def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
 
 
 def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
-                      date: str = '') -> Refinement:
+                      date: str = '', also: tuple[str, ...] = ()) -> Refinement:
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
 
@@ -206,7 +208,7 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
     """
     fitted = fit_with_fleet(poses, units, fleet, sensor=sensor, date=date)
     try:
-        found = refine(poses, units, base=_BASE, sensor=sensor, date=date)
+        found = refine(poses, units, base=_BASE, sensor=sensor, date=date, also=also)
     except RefusedFitError as err:
         return _without_search(fitted, err.message, err.advice)
     if found.refusal:

@@ -14,7 +14,7 @@ instant, the ends of the range of a column, or directions of the force.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from html import escape
 from itertools import pairwise
 import math
@@ -38,24 +38,25 @@ from .words import (
     percent,
     plain_name,
     range_words,
+    shown_name,
 )
 from ..calibrate import Calibration
 from ..effects import (
     CHANGES,
     effect_named,
     EFFECTS,
-    EMPIRICAL,
-    empirical_parts,
     included,
+    kind_of,
     LADDER,
     Model,
     parameter_names,
     PROCESSES,
+    variable_of,
     WANDER,
 )
 from ..estimate import judge, kinds
 from ..geometry import ATTITUDES
-from ..table import COLUMNS, Floats, Poses
+from ..table import column_of, Floats, Poses
 from ..text import listed, table
 from ..units import MG
 
@@ -79,7 +80,7 @@ class Step:
     Parameters
     ----------
     effect : str
-        Name in the catalogue.
+        What the effect is: its name in the catalogue, ``empirical`` or a covariate.
     rivals : tuple of str
         Effects that these data cannot distinguish from it.
     probabilities : dict
@@ -94,9 +95,10 @@ class Step:
         Probability that noise alone makes one of all candidates this good.
     where : str
         Directions, range or poses of the disagreement.
-    curve : str
-        Name of an empirical curve in the model, with carrier, variable and modes; empty for other
-        effects.
+    name : str
+        Name in the model, by which `accel_calib.effects.effect_named` finds the effect.
+    variable : str
+        Quantity that a covariate or a curve is a function of; empty for other effects.
 
     """
 
@@ -110,12 +112,11 @@ class Step:
     held_out_after_mg: float
     p_value: float
     where: str
-    curve: str = ''
+    name: str
+    variable: str = field(init=False)
 
-    @property
-    def name(self) -> str:
-        """Return the name by which `accel_calib.effects.effect_named` finds the effect."""
-        return self.curve or self.effect
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'variable', variable_of(self.name))
 
     @property
     def likely_rivals(self) -> tuple[str, ...]:
@@ -193,14 +194,6 @@ class Refinement:
     stages: tuple[Stage, ...]
     plan: PosePlan
 
-    def __post_init__(self) -> None:
-        curves = [name for name in self.calibration.model.effects if is_curve(name)]
-        steps = []
-        for step in reversed(self.steps):  # earlier curves belong to the base
-            steps.append(replace(step, curve=curves.pop()) if step.effect == EMPIRICAL and curves
-                         else step)
-        object.__setattr__(self, 'steps', tuple(reversed(steps)))
-
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
         return (f'Refinement({self.verdict}: {names}; residual {self.gap_mg:.3g} -> '
@@ -272,29 +265,27 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
         return Step(name, rivals, chances, {}, before.gap_mg(before.residual),
                     before.gap_mg(residual), before.gap_mg(before.held_out),
                     before.gap_mg(held_out), _p_value(name, before, found),
-                    _where(name, before, residual))
+                    _where(name, before, residual), name)
     effect, first, last = effect_named(name), before.fit.residual, after.fit.residual
     values = after.model.values.get(name, np.zeros(len(effect.values)))
     words = _curve(name, before, last) if is_curve(name) else _where(name, before, last)
     if name in CHANGES:
         words = f'{_change(name, after, date)}; {words}'
-    return Step(_shown(name), rivals, chances, effect.shown(values), before.gap_mg(first),
-                after.gap_mg(last), before.gap_mg(first if unseen else before.held_out),
-                after.gap_mg(after.held_out), _p_value(name, before, found), words)
+    return Step(kind_of(shown_name(name)), rivals, chances, effect.shown(values),
+                before.gap_mg(first), after.gap_mg(last),
+                before.gap_mg(first if unseen else before.held_out),
+                after.gap_mg(after.held_out), _p_value(name, before, found), words,
+                plain_name(name))
 
 
 def _rivals(name: str, found: Found) -> tuple[tuple[str, ...], dict[str, float]]:
     """Return the rivals of an effect, and the probabilities of it and of those in its place."""
-    chances: dict[str, float] = {}
+    own, chances = shown_name(name), dict[str, float]()
     for other, part in probabilities(name, found.near).items():
-        chances[_shown(other)] = chances.get(_shown(other), 0.0) + part
+        shown = kind_of(own) if shown_name(other) == own else shown_name(other)
+        chances[shown] = chances.get(shown, 0.0) + part
     return tuple(other for other, part in chances.items()
-                 if other != _shown(name) and part > LEAST), chances
-
-
-def _shown(name: str) -> str:
-    """Return the name of an effect in the record."""
-    return EMPIRICAL if is_curve(name) else plain_name(name)
+                 if other != kind_of(own) and part > LEAST), chances
 
 
 def _p_value(name: str, before: State, found: Found) -> float:
@@ -319,10 +310,11 @@ def _output_steps(found: Found) -> list[Step]:
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
         steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': limit_g},
                           whole.gap_mg(whole.residual), gap, whole.gap_mg(whole.held_out),
-                          held_out, 0.0, limit_words(rows, limit_g)))
+                          held_out, 0.0, limit_words(rows, limit_g), 'saturation'))
     if found.grid_g is not None:
         steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, gap,
-                          gap, held_out, held_out, 0.0, grid_words(found.grid_g * MG)))
+                          gap, held_out, held_out, 0.0, grid_words(found.grid_g * MG),
+                          'quantisation'))
     return steps
 
 
@@ -338,7 +330,7 @@ def _curve(name: str, before: State, after: Floats) -> str:
     """Return a description of an empirical curve, given the residuals with it."""
     share_mg = before.mg_of_poses(before.fit.residual - after)
     return curve_words(name, float(np.max(np.abs(share_mg))),
-                       steepest(empirical_parts(name)[1], before.poses_g, share_mg),
+                       steepest(variable_of(name), before.poses_g, share_mg),
                        nearest_effects(before))
 
 
@@ -423,7 +415,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[s
             continue
         if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
             continue
-        lacking = [', '.join(COLUMNS[key].names) for key in effect.needs if key not in poses_g]
+        lacking = [', '.join(column_of(key).names) for key in effect.needs if key not in poses_g]
         if lacking:
             missing.append((name, ' and '.join(lacking)))
         elif effect.known_orientation and unknown:
@@ -432,7 +424,7 @@ def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[s
             continue
         elif effect.needs:
             missing.append((name, 'poses with a larger change of this quantity: '
-                            f'{COLUMNS[effect.needs[0]].meaning}'))
+                            f'{column_of(effect.needs[0]).meaning}'))
         else:
             missing.append((name, 'more poses in more directions'))
     return tuple(missing)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from .base import (
     beginning,
+    causes,
     Clipped,
     fitted_state,
     is_noise,
@@ -41,7 +42,17 @@ from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, w
 from .linear import LEVEL, Linear, linearised, Set
 from .sets import accepted, explored, Near, simpler
 from ..calibrate import with_previous
-from ..effects import CHANGES, EFFECTS, empirical_parts, included, LADDER, Model, WANDER
+from ..effects import (
+    CHANGES,
+    covariate_names,
+    effect_named,
+    EFFECTS,
+    empirical_parts,
+    included,
+    LADDER,
+    Model,
+    WANDER,
+)
 from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses
@@ -105,20 +116,25 @@ class Found:
     with_clipped: State | None = None
 
 
-def search(poses_g: Poses, base: Model) -> Found:
-    """Search for the effects that a base lacks; `NotConvergedError` if its fit fails."""
+def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
+    """
+    Search for the effects that a base lacks; `NotConvergedError` if its fit fails.
+
+    `also` are the names of own effects of the user, which are tried beside the catalogue.
+
+    """
     everyone = np.arange(len(poses_g))
     whole, clip = unclipped(poses_g, base)
     if clip is not None:
         everyone = np.delete(everyone, clip.poses)
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
-    found = _search(poses_g, base)
+    found = _search(poses_g, base, also)
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
 
 
-def _search(poses_g: Poses, base: Model) -> Found:
+def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
@@ -127,7 +143,7 @@ def _search(poses_g: Poses, base: Model) -> Found:
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
     names = (*_ladder_effects(begun), *(name for name in EFFECTS if name not in LADDER),
-             *_beside(begun.model, CHANGES))
+             *also, *covariate_names(causes(poses_g)), *_beside(begun.model, CHANGES))
     state, near = _settled(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
@@ -145,6 +161,9 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     if found.walk is None and found.final.is_noise:
         return found
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
+    alone = None if curve is None else _alone(curve, found, poses_g)
+    if alone is not None:
+        return _described(alone, start, poses_g)
     walking = _walking(found)
     if curve is None or (walking is not None and not _is_better(curve, walking.near)):
         return found if curve is None or walking is None else walking
@@ -160,6 +179,26 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     return replace(found, base=_without(start, poses_g, out), final=after, near=near,
                    walk=None, outliers=out, curve=curve,
                    added=(*(name for name in found.added if name != WANDER), curve.name))
+
+
+def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
+    """Return what was found without the effects of the variable of a curve that replaces them."""
+    variable = empirical_parts(curve.name)[1]
+    shared = [name for name in found.near.names if effect_named(name).needs == (variable,)]
+    fewer = {name: values for name, values in found.final.model.values.items()
+             if name not in shared}
+    state = fitted_state(Model(fewer), found.final.poses_g) if shared else None
+    if state is None:
+        return None
+    near = found.near
+    blocks = [block for block in near.chosen.blocks
+              if near.linear.blocks[block].effect not in shared]
+    instead = best_curve(state, poses_g, near.chosen.out)
+    if instead is None or empirical_parts(instead.name)[1] != variable:
+        return None
+    return replace(found, final=state, near=replace(
+        near, chosen=near.linear.set_of(blocks, near.chosen.out)),
+        added=tuple(name for name in found.added if name not in shared))
 
 
 def _walking(found: Found) -> Found | None:

@@ -14,16 +14,21 @@ import numpy as np
 from ..calibrate import words_of
 from ..effects import (
     CHANGES,
+    COVARIATES,
     effect_named,
     EMPIRICAL,
     empirical_parts,
+    is_effect,
+    kind_of,
     TO_SEPARATE,
+    unit_of,
     value_unit,
-    VARIABLES,
+    variable_of,
+    variable_words,
     WANDER,
 )
 from ..geometry import ATTITUDES, unit
-from ..table import COLUMNS, Floats
+from ..table import column_of, Floats, is_quantity
 from ..text import counted, short
 
 if TYPE_CHECKING:
@@ -137,10 +142,10 @@ def curve_words(name: str, largest_mg: float, steepest: tuple[float, float] | No
     whole, _, part = carrier.partition('.')
     what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
     of = f' of {part}' if part else ''
-    words = f'the {what}{of} changes with {VARIABLES[variable]} by up to {largest_mg:.2g} mg'
+    words = f'the {what}{of} changes with {variable_words(variable)} by up to {largest_mg:.2g} mg'
     if steepest is not None:
         low, high = steepest
-        words += f', most between {low:.4g} and {high:.4g} {COLUMNS[variable].unit}'
+        words += f', most between {low:.4g} and {high:.4g} {column_of(variable).unit}'.rstrip()
     if nearest:
         words += '; no known effect has this form, the nearest are ' + ', '.join(
             f'{effect} (leaves {left:.2g} mg)' for effect, left in nearest.items())
@@ -154,8 +159,8 @@ def instant_words(times: tuple[float, float], rows: tuple[int, int]) -> str:
 
 def range_words(column: str, ends: tuple[float, float], rms_mg: tuple[float, float]) -> str:
     """Return the range of a column, and the disagreement at both ends of it [mg]."""
-    unit_name = COLUMNS[column].unit if column != 'std' else 'g'
-    return (f'over {column.replace("_", " ")} {ends[0]:.4g} to {ends[1]:.4g} {unit_name}: '
+    span = f'{ends[0]:.4g} to {ends[1]:.4g} {unit_of(column)}'.rstrip()
+    return (f'over {column.replace("_", " ")} {span}: '
             f'{rms_mg[0]:.2g} mg RMS in the lowest fifth of the poses, {rms_mg[1]:.2g} mg in the '
             'highest')
 
@@ -180,6 +185,13 @@ def change_words(name: str, values: Floats, deviation: float, date: str) -> str:
 def plain_name(name: str) -> str:
     """Return the name of an effect, for a change that of the effect that has changed."""
     return CHANGES[name].base if name in CHANGES else name
+
+
+def shown_name(name: str) -> str:
+    """Return the name of an effect among rivals; a covariate keeps its quantity."""
+    if kind_of(name) in COVARIATES:
+        return f'{kind_of(name)}-{variable_of(name)}'
+    return plain_name(kind_of(name))
 
 
 def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
@@ -233,8 +245,8 @@ def _other_sensor(found: Found) -> list[str]:
 
 
 def _separating(step: Step) -> str:
-    families = {effect_named(name).family for name in (step.effect, *step.rivals)
-                if name != EMPIRICAL}
+    families = {effect_named(name).family for name in (step.name, *step.rivals)
+                if is_effect(name)}
     family = families.pop() if len(families) == 1 else ''
     return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
             f'{TO_SEPARATE[family]}')
@@ -244,7 +256,7 @@ def _remarks(step: Step) -> list[str]:
     """Return a remark on values that are far larger than in common parts."""
     if step.effect == EMPIRICAL:
         return []
-    effect = effect_named(step.effect)
+    effect = effect_named(step.name)
     largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                   default=0.0)
     if largest <= _FAR * effect.typical:
@@ -293,7 +305,7 @@ def _counted(texts: list[str]) -> list[str]:
 
 def versus(names: Sequence[str]) -> str:
     """Return the words of an effect and its rivals."""
-    first, *others = (plain_name(name) for name in names)
+    first, *others = (shown_name(name) for name in names)
     return f'{first} from {", ".join(others)}'
 
 
@@ -306,6 +318,7 @@ def condition_words(context: Mapping[str, float]) -> str:
         parts.append(f'at {context["supply_voltage"]:.2f} V')
     if 'std' in context:
         parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+    parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
     if context.get('time', 0.0) > 0.0:
         parts.append(f'{_duration(context["time"])} after the last pose')
     return ' '.join(parts)

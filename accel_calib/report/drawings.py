@@ -45,9 +45,10 @@ from ..effects import (
     CARRIERS,
     curve_unit,
     effect_named,
+    EMPIRICAL,
     empirical_parts,
     parameter_names,
-    VARIABLES,
+    variable_words,
 )
 from ..refine.words import base_words
 from ..table import Floats, Poses
@@ -71,7 +72,7 @@ def all_drawings(result: Refinement) -> Iterator[Drawing]:
     yield ladder(result)
     for step in range(len(result.steps)):
         yield from of_step(result, step)
-        if result.steps[step].curve:
+        if result.steps[step].effect == EMPIRICAL:
             yield of_curve(result, step)
     yield from of_remainder(residuals_of_refinement(result))
 
@@ -190,10 +191,10 @@ def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Flo
 
 def of_curve(result: Refinement, step: int) -> Drawing:
     """Draw the empirical curve of a step with its 95 % band, and ticks at the poses."""
-    name = result.steps[step].curve
+    name = result.steps[step].name
     carrier, variable, _ = empirical_parts(name)
     words = _carrier_words(carrier)
-    title = f'{words[0].upper()}{words[1:]} over {VARIABLES[variable]}, with 95 % band'
+    title = f'{words[0].upper()}{words[1:]} over {variable_words(variable)}, with 95 % band'
     parts = curve_parts(result, name)
     with styled():
         figure = new_figure(HEIGHT_INCHES, title)

@@ -51,7 +51,7 @@ from ..effects import (
     empirical_parts,
     REFERENCE_TEMPERATURE,
     value_unit,
-    VARIABLES,
+    variable_words,
     with_vector,
 )
 from ..estimate import coverage
@@ -313,7 +313,8 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     for name in calibration.model.effects:
         if name.startswith(f'{EMPIRICAL}-'):
             carrier, variable, modes = empirical_parts(name)
-            yield f'curve of {carrier} over {VARIABLES[variable]}', counted(len(modes), 'wave'), ''
+            words = variable_words(variable)
+            yield f'curve of {carrier} over {words}', counted(len(modes), 'wave'), ''
     for figure in effect_figures(calibration):
         name, _, part = figure.key.rpartition('.')
         if name.startswith(f'{EMPIRICAL}-') or not (figure.value or figure.sd):
@@ -332,7 +333,7 @@ def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str
     if unit.startswith('g') and 0.0 < typical < _SMALL:
         unit, factor = f'µ{unit}', MG ** 2
     return (signed(figure.value * factor, figure.sd * factor, unit),
-            f'±{short(typical * factor)} {unit}' if typical else '')
+            f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
 
 
 def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
@@ -404,7 +405,7 @@ def _step(result: Refinement, number: int, step: Step) -> str:
     table = '' if not shown else scroll_table(
         [name for name, _ in shown], [[value for _, value in shown]], 'whole-cells',
         f'Values of step {number}')
-    curve = figures([of_curve(result, number - 1)], 'wide') if step.curve else ''
+    curve = figures([of_curve(result, number - 1)], 'wide') if step.effect == EMPIRICAL else ''
     title = f'{number}. {effect_named(step.name).words.capitalize()}'
     return section(title, f'<p>{_story(step)}</p>\n', table,
                    figures(of_step(result, number - 1), 'pair'), curve)

@@ -14,7 +14,7 @@ import numpy as np
 from ..calibrate import Calibration, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
 from ..geometry import unit
-from ..table import Floats, Poses
+from ..table import column_of, Floats, Poses
 from ..units import MG
 
 if TYPE_CHECKING:
@@ -95,7 +95,8 @@ def with_thermal(poses_g: Poses, lagged: str, shape: Floats) -> Poses:
 
 def recorded(poses_g: Poses) -> list[Variable]:
     """Return the variables of the context that change between poses."""
-    found = [variable_of(key, poses_g[key]) for key in _CONTEXT if key in poses_g]
+    found = [variable_of(key, poses_g[key]) for key in (*_CONTEXT, *poses_g.quantities)
+             if key in poses_g]
     return [variable for variable in found if np.ptp(variable.values) > 0.0]
 
 
@@ -106,7 +107,7 @@ def variable_of(key: str, values: Floats) -> Variable:
     if values.ndim > 1:
         mean = np.mean if key == 'std' else np.sum
         values = np.sqrt(mean(values ** 2, axis=1))
-    label, factor = _LABELS[key]
+    label, factor = _LABELS.get(key) or (column_of(key).meaning, 1.0)
     return Variable(label, values * factor)
 
 

@@ -254,7 +254,8 @@ class Sensor:
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
         """Return the context of a rest as one row, for this calibration."""
-        return {**context_of_rest(rest, calibration.units),
+        neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
+        return {**neutral, **context_of_rest(rest, calibration.units),
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
@@ -272,8 +273,8 @@ class Sensor:
             return None
         if self._prepared is None or self._prepared[0] is not calibration:
             self._prepared = calibration, OneReading(calibration, 1.0 / calibration.force_per_g)
-        context = {'std': _AT_REST, 'previous': _AT_REST, 'rate': _AT_REST,
-                   **self.temperatures.columns_of(calibration.model), **known}
+        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
+                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
         try:
             return self._prepared[1].at(context).correct(*reading)
         except InputError:

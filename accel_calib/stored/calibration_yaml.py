@@ -62,7 +62,7 @@ from ..errors import (
 )
 from ..estimate import judge
 from ..finding import Finding, KINDS, LEVELS, without
-from ..table import check_values, COLUMNS, Floats, LARGEST, Poses
+from ..table import check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..units import UNIT_NAMES, Units
 
 _FORMAT = 'accel_calib calibration'
@@ -83,6 +83,9 @@ OF_FILE = {
 _EQUATION = 'reading = V + W u + effects, u = ΔR force, |force| = 1 g at rest; values in g'
 _SAME = 1e-9
 """A stated correction may differ by this share from that of the effects."""
+
+_SAME_OWN = 1e-6
+"""The contribution of an own effect may differ by this share from that when it was fitted."""
 
 _CHECKSUM = '\nchecksum: sha256 '
 _NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
@@ -132,7 +135,7 @@ def _digest(text: str) -> str:
 def _values_in(calibration: Calibration) -> int:
     """Return an upper limit of the number of values and keys in the file of a calibration."""
     poses = calibration.poses
-    cells = sum(1 + len(column.names) for key, column in COLUMNS.items() if key in poses)
+    cells = sum(1 + len(column_of(key).names) for key in poses.columns)
     return _OTHERS + (1 + cells) * len(poses) + 5 * len(calibration.rejected)
 
 
@@ -145,7 +148,8 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'date': calibration.date,
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
-        'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values)}
+        'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values),
+                           **({'own_rms': _own_rms(name, poses, units)} if effect.own else {})}
                     for (name, values), effect in zip(model.values.items(), model.terms.effects,
                                                       strict=True)},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
@@ -162,8 +166,17 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'findings': [each.stated for each in without(calibration.noted, *OF_FILE)],
         'poses': {'row': poses.row.tolist(),
                   **{key: poses[key].tolist() for key, column in COLUMNS.items()
-                     if key in poses and not column.made}},
+                     if key in poses and not column.made},
+                  **({'quantities': {key: poses[key].tolist() for key in poses.quantities}}
+                     if poses.quantities else {})},
     }
+
+
+def _own_rms(name: str, poses: Poses, units: Units) -> float:
+    """Return the RMS over the poses of what the values of an own effect are multiplied by."""
+    poses_g, values = in_g(poses, units), np.zeros(len(effect_named(name).values))
+    basis = Model({name: values}).basis(poses_g.reading, poses_g.columns)
+    return float(np.sqrt(np.mean(basis.terms ** 2)))
 
 
 def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, Any]:
@@ -197,7 +210,9 @@ def calibration_from(data: bytes, name: str) -> Calibration:
         raise _damaged(name, str(err)) from err
     _check_version(content, name)
     body, found, digest = text.rpartition(_CHECKSUM)
+    _check_known(content, name)
     calibration = _checked(content, name)
+    _check_own(calibration, content, name)
     if (not found and content['version'] == 1) or digest.strip() == _digest(body.rstrip()):
         return calibration
     if not found:
@@ -221,6 +236,29 @@ def _text_of(data: bytes, name: str) -> str:
     except UnicodeDecodeError as err:
         line = 1 + data.count(b'\n', 0, err.start)
         raise _damaged(name, f'line {line} is not text in UTF-8') from err
+
+
+def _check_known(content: Mapping[str, Any], name: str) -> None:
+    """Refuse a calibration with an own effect of the user that this process does not know."""
+    stated = content.get('effects')
+    for each, values in stated.items() if isinstance(stated, Mapping) else ():
+        if isinstance(values, Mapping) and 'own_rms' in values and not is_effect(each):
+            raise StoredCalibrationError(
+                f'{name} needs the effect {shown(each)} of the user ({shown(values.get("what"))}),'
+                ' expected its definition', 'use --also FILE.py with the file that defines it, '
+                'also=[effect] in Python')
+
+
+def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) -> None:
+    """Refuse a calibration whose own effects are now defined in another way."""
+    model = calibration.model
+    for each, effect in zip(model.effects, model.terms.effects, strict=True):
+        if effect.own and not np.isclose(
+                _own_rms(each, calibration.poses, calibration.units),
+                number_at(content['effects'][each], 'own_rms'), _SAME_OWN, 0.0):
+            raise StoredCalibrationError(
+                f'{name} needs the effect {shown(each)} as it was when it was fitted, found '
+                'another definition', 'use that definition, or refine again')
 
 
 def _check_version(content: Any, name: str) -> None:
@@ -345,7 +383,7 @@ def _effects(stated: Mapping[str, Any]) -> dict[str, Floats]:
 def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
     """Return the values of an effect; shape constants that are not stated are the usual ones."""
     for key in stated:
-        if key not in (*effect.values, 'what', 'unit'):
+        if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
             raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
                              f'{", ".join(effect.values)}')
     known = {**dict(zip(effect.shape, effect.usual)), **stated}
@@ -394,6 +432,10 @@ def _poses(stated: Mapping[str, Any]) -> Poses:
             shape = (len(rows), len(column.names))
             columns[key] = _labels(stated) if key == 'label' else array_at(
                 stated, key, shape if shape[1] > 1 else shape[:1])
+    for key in value_at({'quantities': {}, **stated}, 'quantities', dict):
+        if not is_quantity(key):
+            raise ValueError(f'the key {shown(key)} of quantities is not that of a quantity')
+        columns[key] = array_at(stated['quantities'], key, (len(rows),))
     check_values(columns, 'poses')
     return Poses(columns, rows)
 

@@ -35,7 +35,8 @@ _NAMES = parameter_names(MODELS['10'].effects)
 
 _CONTEXT = {'temperature': ('temperature', 1.0), 'supply_voltage': ('supply_voltage', 1.0),
             'std': ('vibration', STANDARD_GRAVITY), 'time': ('wait', 1.0)}
-"""Column of the plan and its unit, by column of the poses: °C, V, m/s², s after the last pose."""
+"""Column of the plan and its unit, by column of the poses: °C, V, m/s², s after the last pose.
+Quantities keep their name."""
 
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
@@ -109,15 +110,17 @@ def write_plan(path: Path, plan: PosePlan) -> None:
         If the file cannot be written. An earlier file is then unchanged.
 
     """
+    columns = {**{key: (key, 1.0) for pose in plan.poses for key in pose.context}, **_CONTEXT}
+
     def write(file: TextIO) -> None:
         file.writelines(f'# {line}\n' for line in plan.lines)
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
-                         *(name for name, _ in _CONTEXT.values()), 'separates',
+                         *(name for name, _ in columns.values()), 'separates',
                          'expected_probability'])
         for number, pose in enumerate(plan.poses, 1):
             context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
-                       for key, (_, scale) in _CONTEXT.items()]
+                       for key, (_, scale) in columns.items()]
             writer.writerow([number, *(f'{part:.6f}' for part in pose.up), pose.words, *context,
                              ' / '.join(pose.separates), f'{pose.expected:.4f}'])
 

@@ -180,6 +180,10 @@ def _with_steps(header: Header, calibration: Calibration) -> Header:
 
 def _make(calibration: Calibration, options: Options, use: Sequence[str]) -> Made:
     """Return a header for C99 and C++, with these lines about its use."""
+    own = [effect.words for effect in calibration.model.terms.effects if effect.own]
+    if own:
+        raise InputError(f'the calibration has an effect of the user ({own[0]}), which has no '
+                         'code in C', 'refine without --also, or write this correction by hand')
     header, per_g = _header_of(calibration), calibration.force_per_g
     return Made(_text(header, calibration, _name_of(calibration, options), use),
                 lambda reading, temperature: header.force(reading, temperature) / per_g, True)

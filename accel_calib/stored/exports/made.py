@@ -159,15 +159,14 @@ def steady_at(calibration: Calibration, temperature: Floats) -> AtContext:
 
 
 def _steady_context(calibration: Calibration, temperature: Floats) -> Context:
-    none, used = np.zeros((len(temperature), 3)), calibration.used_poses
+    count, used = len(temperature), calibration.used_poses
     supply = (float(np.mean(used['supply_voltage'])) if 'supply_voltage' in used and len(used)
               else NOMINAL_SUPPLY)
     time = calibration.ranges.get('time', (0.0, 0.0))[1]
-    return {**dict.fromkeys(_TEMPERATURE_KEYS, temperature),
-            'temperature_rate': np.zeros(len(temperature)),
-            'time': np.full(len(temperature), time),
-            'supply_voltage': np.full(len(temperature), supply),
-            'std': none, 'previous': none, 'rate': none}
+    return {**calibration.typical_context(count),
+            **{key: np.full(count, value) for key, value in calibration.model.neutral.items()},
+            **dict.fromkeys(_TEMPERATURE_KEYS, temperature), 'temperature_rate': np.zeros(count),
+            'time': np.full(count, time), 'supply_voltage': np.full(count, supply)}
 
 
 def steady_grid(calibration: Calibration, temperatures: int = _TEMPERATURES, size: float = 1.0
