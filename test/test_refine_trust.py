@@ -259,3 +259,19 @@ def test_a_file_that_was_edited_is_compared_with_its_own_poses(stored, tmp_path,
     assert result['gap_mg'] > 20.0
     assert [step['effect'] for step in result['steps']] == ['offset']
     assert result['steps'][0]['parameters']['x'] == pytest.approx(-0.05, abs=2e-3)
+
+
+@pytest.mark.parametrize('seed', [3, 10, 11, 22])
+def test_without_a_gap_the_calibration_is_that_of_the_fit(seed):
+    rng = np.random.default_rng([31, seed])
+    model = with_effects(rng)
+    poses = simulate_poses(model, random_directions(30, rng), rng)
+    shift = rng.normal(size=3) * 2.2e-3 * rng.uniform(0.5, 1.5)
+    poses = poses.with_columns(reading=poses.reading + shift * (np.arange(30) == 4)[:, np.newaxis])
+    found, fitted = refine(poses, G), fit_poses(poses, G)
+    assert found.verdict == 'no_gap'
+    np.testing.assert_array_equal(found.calibration.model.vector, fitted.model.vector)
+    assert found.calibration.rejected == fitted.rejected
+    assert found.calibration.quality == fitted.quality
+    assert found.disturbed_poses == tuple(pose.row for pose in fitted.rejected)
+    assert found.remaining_gap_mg == pytest.approx(fitted.quality.rms_after_mg)

@@ -72,14 +72,15 @@ _NAMED = 4
 """Largest number of undetermined values that are named."""
 
 
-def base_of(poses: Poses, units: Units, name: str) -> Calibration:
-    """Return the base as a calibration; errors as in `fit_poses`."""
+def base_of(poses: Poses, units: Units, name: str, *, sensor: str = '', date: str = ''
+            ) -> Calibration:
+    """Return the base as a calibration; `sensor`, `date` and errors as in `fit_poses`."""
     if name not in BASES:
         raise ValueError(f'base is {name!r}, expected one of {BASES}')
     if name == 'ideal':
         return ideal(poses, units)
     try:
-        return fit_poses(poses, units, model=name)
+        return fit_poses(poses, units, model=name, sensor=sensor, date=date)
     except RefusedFitError:
         if name == 'auto' and 'orientation' in poses:
             return ideal(poses, units)

@@ -39,6 +39,7 @@ from .result import (
     Stage,
     steps_of,
     untestable,
+    Verdict,
     verdict_of,
 )
 from .search import Found, search
@@ -125,7 +126,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
         raise RefusedFitError(f'found {counted(len(sound), "sound pose")}, expected at least '
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
-    calibration = stored or base_of(sound, units, str(base))
+    calibration = stored or base_of(poses, units, str(base), sensor=sensor, date=date)
     poses_g = with_history(in_g(sound, calibration.units), calibration.model)
     if stored is not None:
         poses_g = beside_stored(poses_g, stored)
@@ -152,13 +153,17 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
     steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
     verdict = verdict_of(found, bool(steps))
+    missing, plan = untestable(found, steps), plan_poses(found)
+    if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
+        alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
+        advice = advice_for(verdict, found, steps, missing, len(calibration.rejected))
+        return _of_fit(calibration, alone, verdict, missing, (*advice, *plan.advice))
     rejected = _rejected(found, given)
     clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
     outliers = tuple(each.row for each in rejected if each.row not in clipped)
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
-    missing, plan = untestable(found, steps), plan_poses(found)
     advice = (*advice_for(verdict, found, steps, missing, len(outliers)), *plan.advice)
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual),
@@ -244,14 +249,22 @@ def _with(found: Refinement, calibration: Calibration) -> Refinement:
 def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
-    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
-    state, ratio = State(fit), fitted.quality.chi2_per_dof
-    gap_mg = state.gap_mg(fit.residual)
-    quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
-    return Refinement(
-        'no_gap' if quiet else 'unexplained', fitted.quality.noise_floor_mg, gap_mg, gap_mg, (),
-        tuple(each.row for each in fitted.rejected),
+    found = _of_fit(
+        fitted, with_history(only_norm(poses_g), fitted.model), 'no_gap',
         not_testable(poses_g, {}, fitted.model.effects),
-        (f'no effects were searched: {message}; the result is the fit with the fleet', advice),
-        fitted, (), fit.poses_g, fit.equations.force,
-        (Stage('base', state.mg_of_poses(fit.residual)),), PosePlan())
+        (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
+    fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
+    quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
+    return found if quiet else replace(found, verdict='unexplained')
+
+
+def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
+            missing: tuple[tuple[str, str], ...], advice: tuple[str, ...]) -> Refinement:
+    """Return a fit as a refinement without steps; `poses_g` are the poses that it used."""
+    state = State(judge(Model(fitted.model.values), poses_g))
+    gap_mg = state.gap_mg(state.fit.residual)
+    return Refinement(
+        verdict, fitted.quality.noise_floor_mg, gap_mg, gap_mg, (),
+        tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
+        state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
+        PosePlan())
