@@ -43,7 +43,7 @@ class Intake:
 
     @property
     def said(self) -> str:
-        """Return how the log was read and captured, in one line, for what comes beside a refusal."""
+        """Return how the log was read and captured, in one line, for an error about it."""
         return ', '.join(filter(None, (self.read_as, *self.captured)))
 
     @property
