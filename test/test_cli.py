@@ -323,7 +323,8 @@ def test_a_wider_limit_that_finds_many_more_poses_is_stated_and_can_be_used(tmp_
     log = shaky(tmp_path / 'log.csv')
     run('calibrate', log, '-o', tmp_path / 'c.yaml')
     said = capsys.readouterr()
-    advice = re.search(r'(\d) poses only, (\d+) with still_std_max (\S+)', said.out + said.err)
+    words = ' '.join((said.out + said.err).split())
+    advice = re.search(r'(\d) poses only, (\d+) with still_std_max (\S+)', words)
     assert advice is not None, said
     few, many = int(advice[1]), int(advice[2])
     assert many >= 2 * few
