@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import calibrate
 from .calibrate import FrameName, Method, mounting_of, Verification
-from .capture import capture as find_still
-from .capture import settings_from
 from .compare import compare as compare_calibrations
 from .compare import Comparison
 from .effects import know, model_with, simulate_poses, simulate_recording
@@ -27,7 +25,7 @@ from .errors import InputError
 from .finding import Finding
 from .findings import rate, Rating
 from .geometry import spread_directions
-from .intake import nothing_still, poses_of
+from .intake import poses_of, samples_again, still_poses
 from .logs import LogOptions, open_log, read_log
 from .logs import read_recording as read_whole_recording
 from .pipeline import calibrated, Plan
@@ -254,15 +252,13 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         options = LogOptions(units=units or '', gravity=gravity, topic=topic, sensor=sensor)
         with open_log(path, options) as log:
             known = log.units
-            found = find_still(log.blocks, known, settings_from(settings, known))
+            found, _ = still_poses(str(path), known, settings, log.blocks,
+                                   lambda: samples_again(path, options))
     else:
-        path = Path('the recording')
         samples = _table(recording, Recording, 'the recording')
         known = _units(units, gravity, samples.units, 'the recording')
         check_units(samples, known)
-        found = find_still(samples, known, settings_from(settings, known))
-    if not len(found.poses):
-        raise nothing_still(str(path), found.recorded)
+        found, _ = still_poses('the recording', known, settings, samples, lambda: samples)
     return replace(found.poses, units=known.name)
 
 

@@ -3,14 +3,17 @@
 
 """The command line: results, JSON, and one line for invalid input."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
+from accel_calib.capture import CaptureSettings
 from accel_calib.stored import read_calibration
-from inside import main, parser, rotation_from_rpy
+from inside import main, parser, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
 from shared import run, run_json
@@ -288,3 +291,58 @@ def test_without_matplotlib_one_line_advises_what_to_install(poses, tmp_path, ca
     assert printed.err.count('\n') == 1
     assert not page.exists()
     assert run('refine', poses) == 0
+
+
+# --------------------------------------------------------------------- settings of the capture
+
+def shaky(path, quiet=3, shaken=9, std_g=0.012):
+    """Write a recording whose first rests are quiet, and whose other rests are shaken."""
+    rng = np.random.default_rng(3)
+    rest, turn, rows = 250, 80, []
+    ups = spread_directions(quiet + shaken)
+    for k, (up, following) in enumerate(zip(ups, np.roll(ups, -1, axis=0))):
+        shaking = std_g * np.sin(2 * np.pi * 31.0 * np.arange(rest) / 100.0)[:, np.newaxis]
+        rows += [up + (shaking if k >= quiet else 0.0) * np.ones((rest, 3)),
+                 np.linspace(up, following, turn)]
+    readings = np.concatenate(rows) + rng.normal(0.0, 5e-4, ((rest + turn) * len(ups), 3))
+    lines = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(readings)]
+    path.write_text('\n'.join(['# units: "g"', 'time,ax,ay,az', *lines]) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('command', ['capture', 'calibrate', 'fit', 'verify', 'refine', 'report',
+                                     'fleet', 'live'])
+def test_every_command_that_captures_has_all_settings_of_the_capture(command):
+    others = {'capture': ['-o', 'p.csv'], 'verify': ['-c', 'c.yaml'], 'report': ['-o', 'r.html'],
+              'fleet': ['-o', 'out']}
+    assert {each.name for each in dataclasses.fields(CaptureSettings)} <= vars(
+        parser([command]).parse_args([command, 'log.csv', *others.get(command, [])])).keys()
+
+
+def test_a_wider_limit_that_finds_many_more_poses_is_stated_and_can_be_used(tmp_path, capsys):
+    log = shaky(tmp_path / 'log.csv')
+    run('calibrate', log, '-o', tmp_path / 'c.yaml')
+    said = capsys.readouterr()
+    words = ' '.join((said.out + said.err).split())
+    advice = re.search(r'(\d) poses only, (\d+) with still_std_max (\S+)', words)
+    assert advice is not None, said
+    few, many = int(advice[1]), int(advice[2])
+    assert many >= 2 * few
+    run('calibrate', log, '-o', tmp_path / 'c.yaml', '--still-std-max', advice[3])
+    assert f'captured {many} poses' in capsys.readouterr().out
+
+
+def test_without_a_still_stretch_the_quietest_window_the_limit_and_a_wider_one_are_stated(
+        tmp_path, capsys):
+    log = shaky(tmp_path / 'log.csv', quiet=0, shaken=12)
+    status, result = run_json(capsys, 'calibrate', log, '-o', tmp_path / 'c.yaml',
+                              '--still-std-max', 0.004)
+    assert status == 2
+    found = re.search(r'quietest 0.5 s the standard deviation is (\S+) g, the limit is 0.004',
+                      result['error'])
+    assert found is not None, result
+    assert float(found[1]) == pytest.approx(0.012 / np.sqrt(2.0), rel=0.1)
+    advice = re.search(r'(\d+) with still_std_max (\S+)', result['advice'])
+    assert advice is not None, result
+    run('capture', log, '-o', tmp_path / 'p.csv', '--still-std-max', advice[2])
+    assert f'{advice[1]} poses in' in capsys.readouterr().out

@@ -622,3 +622,161 @@ def test_many_poses_without_times_are_poses(tmp_path):
     path = tmp_path / 'poses.csv'
     np.savetxt(path, poses.reading, delimiter=',', header='ax,ay,az', comments='')
     assert isinstance(read_log(path).table, Poses)
+
+
+# -------------------------------------------------------------------- tables of real loggers
+
+def counted(made: dict[str, Any], start: int = 65_000, bits: int = 16) -> np.ndarray:
+    """Return the numbers of the samples by a counter of this width."""
+    return (start + np.arange(len(made['time']))) % 2**bits
+
+
+@pytest.mark.parametrize('comment', ['// Sample rate: 100.0Hz', '// Update Rate: 100.0Hz',
+                                     '# Config: data_rate = 100.0 Hz, filter = 48 Hz',
+                                     'Acquisition frequency: 100 Hz',
+                                     '--- Data File Created at 100 Hz ---', 'OutputRate:,0.1kHz'])
+@pytest.mark.parametrize('name', ['Counter', 'PacketCounter', 'Packet number', ''])
+def test_samples_without_times_have_the_rate_that_the_file_states(comment: str, name: str,
+                                                                  tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    rows = rows_of(counted(made), made['reading'], made['rate'])
+    kept = np.arange(len(rows)) % 37 != 5 if name else np.ones(len(rows), bool)
+    first = 0 if name else 1  # without a counter, no sample is missing
+    text = text_of([row[first:] for row, keep in zip(rows, kept) if keep],
+                   ','.join([name, 'Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z']).lstrip(','))
+    log = read_log(write(tmp_path, f'{comment}\n{text}'))
+    assert isinstance(log.table, Recording)
+    when = log.table['time'] - log.table['time'][0]
+    np.testing.assert_allclose(when, np.flatnonzero(kept) / 100.0, atol=1e-9)
+    assert '100 Hz (stated)' in log.read_as
+
+
+@pytest.mark.parametrize('count', [300, 953])
+def test_a_table_with_angular_rates_or_of_one_direction_is_not_taken_for_poses(
+        count: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    turned = np.column_stack([G * spread_directions(count), rng.normal(size=(count, 3))])
+    still = np.array([0.1, 0.2, G]) + 0.01 * rng.normal(size=(count, 3))
+    for values, header in ((turned, 'Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z'), (still, 'ax,ay,az')):
+        path = write(tmp_path, text_of(rows_of(values), header))
+        with pytest.raises(InputError, match='look like samples'):
+            read_log(path)
+        assert isinstance(read_log(path, LogOptions(rate=50.0)).table, Recording)
+
+
+def test_more_rows_than_a_person_poses_are_samples(tmp_path: Path) -> None:
+    poses = G * spread_directions(1500)
+    path = write(tmp_path, text_of(rows_of(poses), 'ax,ay,az'))
+    with pytest.raises(InputError, match='look like samples'):
+        read_log(path)
+    marked = write(tmp_path, text_of(rows_of(poses, np.arange(1500)), 'ax,ay,az,orientation'))
+    assert isinstance(read_log(marked).table, Poses)
+    timed = write(tmp_path, text_of(rows_of(np.arange(1500) * 5.0, poses), 'time,ax,ay,az'))
+    with open_log(timed) as log:
+        assert log.poses is None
+
+
+@pytest.mark.parametrize(('tick', 'rate_hz'), [(1e-4, 400.0), (1e-4, 60.0), (1e-6, 60.0),
+                                               (1e-4, 100.0), (1e-6, 120.0)])
+def test_the_clock_of_xsens_is_in_ticks_of_its_own(tick: float, rate_hz: float, tmp_path: Path
+                                                   ) -> None:
+    made = samples(per_g=G)
+    times = np.arange(len(made['time'])) / rate_hz
+    stamps = 12_000_000 + np.round(times / tick)
+    text = text_of(rows_of(counted(made), stamps, made['reading'], digits='.12g'),
+                   'PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z')
+    log = read_log(write(tmp_path, text))
+    np.testing.assert_allclose(log.table['time'] - log.table['time'][0], times, atol=tick)
+    assert ('100 µs' if tick == 1e-4 else 'SampleTimeFine in µs') in log.read_as
+
+
+@pytest.mark.parametrize('beside', ['comment', 'seconds', 'counter'])
+def test_a_unit_of_time_is_that_which_agrees_with_what_else_the_file_states(
+        beside: str, tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    slow = 8.0  # rows per second; in µs, 100 Hz would be as plausible
+    times = np.arange(len(made['time'])) / slow
+    stamps = np.round(times * 1e3)
+    columns: list[Any] = [stamps, made['reading']]
+    header, first = 'stamp,accX,accY,accZ', ''
+    if beside == 'seconds':
+        columns, header = [*columns, times], f'{header},elapsed_s_time'
+    if beside == 'comment':
+        first = '# Rate: 8 Hz\n'
+    if beside == 'counter':
+        first = '# Rate: 80 Hz\n'
+        columns, header = [10 * np.arange(len(times)), *columns], f'Counter,{header}'
+    log = read_log(write(tmp_path, first + text_of(rows_of(*columns, digits='.12g'), header)))
+    np.testing.assert_allclose(log.table['time'] - log.table['time'][0], times, atol=1e-3)
+
+
+def test_stamps_that_contradict_the_stated_rate_are_noted(tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    text = text_of(rows_of(made['time'] * 1e3, made['reading']), 't_ms,accX,accY,accZ')
+    log = read_log(write(tmp_path, f'# Sample rate: 400 Hz\n{text}'))
+    assert any('t_ms has 100 samples per second, but the file states 400 Hz' in note
+               for note in log.notes)
+    log = read_log(write(tmp_path, f'# Sample rate: 100 Hz\n{text}'))
+    assert not log.notes
+
+
+@pytest.mark.parametrize(('header', 'first', 'second'), [
+    ('Date,Timestamp', '2026-01-31 12:00:00', ''), ('time,millis', '12:00:{}', ''),
+    ('time,t_ms', '17', ''), ('Second,stamp', '', '')])
+def test_the_clock_that_runs_finest_is_read(header: str, first: str, second: str, tmp_path: Path
+                                            ) -> None:
+    made = samples(per_g=G)
+    rows = [[first.format(f'{int(when) % 60:02d}'), f'{when * 1e3:.0f}', *row]
+            for when, row in zip(made['time'], rows_of(made['reading']))]
+    log = read_log(write(tmp_path, text_of(rows, f'{header},accX,accY,accZ')))
+    np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-3)
+
+
+def test_seconds_and_nanoseconds_of_ros_are_read_together(tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    fraction = np.round(made['time'] % 1.0 * 1e9)
+    text = text_of(rows_of(np.floor(made['time']), fraction, made['reading'], digits='.12g'),
+                   'stamp.secs,stamp.nsecs,accX,accY,accZ')
+    np.testing.assert_allclose(read_log(write(tmp_path, text)).table['time'], made['time'],
+                               atol=1e-8)
+
+
+@pytest.mark.parametrize('blank', [',,,', '"","","",""', ' , ,,'])
+def test_rows_without_any_value_are_ignored(blank: str, tmp_path: Path) -> None:
+    text = log_text('time,ax,ay,az') + f'{blank}\n' * 20
+    log = read_log(write(tmp_path, text))
+    assert len(log.table) == len(samples()['time'])
+    assert log.notes == ()
+
+
+def test_columns_with_gravity_of_one_maker_go_before_those_without_it(tmp_path: Path) -> None:
+    made = samples(per_g=1.0)
+    free = 0.3 + 0.01 * made['reading'] * G
+    text = text_of(rows_of(made['time'], made['reading'], free, made['rate']),
+                   'time,gFx,gFy,gFz,ax,ay,az,wx,wy,wz')
+    log = read_log(write(tmp_path, f'\n{text}'))
+    assert log.units.name == 'g'
+    np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-8)
+    np.testing.assert_allclose(log.table['rate'], made['rate'], rtol=1e-7, atol=1e-9)
+    assert 'gFx/y/z' in log.read_as
+
+
+def test_an_acceleration_that_is_free_of_gravity_by_its_name_is_refused(tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    path = write(tmp_path, text_of(rows_of(made['time'], made['reading']),
+                                   't,FreeAcc_X,FreeAcc_Y,FreeAcc_Z'))
+    with pytest.raises(InputError, match='FreeAcc_X, FreeAcc_Y, FreeAcc_Z only, linear'):
+        read_log(path)
+    given = {'ax': 'FreeAcc_X', 'ay': 'FreeAcc_Y', 'az': 'FreeAcc_Z'}
+    assert read_log(path, LogOptions(columns=given)).units.name == 'm/s2'
+
+
+@pytest.mark.parametrize('header', ['', 'time,x,y,z'])
+def test_numbers_of_which_nothing_says_what_they_are_are_noted(header: str, tmp_path: Path
+                                                               ) -> None:
+    made = samples(per_g=48.0)  # the field of the Earth, in µT
+    text = text_of(rows_of(made['time'], made['reading']), header)
+    assert any('magnetometer' in note for note in read_log(write(tmp_path, text)).notes)
+    for named in (text_of(rows_of(made['time'], made['reading']), 'time,accX,accY,accZ'),
+                  text_of(rows_of(made['time'], made['reading'] / 48.0), header)):
+        assert not any('magnetometer' in note for note in read_log(write(tmp_path, named)).notes)

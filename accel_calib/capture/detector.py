@@ -296,6 +296,11 @@ class StillDetector:
         return float(np.sqrt(np.max(limit[:3])))
 
     @property
+    def quietest(self) -> float:
+        """Return the standard deviation in the quietest window [unit of the readings]."""
+        return math.sqrt(self._rule.quietest)
+
+    @property
     def interruptions(self) -> tuple[Interruption, ...]:
         """Return the most recent interruptions of the stamps, at most 10,000."""
         return tuple(self._chunker.interruptions)

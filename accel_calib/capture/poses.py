@@ -45,8 +45,9 @@ class Captured:
     ----------
     samples, recorded : int
         Number of samples in the poses, and in the recording.
-    threshold : float
-        Standard deviation below which a window is still, at the end [unit of the readings].
+    threshold, quietest : float
+        Standard deviation below which a window is still, at the end, and that of the quietest
+        window, each of the axis with the largest one [unit of the readings].
     seconds : float
         Duration of the recording without interruptions [s].
     interruptions : tuple of Interruption
@@ -60,6 +61,7 @@ class Captured:
     seconds: float
     interruptions: tuple[Interruption, ...]
     recorded: int
+    quietest: float
 
 
 def capture(recording: Recording | Iterable[Recording], units: Units,
@@ -102,7 +104,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     poses = replace(poses_from(dwells, settings), units=about[0], sensor=about[1])
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
-                    interruptions, recorded)
+                    interruptions, recorded, detector.quietest)
 
 
 def samples_of(recording: Recording, start: int, stop: int) -> Floats:

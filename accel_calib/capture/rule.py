@@ -149,7 +149,12 @@ class Judged(NamedTuple):
 
 
 class Rule:
-    """The rule with its state: the last chunks, and noise and resolution so far."""
+    """
+    The rule with its state: the last chunks, and noise and resolution so far.
+
+    `quietest` is the variance of the axis with the largest one, in the quietest window so far.
+
+    """
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings = settings
@@ -161,6 +166,7 @@ class Rule:
         self._before = blank(SUMS, HORIZON - 1)
         self._floor = np.full(6, np.inf)
         self._step = np.full(2, np.inf)
+        self.quietest = math.inf
 
     @property
     def scale(self) -> float:
@@ -222,6 +228,7 @@ class Rule:
         mean, level = windows(columns)
         mean = mean[:, -size:] + chunks.origin[:self._axes, np.newaxis]
         recent = level[:, -size:]
+        self.quietest = float(np.fmin.reduce(recent[:3].max(axis=0), initial=self.quietest))
         seen = {length: stretch(columns, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
         noise = self._learn(seen[LONG], mean, chunks.step)

@@ -159,9 +159,9 @@ def _calibrate(made: options.Parser) -> None:
     add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
         'or first or last; it determines the mounting')
     options.add_mounting(made)
-    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--no-refine', '--max-dwell',
-                  '--json')
+    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--no-refine', '--json')
     options.add_log(made)
+    options.add_capture(made)
 
 
 def _verify(made: options.Parser) -> None:
@@ -198,26 +198,13 @@ def _compare(made: options.Parser) -> None:
 
 
 def _capture(made: options.Parser) -> None:
-    from ..capture import CaptureSettings, REPEATED
-
     made.add_argument('recording', type=Path, metavar='RECORDING', help='CSV in any dialect, '
                       'rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or ArduPilot .bin')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='pose table to write')
-    options.add_fields(made, CaptureSettings, {
-        'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
-        'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still '
-                          'sensor, in the unit of ax (default: adapts to the noise of the '
-                          'sensor)'},
-        'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
-                           'checked)'},
-        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
-        'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
-        'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'},
-        'repeated': {'choices': REPEATED, 'help': 'keep, merge or refuse repeated poses (default: '
-                     'keep)'}})
+    options.add_capture(made)
     options.add_log(made)
-    options.share(made, '--max-dwell', '--json')
+    options.share(made, '--json')
 
 
 def _apply(made: options.Parser) -> None:
@@ -316,7 +303,8 @@ def _fleet(made: options.Parser) -> None:
                       metavar='FORMAT', help='write each calibration in this format, too; can be '
                       f'repeated: {", ".join(CALIBRATION_ALONE)}')
     options.add_log(made)
-    options.share(made, '--no-refine', '--max-dwell', '--json')
+    options.add_capture(made)
+    options.share(made, '--no-refine', '--json')
 
 
 HIDDEN = {
@@ -362,6 +350,7 @@ def _live(made: options.Parser) -> None:
     add('--speed', type=options.positive, default=1.0, help='speed of a recording, relative to '
         'real time (default: %(default)s)')
     options.add_log(made)
+    options.add_capture(made)
 
 
 def _none(made: options.Parser) -> None:

@@ -53,7 +53,7 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
     """Yield the poses of a log, captured from a recording; later errors say how it was read."""
     with progress('samples') as moved:
         found = poses_of(path, log_options(args, calibration), settings(args), moved)
-    with saying(found.read_as):
+    with saying(found.said):
         yield found
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from .commands import HIDDEN
 from .frame import console, Done, Output, table
-from .inputs import log_options
+from .inputs import log_options, settings
 from .terminal import ended
 from ..errors import InputError, NEEDS_ROS
 
@@ -57,7 +57,8 @@ def run_live(args: argparse.Namespace) -> Done:
             output.print(f'read as: {source.read_as}')
         host = Host(source, CalibratorSettings(
             units=source.units.name, gravity=args.gravity, calibration_file=str(args.output),
-            web_host=args.host, web_port=args.port), lambda line: output.print(line.words))
+            web_host=args.host, web_port=args.port, **settings(args)),
+            lambda line: output.print(line.words))
         try:
             output.print(f'live page: {host.server.link}')
             if sys.stdout.isatty():

@@ -42,6 +42,19 @@ def _columns(text: str) -> dict[str, str]:
 _TYPES: dict[str, Any] = {'float': positive, 'float | None': positive, 'int | None': int}
 """Types of options by those of the fields of records; others are texts."""
 
+_CAPTURE: dict[str, dict[str, Any]] = {
+    'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
+    'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still sensor, in '
+                      'the unit of ax (default: adapts to the noise of the sensor)'},
+    'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
+                       'checked)'},
+    'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
+    'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
+    'max_dwell': {'metavar': 'S', 'help': 'split longer rests into poses with the same '
+                  'orientation'},
+    'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'}}
+"""Options of the capture, by the fields of `CaptureSettings`."""
+
 _SHARED: dict[str, dict[str, Any]] = {
     '--rows': {'metavar': 'A:B', 'help': 'rows A to B, 1-based, inclusive'},
     '--jobs': {'type': int, 'default': 1, 'metavar': 'N',
@@ -51,8 +64,6 @@ _SHARED: dict[str, dict[str, Any]] = {
                     'mounting (needs --flat)'},
     '--no-refine': {'dest': 'refined', 'action': 'store_false', 'help': 'do not look for effects '
                     'beyond offset, gain and cross-axis'},
-    '--max-dwell': {'type': positive, 'metavar': 'S', 'help': 'for a recording: split longer '
-                    'rests into poses with the same orientation'},
     '--prior': {'type': Path, 'metavar': 'FLEET', 'help': 'typical values of a fleet (fleet.yaml '
                 'of accel-calib fleet) for offset, gain and cross-axis, for few poses'},
     '--sensor-model': {'default': '', 'metavar': 'NAME', 'help': 'model of the sensor in the file '
@@ -72,8 +83,8 @@ def share(made: Any, *names: str) -> None:
         made.add_argument(name, **_SHARED[name])
 
 
-def add_fields(made: Parser, record: Any, options: Mapping[str, Mapping[str, Any]]) -> None:
-    """Add options for fields of a record, with their types and defaults."""
+def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]]) -> None:
+    """Add options for fields of a record to a parser or a group, with types and defaults."""
     for name, about in options.items():
         field = record.__dataclass_fields__[name]
         kind = ({'action': 'store_true'} if field.type == 'bool' else
@@ -113,13 +124,24 @@ def add_log(made: Parser) -> None:
         **units()})
 
 
+def add_capture(made: Parser) -> None:
+    """Add the options of the capture of poses; none of them has a value by default."""
+    from ..capture import CaptureSettings, REPEATED
+
+    group = made.add_argument_group('capture of poses from a recording')
+    add_fields(group, CaptureSettings, {
+        **{name: {'default': None, **about} for name, about in _CAPTURE.items()},
+        'repeated': {'default': None, 'choices': REPEATED, 'help': 'keep, merge or refuse '
+                     'repeated poses'}})
+
+
 def add_poses(made: Parser, number: str | None = '+') -> None:
     """Add the options for reading the poses of one or several logs."""
     made.add_argument('poses', nargs=number, type=Path, metavar='POSES',
                       help='pose table, or a recording, whose poses are captured first')
     share(made, '--rows')
     add_log(made)
-    share(made, '--max-dwell')
+    add_capture(made)
 
 
 def add_outputs(made: Parser, output: str, page: str = 'page') -> None:

@@ -24,10 +24,10 @@ from ..calibrate import (
     Outside,
     SampleContext,
 )
-from ..capture import capture, Captured, settings_from
+from ..capture import Captured
 from ..effects import Context, parse_effect
 from ..errors import InputError
-from ..intake import Intake, nothing_still
+from ..intake import Intake, samples_again, still_poses
 from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
 from ..table import Poses, Recording
 from ..text import counted
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 def run_capture(args: argparse.Namespace) -> Done:
     """Find the still stretches of a recording, and write the poses."""
     with open_log(args.recording, log_options(args)) as log, progress('samples') as moved:
-        captured = capture(log.watched(moved), log.units, settings_from(settings(args), log.units))
-        lines = Intake(captured.poses, log.units, log.read_as, log.notes).lines
-    if len(captured.poses) == 0:
-        raise nothing_still(str(args.recording), captured.recorded)
+        captured, wider = still_poses(
+            str(args.recording), log.units, settings(args), log.watched(moved),
+            lambda: samples_again(args.recording, log_options(args)))
+        lines = Intake(captured.poses, log.units, log.read_as, log.notes, wider).lines
     write_table(args.output, replace(captured.poses, units=log.units.name))
     return Done({
         'poses': len(captured.poses), 'samples': captured.recorded,

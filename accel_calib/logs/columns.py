@@ -23,7 +23,20 @@ import numpy as np
 
 from . import formats
 from .dialect import is_clock, is_number, Layout, shown
-from .names import BARE, is_unit, may_cause, meaning, OURS, RATE, READING, unit_of, WORDS
+from .names import (
+    BARE,
+    bare_name,
+    COUNTERS,
+    is_unit,
+    LINEAR_WORDS,
+    may_cause,
+    meaning,
+    OURS,
+    RATE,
+    READING,
+    unit_of,
+    WORDS,
+)
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
@@ -34,6 +47,9 @@ FRACTION = 'time_ns'
 
 CONTEXT = (*RATE, 'temperature', 'supply_voltage')
 """Columns that are used only where they are plain."""
+
+_FIRST_ROWS = 5
+"""Number of rows that show whether a column has numbers, dates or other text."""
 
 MOST = 5000
 """Number of columns among which names other than our own are looked for."""
@@ -157,11 +173,14 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     header, maker = layout.header, None
     if options.format:
         maker = formats.named(options.format, header, str(layout.path))
-    elif not set(READING) <= set(header):
+    else:
         maker = formats.recognise(header[:MOST])
+        # Our own names go first, unless the maker's layout says that they are other columns.
+        if maker is not None and set(READING) <= {*header} and not {*READING} <= {*maker.marks}:
+            maker = None
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
-        return with_indices(layout, sources(layout, given))
+        return with_indices(layout, _counted(layout, options, sources(layout, given)))
     formats.check_sensor(header, layout.path)
     found = sources(layout, {**maker.present(header), **given})
     for ours, theirs in maker.divisors.items():
@@ -171,12 +190,20 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     return with_indices(layout, found, maker)
 
 
+def _counted(layout: Layout, options: LogOptions, found: dict[str, Source]) -> dict[str, Source]:
+    """Return columns with the counter of the samples as time, if there is only their rate."""
+    if 'time' in found or 'time' in options.columns or not (options.rate or layout.rate_hz):
+        return found
+    source = counter(layout)
+    return found if source is None else {**found, 'time': source}
+
+
 def with_indices(layout: Layout, sources: Mapping[str, Source],
                  maker: formats.LogFormat | None = None) -> Chosen:
     """Return the columns with the indices of those of numbers and of text."""
     text = [sources['label'].index] if 'label' in sources else []
     if 'time' in sources:
-        cells = _sample(layout, sources['time'])
+        cells = _sample(layout, sources['time'].index)
         if cells and all(map(is_clock, cells)):
             text.append(sources['time'].index)
     used = {source.index for source in sources.values()}
@@ -197,9 +224,9 @@ def _quantities(layout: Layout, used: Container[int], sources: Mapping[str, Sour
     return found
 
 
-def _sample(layout: Layout, source: Source) -> list[str]:
+def _sample(layout: Layout, index: int, rows: int = _FIRST_ROWS) -> list[str]:
     """Return the cells of a column in the first rows."""
-    return [row[source.index] for row in layout.sample if source.index < len(row)]
+    return [row[index] for row in layout.sample[:rows] if index < len(row)]
 
 
 def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
@@ -217,7 +244,7 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
              if ours not in CONTEXT or ours in given or source.name == ours
-             or all(is_number(cell.replace(',', '.')) for cell in _sample(layout, source))}
+             or all(is_number(cell.replace(',', '.')) for cell in _sample(layout, source.index))}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
@@ -297,12 +324,17 @@ def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     groups = list(_triples('reading', header).values())
     with_gravity = [triple for triple in groups if not meaning(header[triple[0]]).free]
     plain = [triple for triple in with_gravity
-             if 'linear' not in meaning(header[triple[0]]).group]
-    groups = plain or with_gravity or groups or _bare(header)
+             if not LINEAR_WORDS.intersection(meaning(header[triple[0]]).group)]
+    if groups and not with_gravity:
+        raise InputError(f'{layout.path} has {_listed(layout, groups[0])} only, linear '
+                         'acceleration, gravity removed, by its name; expected an accelerometer',
+                         'record the acceleration with gravity, often called raw or total '
+                         'acceleration')
+    groups = plain or with_gravity or _bare(header)
     if len(groups) == 1:
         return {name: _source(layout, k) for name, k in zip(READING, groups[0])}
     if groups:
-        names = ' and '.join(', '.join(header[k] for k in triple) for triple in groups[:3])
+        names = ' and '.join(_listed(layout, triple) for triple in groups[:3])
         # A name that several columns have is replaced by the number.
         choice = ','.join(f'{name}={header[k] if header.count(header[k]) == 1 else k + 1}'
                           for name, k in zip(READING, groups[0]))
@@ -313,6 +345,10 @@ def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     raise InputError(f'{layout.path} has the columns {shown(header)}{lacks}, expected three '
                      'of an accelerometer, such as ax, ay, az or accX, accY, accZ',
                      'name them with --columns ax=NAME,ay=NAME,az=NAME')
+
+
+def _listed(layout: Layout, triple: Sequence[int]) -> str:
+    return ', '.join(map(layout.name, triple))
 
 
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
@@ -352,10 +388,11 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     by_quantity: dict[str, list[int]] = {}
     for k, name in enumerate(header[:MOST]):
         by_quantity.setdefault(meaning(name).quantity, []).append(k)
-    if 'time' not in found and by_quantity.get('time'):
-        best = max(by_quantity['time'], key=lambda k: (_time_rank(header[k]), -k))
-        more['time'] = _source(layout, best)
-        more |= _fraction(layout, best)
+    if 'time' not in found:
+        clocks = _clocks(layout, by_quantity.get('time', ()))
+        if clocks:
+            best = max(clocks, key=lambda k: (clocks[k], _time_rank(header[k]), -k))
+            more |= {'time': _source(layout, best), **_fraction(layout, best)}
     if RATE[0] not in found:
         more |= {name: _source(layout, k) for name, k in zip(RATE, _rates(header, found))}
     for key in ('temperature', 'supply_voltage'):
@@ -363,6 +400,55 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
     return more
+
+
+def _clocks(layout: Layout, which: Sequence[int]) -> dict[int, bool]:
+    """
+    Return the columns of times that run, and whether they run as finely as the finest one.
+
+    A date that stays the same, or a time of the day in whole seconds, is no clock of the samples.
+
+    """
+    cells = {k: _sample(layout, k, len(layout.sample)) for k in which}
+    different = {k: len(set(texts)) for k, texts in cells.items()
+                 if all(is_number(text.replace(',', '.')) or is_clock(text)
+                        for text in texts[:_FIRST_ROWS])}
+    different |= {k: max(different.get(other.index, 0), different[k]) for k in different
+                  for other in _fraction(layout, k).values()}
+    return {k: 2 * count >= max(different.values()) for k, count in different.items()
+            if count > 1 or len(cells[k]) < _FIRST_ROWS}
+
+
+def counter(layout: Layout) -> Source | None:
+    """Return the column that counts the samples, or None."""
+    for k, name in enumerate(layout.header[:MOST]):
+        cells = _sample(layout, k, len(layout.sample))
+        if (bare_name(name) in COUNTERS and len(cells) >= _FIRST_ROWS
+                and all(map(is_number, cells)) and step_of(cells) > 0.0):
+            return _source(layout, k)
+    return None
+
+
+def step_of(cells: Sequence[str]) -> float:
+    """Return the median step between the numbers of cells."""
+    return float(np.median(np.diff([float(cell) for cell in cells]))) if len(cells) > 1 else 0.0
+
+
+def rates_beside(layout: Layout, time: Source) -> list[float]:
+    """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
+    rates = []
+    counted = counter(layout)
+    if layout.rate_hz is not None:
+        every = step_of(_sample(layout, counted.index, len(layout.sample))) if counted else 1.0
+        rates.append(layout.rate_hz / every)
+    for k, name in enumerate(layout.header[:MOST]):
+        known = meaning(name)
+        unit = unit_of('time', known.unit)
+        if known.quantity == 'time' and unit is not None and k != time.index:
+            cells = _sample(layout, k, len(layout.sample))
+            if cells and all(map(is_number, cells)) and step_of(cells) > 0.0:
+                rates.append(1.0 / (unit[1] * step_of(cells)))
+    return rates
 
 
 def _time_rank(name: str) -> tuple[bool, bool, bool]:

@@ -45,7 +45,13 @@ _COMMENTS = ('#', '//', '%')
 _TRIED_LINES = 200
 """Number of lines from which the delimiter and the decimal mark are found."""
 
-_SAMPLE_ROWS = 5
+_SAMPLE_ROWS = 200
+"""Number of first rows in `Layout.sample`."""
+
+_RATE = re.compile(r'(?:rate|frequency|\bodr|\bat)\b[^\w\n]{0,12}(\d+(?:\.\d+)?) ?(k?)Hz\b',
+                   re.ASCII | re.IGNORECASE)
+"""Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``at 100 Hz``."""
+
 _MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
 """Time that the serial monitor of the Arduino IDE puts before a line."""
 
@@ -104,7 +110,8 @@ class Layout:
     the names of the columns, and `units_row` the cells of a row of units below them; both are
     empty if there are none. `width` is the number of cells in a row, and `start` that of lines
     before the first row. `about` has units and sensor from the comments, `notes` what was skipped
-    before the table, and `sample` the cells of the first rows.
+    before the table, and `sample` the cells of the first rows. `rate_hz` is the rate of the
+    samples that the lines before the table state, if it is one.
 
     """
 
@@ -119,6 +126,7 @@ class Layout:
     about: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     sample: tuple[tuple[str, ...], ...] = ()
+    rate_hz: float | None = None
 
     @property
     def words(self) -> list[str]:
@@ -250,7 +258,8 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     return Layout(path, found.dialect, _decimal(rows[:_TRIED_LINES]), found.header,
                   finder.units_row(found, start), _width(found.header, rows), start, encoding,
                   _about(path, [line for line in head if line[0] == '#']),
-                  _passed_over([head[k] for k in passed]), tuple(map(tuple, rows[:_SAMPLE_ROWS])))
+                  _passed_over([head[k] for k in passed]), tuple(map(tuple, rows[:_SAMPLE_ROWS])),
+                  _stated_rate(head[:start]))
 
 
 def _check_text(path: Path, head: Sequence[str], expected: str) -> None:
@@ -407,6 +416,13 @@ def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
         return ()
     mark = ':' if len(lines) == 1 else ', the first is'
     return (f'skipped {counted(len(lines), "line")} before the table{mark} {short(lines[0])!r}',)
+
+
+def _stated_rate(lines: Sequence[str]) -> float | None:
+    """Return the rate of the samples that lines state [Hz]; None if they state none or several."""
+    found = {float(value) * (1000.0 if kilo else 1.0)
+             for line in lines for value, kilo in _RATE.findall(line[:1000])}
+    return found.pop() if len(found) == 1 and min(found) > 0.0 else None
 
 
 def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:

@@ -129,6 +129,13 @@ _PHYPHOX_FORMATS = tuple(
               record="record 'Acceleration with g' (Raw sensors) in phyphox")
     for pattern in ('Acceleration {} (m/s^2)', '{} (m/s^2)'))
 
+# ------------------------------------------------------------------- Physics Toolbox
+# https://www.vieyrasoftware.net
+# The g-force meter has gravity; ax, ay, az beside it are the linear acceleration.
+
+_TOOLBOX = LogFormat('physics-toolbox', {'time': 'time', **_axes('gF{}'), **dict(zip(
+    RATE, ('wx', 'wy', 'wz')))}, {'gx': 1.0}, 'g', READING)
+
 # ---------------------------------------------------------------------- Sensor Logger
 # https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
 # One file per sensor with the same header; the name of the file is the name of the sensor.
@@ -243,8 +250,9 @@ _BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_
 
 _ESP32 = LogFormat('esp32', {}, units='', plain=False)
 
-FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, _LOGGER, *_MATLAB_FORMATS, *_PX4_FORMATS,
-                                  *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS, _ESP32)
+FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, _TOOLBOX, _LOGGER, *_MATLAB_FORMATS,
+                                  *_PX4_FORMATS, *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS,
+                                  _ESP32)
 
 NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
 """Names of the formats, as ``--format`` has them."""

@@ -57,8 +57,19 @@ CAUSES = frozenset((
     'offset', 'setpoint', 'gps', 'baro', 'pressure'))
 """Those of `OTHER_WORDS` that neither the readings nor the orientation determine."""
 
-FREE_WORDS = frozenset(('user', 'free', 'lin', 'nograv', 'nogravity', 'world'))
+FREE_WORDS = frozenset(('user', 'free', 'nograv', 'nogravity', 'world'))
 """Words of an acceleration without gravity."""
+
+LINEAR_WORDS = frozenset(('lin', 'linear'))
+"""Words of an acceleration that has gravity or not, as its maker understands them."""
+
+COUNTERS = frozenset(('counter', 'packetcounter', 'packetnumber', 'packet', 'framenumber', 'frame',
+                      'frameno', 'sample', 'samples', 'samplenumber', 'nsamples', 'index', 'seq',
+                      'pccounter', 'count'))
+"""Names of a counter of the samples, in lower case without punctuation."""
+
+TICKS = {'sampletimefine': {'ticks of 100 µs': 1e-4, 'µs': 1e-6}}
+"""Units of clocks with a name of their own: of Xsens, by the model."""
 
 _RAD = math.pi / 180.0
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
@@ -172,6 +183,11 @@ def meaning(name: str) -> Meaning:
     if not quantity and not unit:
         words += [each for each in brackets if each and not each.isdecimal()]
     return Meaning(quantity, axis, unit, tuple(words), bool(FREE_WORDS.intersection(words)))
+
+
+def bare_name(name: str) -> str:
+    """Return a name in lower case, without punctuation."""
+    return re.sub(r'[\W_]', '', name[:_LONGEST_NAME]).casefold()
 
 
 def is_unit(text: str) -> bool:

@@ -25,15 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .accelerometer import compact, unit_of_reading
-from .columns import Chosen, FRACTION, LogOptions, unused
+from .columns import Chosen, FRACTION, LogOptions, rates_beside, unused
 from .dialect import has_date, seconds_of
-from .names import RATE, READING, unit_of, ZEROS
+from .names import bare_name, COUNTERS, meaning, RATE, READING, TICKS, unit_of, ZEROS
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats
 from ..units import Units, units_of
 
 TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'µs': 1e-6, 'ns': 1e-9}
+
+TICK = 'ticks of 100 µs'
+
+_AGREES = 1.25
+"""Factor within which the rate of stamps is the one that the file states."""
 
 _MOST_BACK = 0.1
 """Share of steps back in time above which a column is no time."""
@@ -66,21 +71,32 @@ _MOVING = 0.05
 """Share of windows whose scatter is above `_MOVES` times that at rest, the quantile `_AT_REST`."""
 
 
-def unit_by_rate(stamps: Floats) -> tuple[str, float] | None:
-    """Return the unit in which stamps have a plausible rate, and that rate [Hz], or None."""
+def unit_by_rate(stamps: Floats, beside: Sequence[float] = (),
+                 units: Mapping[str, float] = TIME_UNITS) -> tuple[str, float] | None:
+    """
+    Return the unit in which stamps have a plausible rate, and that rate [Hz], or None.
+
+    `beside` are the rates that the file states; a unit with one of them goes first.
+
+    """
     step = step_of(stamps)
     if not step > 0.0:
         return None
-    rates = {name: 1.0 / (step * unit) for name, unit in TIME_UNITS.items()}
+    rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if _RATES_HZ[0] * 0.9 <= rate
                  <= _RATES_HZ[1] * 1.1]
+    stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
     since_1970 = [name for name in plausible
-                  if _EPOCH_S[0] <= float(np.median(stamps)) * TIME_UNITS[name] <= _EPOCH_S[1]]
+                  if _EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= _EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
-    best = min(since_1970 or plausible, default=None,
+    best = min(stated or since_1970 or plausible, default=None,
                key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
     return None if best is None else (best, rates[best])
+
+
+def _agree(one: float, two: float) -> bool:
+    return 1.0 / _AGREES < one / two < _AGREES
 
 
 def step_of(stamps: Floats) -> float:
@@ -140,15 +156,16 @@ def counter_of(unit: str, *, of_day: bool = False) -> Counter:
     """Return the counter for stamps in a unit: 2^32 µs or ms, or a day."""
     if of_day:
         return Counter((_DAY_S,))
-    return Counter({'µs': (_COUNTER * 1e-6,), 'ms': (_COUNTER * 1e-3,),
-                    's': (_COUNTER * 1e-6, _COUNTER * 1e-3)}.get(unit, ()))
+    ranges = {'µs': (_COUNTER * 1e-6,), 'ms': (_COUNTER * 1e-3,), TICK: (_COUNTER * 1e-4,),
+              's': (_COUNTER * 1e-6, _COUNTER * 1e-3)}
+    return Counter(ranges.get(unit, ()))
 
 
 _SAMPLES_APART_S = 0.5
 """Rows that are nearer in time are samples."""
 
-_MANY_SAMPLES = 5000
-"""More rows than these are samples."""
+_MOST_POSES = 1000
+"""More rows than these are samples: no person takes as many poses."""
 
 _FEW_POSES = 200
 """Fewer rows without times are poses."""
@@ -156,23 +173,38 @@ _FEW_POSES = 200
 _SAME = 0.1
 """Successive samples at rest are nearer than this, relative to the spread of the readings."""
 
+_ONE_SIDE = 0.3
+"""Readings of a sensor that is not turned scatter by less, relative to their length."""
+
+_OF_POSES = {'count', 'orientation', 'std'}
+"""Columns that only poses have."""
+
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
-    """Return whether rows are samples: with time, without count, and dense or many."""
-    if 'time' not in columns or 'count' in columns or len(columns['time']) < 2:
+    """Return whether rows are samples: with time, not marked as poses, and dense or many."""
+    if 'time' not in columns or _OF_POSES & columns.keys() or len(columns['time']) < 2:
         return False
     apart = float(np.median(np.diff(columns['time'])))
-    return apart < _SAMPLES_APART_S or len(columns['time']) > _MANY_SAMPLES
+    return apart < _SAMPLES_APART_S or len(columns['time']) > _MOST_POSES
 
 
 def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
-    """Return whether rows without times are samples: many, and mostly like the row before."""
+    """
+    Return whether rows without times are samples.
+
+    They are if a person does not take as many poses, or if they are many and have angular rates,
+    are mostly like the row before, or all have about the same direction.
+
+    """
     readings = columns['reading']
-    if len(readings) < _FEW_POSES or {'time', 'count', 'orientation'} & set(columns):
+    if len(readings) < _FEW_POSES or ({'time'} | _OF_POSES) & columns.keys():
         return False
     step = np.linalg.norm(np.diff(readings, axis=0), axis=1)
-    spread = np.linalg.norm(readings - np.median(readings, axis=0), axis=1)
-    return bool(np.median(step) < _SAME * np.median(spread))
+    middle = np.median(readings, axis=0)
+    spread = np.median(np.linalg.norm(readings - middle, axis=1))
+    return bool(len(readings) > _MOST_POSES or 'rate' in columns
+                or np.median(step) < _SAME * spread
+                or spread < _ONE_SIDE * np.linalg.norm(middle))
 
 
 @dataclass
@@ -181,8 +213,8 @@ class Quantities:
     The conversion of the columns of a log; `decided` makes it.
 
     `scales` are the factor to our unit and our value at 0, by column. `instance` is the number of
-    the sensor whose rows are read, where rows of several alternate. `said` is what is assumed, and
-    `notes` what is not used.
+    the sensor whose rows are read, where rows of several alternate. `rate_hz` is the rate of
+    samples without times. `said` is what is assumed, and `notes` what is not used.
 
     """
 
@@ -191,6 +223,7 @@ class Quantities:
     scales: dict[str, tuple[float, float]] = field(default_factory=dict)
     counter: Counter = field(default_factory=lambda: Counter(()))
     instance: float | None = None
+    rate_hz: float | None = None
     said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -266,7 +299,7 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.instance = _instance(columns, first, options, made.notes)
         first = _of_instance(columns, first, made.instance)
     if 'time' in columns.sources:
-        _decide_time(made, first)
+        _decide_time(made, first, options)
     _decide_reading(made, first, options)
     _decide_rate(made, first)
     _decide_temperature(made, first)
@@ -295,8 +328,17 @@ def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[st
 
 # ------------------------------------------------------------------------------------- time
 
-def _decide_time(made: Quantities, first: Cells) -> None:
-    source = made.chosen.sources['time']
+def _decide_time(made: Quantities, first: Cells, options: LogOptions) -> None:
+    source, path = made.chosen.sources['time'], made.chosen.layout.path
+    rate_hz = options.rate or made.chosen.layout.rate_hz
+    if rate_hz is not None and bare_name(source.name) in COUNTERS:
+        made.scale(['time'], 1.0 / rate_hz)
+        made.counter = Counter(tuple(2.0**bits / rate_hz for bits in (8, 16, 32)))
+        made.said.append(f'{source.name} at {rate_hz:g} Hz (stated) -> s')
+        return
+    if options.rate is not None:
+        raise InputError(f'{path} has times, but --rate is {options.rate:g}', 'remove --rate, or '
+                         'leave the times out with --columns time=')
     if made.chosen.dates:
         of_day = not has_date(made.chosen.texts(first, 'time')[0])
         made.counter = counter_of('', of_day=of_day)
@@ -305,14 +347,20 @@ def _decide_time(made: Quantities, first: Cells) -> None:
     stamps = made.chosen.numbers(first, 'time')
     back = np.count_nonzero(np.diff(stamps) < 0.0)
     if not made.chosen.layout.header and back > _MOST_BACK * (len(stamps) - 1):
-        raise InputError(f'{made.chosen.layout.path} has no header line, and column '
+        raise InputError(f'{path} has no header line, and column '
                          f'{source.name} does not increase, expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit, words = _unit_of_time(made, first, stamps)
     made.counter = counter_of(unit)
-    made.scale(['time'], TIME_UNITS[unit])
-    if words:
-        made.said.append(words)
+    scale = {**TIME_UNITS, TICK: 1e-4}[unit]
+    made.scale(['time'], scale)
+    made.said += [words] if words else []
+    stated = made.chosen.layout.rate_hz
+    step = scale * step_of(stamps)
+    if stated and step > 0.0 and not any(_agree(1.0 / step, rate) for rate
+                                         in rates_beside(made.chosen.layout, source)):
+        made.notes.append(f'{source.name} has {1.0 / step:.4g} samples per second, but the file '
+                          f'states {stated:g} Hz')
 
 
 def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, str]:
@@ -328,7 +376,8 @@ def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, 
     if layout.header and source.name == 'time' and (layout.about or 'count' in made.chosen.sources
                                                     or not _by_rate(made, first, stamps)):
         return 's', ''
-    found = unit_by_rate(stamps)
+    own = TICKS.get(bare_name(source.name), TIME_UNITS)
+    found = unit_by_rate(stamps, rates_beside(layout, source), own)
     named = f'column {source.name}' if source.name.isdecimal() else source.name
     if found is None:
         return 's', f'{named} in s'
@@ -346,17 +395,30 @@ def _by_rate(made: Quantities, first: Cells, stamps: Floats) -> bool:
 
 def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
     raw = made.chosen.three(first, READING)
-    columns = {'reading': raw, **{key: raw[:, 0] for key in ('count', 'orientation')
-                                  if key in made.chosen.sources}}
+    columns = {'reading': raw, **{key: raw for key, column in COLUMNS.items()
+                                  if column.names[0] in made.chosen.sources}}
     if 'time' in made.chosen.sources:
         samples = are_samples({**columns, 'time': made._seconds(first)})
     else:
-        samples = options.rate is not None or are_untimed_samples(columns)
+        samples = are_untimed_samples(columns)
+        made.rate_hz = options.rate or (made.chosen.layout.rate_hz if samples else None)
+    samples = samples or made.rate_hz is not None
     found = unit_of_reading(made.chosen, raw, options, samples=samples)
     made.units = found.units
     made.scale(READING, found.factor)
     if found.assumed or made.said:
         made.said += found.words
+    if found.units.is_native and _says_nothing(made.chosen, options):
+        made.notes.append('nothing in the file says what the numbers are: they are taken for '
+                          'those of an accelerometer in counts or volts; a magnetometer looks '
+                          'alike')
+
+
+def _says_nothing(columns: Chosen, options: LogOptions) -> bool:
+    """Return whether neither names nor the user say that the readings are accelerations."""
+    named = meaning(columns.sources[READING[0]].name)
+    return not (options.units or columns.maker or named.quantity
+                or {*READING} & {*options.columns})
 
 
 # ---------------------------------------------------------------------------------- context

@@ -196,7 +196,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities,
              options: LogOptions) -> OpenLog:
     """Return a text log whose columns and units are known."""
-    blocks = _timed(path, converted(path, cells, quantities), options.rate)
+    blocks = _timed(converted(path, cells, quantities), quantities.rate_hz)
     head = next(blocks)
     units, sensor = quantities.units, str(text.layout.about.get('sensor', ''))
     check_units(Poses(*head), units, str(path))
@@ -210,21 +210,19 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
-                             'second with --rate HZ, or name the column with --columns time=NAME')
+                             'second with --rate HZ, or name the column with --columns '
+                             'time=NAME; if each row is a pose, add a column orientation')
         samples, count = _as_samples(path, poses), len(poses)
     said = [quantities.read_as] if quantities.read_as else []
-    if options.rate is not None:
-        said.append(f'{options.rate:g} Hz (stated)')
+    if quantities.rate_hz is not None:
+        said.append(f'{quantities.rate_hz:g} Hz (stated)')
     return OpenLog(samples, count, units, sensor, ', '.join(said), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes))
 
 
-def _timed(path: Path, blocks: Iterator[Block], rate_hz: float | None) -> Iterator[Block]:
+def _timed(blocks: Iterator[Block], rate_hz: float | None) -> Iterator[Block]:
     """Yield blocks, with the times of a stated rate if there is one."""
     for columns, row in blocks:
-        if rate_hz is not None and 'time' in columns:
-            raise InputError(f'{path} has times, but --rate is {rate_hz:g}', 'remove --rate, or '
-                             'leave the times out with --columns time=')
         yield columns if rate_hz is None else {**columns, 'time': (row - 1) / rate_hz}, row
 
 
@@ -311,7 +309,8 @@ class LineReader:
                              'check the format of the lines')
         timed = 'time' in columns.sources
         self._rate_hz = None if timed else options.rate or len(first.row) / seconds
-        self._quantities = decided(columns, first, replace(options, rate=self._rate_hz))
+        self._quantities = decided(columns, first, options if timed else
+                                   replace(options, rate=self._rate_hz))
         self.units = self._quantities.units
         rate = '' if timed else (f'no times, {self._rate_hz:.4g} Hz '
                                  f'({"stated" if options.rate else "measured"})')

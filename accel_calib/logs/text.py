@@ -49,6 +49,9 @@ _LONGEST_LINE = 16_000_000
 _PEEKED = 1 << 16
 """Number of bytes from which the encoding is found."""
 
+_BLANK = ' \t\r\n,;|'
+"""Characters of a row without any value, as spreadsheets write at the end of a table."""
+
 _QUOTED_LINES = 20
 """Largest number of lines of one quoted cell."""
 
@@ -284,7 +287,7 @@ class TextTable:
             fault = self._fault(line)
             if fault is None:
                 good.append(k)
-            elif is_comment(line.lstrip()):
+            elif is_comment(line.lstrip()) or not line.replace('""', '').strip(_BLANK):
                 continue
             elif not self._skip_bad or not self._bad:
                 self._bad = f'{_place(k, *where)}row {rows[k]}{fault}'
