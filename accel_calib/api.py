@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
+import math
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, overload, TypeVar
@@ -32,7 +33,16 @@ from .pipeline import calibrated, Plan
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration
-from .table import check_units, columns_from, Floats, numbered, Poses, Recording, Table
+from .table import (
+    check_units,
+    columns_from,
+    Floats,
+    LARGEST,
+    numbered,
+    Poses,
+    Recording,
+    Table,
+)
 from .text import counted, now
 from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -44,6 +54,11 @@ Data = Any
 """A table, an (n, 3) array of readings, or a DataFrame with the column names of a pose table."""
 
 _Table = TypeVar('_Table', bound=Table)
+
+_MOST_ROWS = 10_000_000
+"""Largest number of simulated rows, which take some 2 GB."""
+
+_LONGEST_NUMBER = 40
 
 
 class Calibration(calibrate.Calibration):
@@ -430,6 +445,7 @@ def simulate(effects: Mapping[str, ArrayLike] = ..., *, recording: Literal[True]
              **options: Any) -> Recording: ...
 
 
+@np.errstate(over='ignore', invalid='ignore')  # the check refuses such numbers
 def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, poses: int = 24,
              directions: ArrayLike | None = None, noise: float = 0.003, samples: int = 100,
              rate: float = 100.0, dwell: float = 3.0, turn: float = 1.0,
@@ -482,10 +498,16 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     Raises
     ------
     InputError
-        If an effect is not in the catalogue, or needs a column that is missing.
+        If an effect is not in the catalogue, or needs a column that is missing; or a number is
+        out of range, or makes readings beyond any sensor.
 
     """
     know(also)
+    _check_within(poses=(poses, 1, _MOST_ROWS), samples=(samples, 1, _MOST_ROWS),
+                  noise=(noise, 0, LARGEST), seed=(seed, 0, math.inf))
+    if recording:
+        _check_within(**{'poses * (dwell + turn) * rate': (
+            poses * (dwell + turn) * rate, 0, _MOST_ROWS)})
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))
@@ -507,7 +529,18 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     scaled: dict[str, NDArray[Any]] = {
         key: known.from_g(kept[key]) for key in ('reading', 'std', 'reference')
         if key in kept and (key != 'reference' or not is_native(units))}
+    if not np.all(np.abs(scaled['reading']) < LARGEST):
+        raise InputError('the simulated readings are beyond any sensor, expected finite numbers '
+                         f'below {LARGEST:g}', 'use smaller effects, noise and temperatures')
     return replace(found, columns={**kept, **scaled}, units=units)  # type: ignore[return-value]
+
+
+def _check_within(**numbers: tuple[float, float, float]) -> None:
+    """Check numbers by their names, each with its least and its largest value."""
+    for name, (value, least, most) in numbers.items():
+        if not least <= value <= most:
+            raise InputError(f'{name} is {str(value)[:_LONGEST_NUMBER]}, expected {least:g} to '
+                             f'{most:g}', f'correct {name}')
 
 
 def _directions(count: int) -> Floats:

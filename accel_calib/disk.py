@@ -81,7 +81,7 @@ def copy_atomically(path: Path, target: Path) -> None:
 @contextmanager
 def _replacing(target: Path) -> Iterator[BinaryIO]:
     """Yield a new file that replaces the target at the end; it is removed after an error."""
-    old = _replaceable(target)
+    old = replaceable(target)
     temporary = target.with_name(
         f'.{target.name[:_LONGEST_NAME]}.{secrets.token_hex(8)}{_SUFFIX}')
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
@@ -100,8 +100,8 @@ def _replacing(target: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
-def _replaceable(path: Path) -> os.stat_result | None:
-    """Return the state of a file that may be replaced; None if there is no file."""
+def replaceable(path: Path) -> os.stat_result | None:
+    """Return the state of a file, no link, that may be replaced; None if there is no file."""
     try:
         old = path.lstat()
     except FileNotFoundError:

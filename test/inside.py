@@ -39,8 +39,9 @@ from accel_calib.capture.trend import _long_run as long_run
 from accel_calib.capture.trend import lines_through
 from accel_calib.cli.commands import COMMANDS
 from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
+from accel_calib.cli.commands import parser
 from accel_calib.cli.frame import Output, shown
-from accel_calib.cli.main import main, parser
+from accel_calib.cli.main import main
 from accel_calib.cli.terminal import in_one_line
 from accel_calib.cli.watch import changes, screen, state
 from accel_calib.compare import NAMES as PARAMETER_NAMES

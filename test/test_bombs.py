@@ -225,6 +225,23 @@ def test_a_database_that_is_no_plain_table_is_refused(statements: list[str], wor
         refused(each, words)
 
 
+@pytest.mark.parametrize('statement', [
+    'UPDATE messages SET data = zeroblob(300000000) WHERE id = 9',
+    'UPDATE messages SET timestamp = zeroblob(300000000) WHERE id = 9',
+    'UPDATE topics SET name = zeroblob(20000000) WHERE id = 1',
+    'UPDATE message_definitions SET topic_type = zeroblob(20000000) WHERE id = 1',
+    'UPDATE schema SET schema_version = zeroblob(20000000)'])
+def test_a_cell_that_no_sensor_writes_is_not_loaded(statement: str, tmp_path: Path) -> None:
+    path = folder_of(StoragePlugin.SQLITE3)(tmp_path) / 'bag.db3'
+    if 'schema' in statement:
+        execute(path, 'CREATE TABLE loose(schema_version)')
+        execute(path, 'DROP TABLE schema')
+        execute(path, 'ALTER TABLE loose RENAME TO schema')
+        execute(path, 'INSERT INTO schema VALUES (4)')
+    execute(path, statement)
+    refused(path, 'string or blob too big')
+
+
 def test_a_query_without_end_is_stopped(tmp_path: Path) -> None:
     path = folder_of(StoragePlugin.SQLITE3)(tmp_path) / 'bag.db3'
     execute(path, 'CREATE TABLE loose AS SELECT * FROM topics')

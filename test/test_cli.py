@@ -166,7 +166,16 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
     ('fit', 'poses.csv', '--rows', '1:99'), ('fit', 'poses.csv', '--flat', '99'),
     ('fit', 'poses.csv', 'poses.csv', '-o', 'calibration.yaml'),
     ('fit', 'poses.csv', '--units', 'g'), ('simulate', '-o', 'x.csv', '--effect', 'wobble=1'),
-    ('simulate', '-o', 'x.csv', '--poses', '0'), ('simulate', '-o', 'no_folder/x.csv'),
+    *(('simulate', '-o', 'x.csv', *words.split()) for words in (
+        '--poses 0', '--seed -1', '--poses 99999999999999999999999', '--poses 100000000',
+        '--samples 99999999999999999999999', '--noise nan', '--noise 1e308',
+        '--effect offset=1e308', '--mounting nan 0 0', '--recording --rate 1e300',
+        '--recording --dwell 1e300', '--gravity 1e308',
+        '--temperature 1e308 1e308 --effect offset_temperature=1')),
+    *(('fit', 'poses.csv', option, 'circle') for option in ('-o', '--json', '--report')),
+    ('capture', 'poses.csv', '-o', 'circle'), ('calibrate', 'poses.csv', '-o', 'circle'),
+    ('apply', 'poses.csv', '-c', 'calibration.yaml', '-o', 'circle'), ('fit', 'circle'),
+    ('simulate', '-o', 'no_folder/x.csv'),
     ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
     ('noise', 'poses.csv'),
     ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
@@ -179,6 +188,7 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
 def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, capsys,
                                             monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / 'circle').symlink_to('circle')
     there = sorted(tmp_path.iterdir())
     capsys.readouterr()
     assert run(*arguments) == 2
@@ -186,7 +196,53 @@ def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, ca
     assert printed.err.startswith(f'accel-calib {arguments[0]}: ')
     assert printed.err.count('\n') == 1
     assert 'Traceback' not in printed.err
+    assert 'internal error' not in printed.err
     assert sorted(tmp_path.iterdir()) == there
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '<&-', '<&- >&- 2>&-'])
+@pytest.mark.parametrize('command', ['fit poses.csv -o new.yaml', 'fit missing.csv'])
+def test_closed_streams_change_no_exit_status_and_no_file(closed, command, poses, tmp_path):
+    done = subprocess.run(
+        ['sh', '-c', f'{sys.executable} -m accel_calib.cli.main {command} {closed}'],
+        capture_output=True, text=True, cwd=tmp_path, check=False,
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'TMPDIR': str(tmp_path)})
+    assert done.returncode == (2 if 'missing' in command else 0), done.stderr
+    assert done.stderr.count('\n') == ('missing' in command and '2>' not in closed)
+    assert ('missing' in command) is not (tmp_path / 'new.yaml').exists()
+    assert not list(tmp_path.glob('accel_calib-*'))
+
+
+def test_a_name_that_is_not_utf_8_is_refused_in_one_line(poses, tmp_path):
+    for command in ('fit', 'calibrate'):
+        done = subprocess.run(
+            [sys.executable, '-m', 'accel_calib.cli.main', command, str(poses), '-o',
+             str(tmp_path / 'new.yaml'), '--sensor', b'a\xff'], capture_output=True, text=True,
+            check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+        assert done.returncode == 2
+        assert done.stderr.count('\n') == 1
+        assert "argument --sensor: 'a\\udcff': expected text in UTF-8" in done.stderr
+    assert not (tmp_path / 'new.yaml').exists()
+
+
+INTERRUPTED_AT = """
+import signal, sys
+def interrupt(event, about):
+    if event == 'import' and about[0] == {name!r}:
+        signal.raise_signal(signal.SIGINT)
+sys.addaudithook(interrupt)
+from accel_calib.cli.main import main
+sys.exit(main(['fit', {poses!r}]))
+"""
+
+
+@pytest.mark.parametrize('name', ['argparse', 'accel_calib.errors', 'numpy',
+                                  'numpy.linalg._umath_linalg', 'rich.console', 'scipy.special'])
+def test_ctrl_c_while_modules_load_ends_without_words(name, poses):
+    done = subprocess.run(
+        [sys.executable, '-c', INTERRUPTED_AT.format(name=name, poses=str(poses))],
+        capture_output=True, text=True, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
 def commands():
@@ -202,7 +258,8 @@ def test_every_command_has_help_with_an_example(command, capsys):
 
 
 def test_wrong_arguments_exit_with_2(capsys):
-    for arguments in (['fly'], ['fit'], ['fit', 'x', '--gravity', '-1']):
+    for arguments in (['fly'], ['fit'], ['fit', 'x', '--gravity', '-1'], ['fit', 'x\0'],
+                      ['fit', 'x', '-o', 'c\0.yaml']):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2

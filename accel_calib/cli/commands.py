@@ -12,20 +12,17 @@ The choices of an option are imported with the options of the requested command,
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 import re
 import shlex
 from typing import NamedTuple, TYPE_CHECKING
 
 from . import options
+from .. import __version__
 
 if TYPE_CHECKING:
     from ..finding import NextStep
-
-BAD_INPUT = 2
-"""Exit status for invalid input."""
-
 
 class Command(NamedTuple):
     """
@@ -423,3 +420,18 @@ COMMANDS = {
         'run the simulated Imu node', 'nodes',
         f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}', _none),
 }
+
+
+def parser(wanted: Collection[str] = tuple(COMMANDS)) -> options.Parser:
+    """Return the parser of the command line, with the options of the wanted commands."""
+    top = options.Parser(
+        prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
+        'gravity as the reference.')
+    top.add_argument('--version', action='version', version=__version__)
+    commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND')
+    for name, command in COMMANDS.items():
+        what = command.summary
+        made = commands.add_parser(name, help=what, description=f'{what[0].upper()}{what[1:]}.')
+        if name in wanted:
+            add_options(made, command)
+    return top

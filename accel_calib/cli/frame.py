@@ -26,6 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 import json
+import os
 from pathlib import Path
 import re
 import runpy
@@ -37,9 +38,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from .commands import BAD_INPUT, COMMANDS, next_command
+from .commands import COMMANDS, next_command
+from .options import BAD_INPUT
 from .terminal import plain_character
-from ..disk import write_atomically
+from ..disk import replaceable, write_atomically
 from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
 from ..text import counted
 
@@ -323,7 +325,7 @@ def _check_targets(args: argparse.Namespace) -> None:
         if not target.kind and not target.path.exists():
             continue
         check_target(target, inputs, force=args.force)
-        whole = target.path.resolve()
+        whole = Path(os.path.realpath(target.path))
         if whole in seen:
             raise InputError(f'{seen[whole]} and {target.option} both name {target.path}, '
                              'expected different files', 'choose another name')
@@ -346,16 +348,19 @@ def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None
     Raises
     ------
     InputError
-        If its folder is missing, or it is an input, or it holds something else.
+        If its folder is missing, or it is an input, cannot be replaced or holds something else.
 
     """
     option, path = target.option, target.path
     if not path.parent.is_dir():
         raise InputError(f'{option} {path}: {path.parent} is not a folder, expected a folder',
                          'choose a file in an existing folder')
-    if any(path.resolve() == each.resolve() for each in inputs):
+    whole = os.path.realpath(path)
+    if any(whole == os.path.realpath(each) for each in inputs):
         raise InputError(f'{option} {path} is an input, expected another file',
                          'choose another name')
+    if target.kind:
+        replaceable(Path(whole))
     if force or not target.kind or not path.is_file():
         return
     with path.open('rb') as file:

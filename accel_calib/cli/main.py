@@ -5,70 +5,20 @@
 """
 The command ``accel-calib``.
 
-Only what the requested command needs is imported, so that ``--help`` does not wait for numpy.
+Only what the requested command needs is imported, so that ``--help`` does not wait for numpy. The
+first imports are few, because Ctrl-C ends the program without words only after them.
 
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Collection, Sequence
-from difflib import get_close_matches
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 import os
-import re
+import signal
 import sys
-from typing import NoReturn
-
-from .commands import add_options, BAD_INPUT, COMMANDS
-from .terminal import in_one_line, use_plain_characters
-from .. import __version__
-from ..errors import AccelCalibError, crash_words, system_error
 
 INTERRUPTED = 130
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, with the nearest known name."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print one line, and exit with status 2."""
-        known = self._known()
-        given = message.partition(' (choose')[0]
-        wrong = re.findall(r"'([^']+)'", given) or given.split()
-        near = [name for word in wrong if word not in known
-                for name in get_close_matches(word, known, 1)]
-        meant = f' (did you mean {near[0]}?)' if near else ''
-        self.exit(BAD_INPUT, f'{self.prog}: {in_one_line(message)}{meant}; see {self.prog} '
-                  '--help\n')
-
-    def parse_command(self, arguments: Sequence[str], command: str) -> argparse.Namespace:
-        """Parse arguments; the parser of the command reports unknown options."""
-        args, unknown = self.parse_known_args(arguments)
-        if unknown:
-            own = next((action.choices[command] for action in self._actions
-                        if isinstance(action.choices, dict) and command in action.choices), self)
-            own.error(f'unrecognized arguments: {" ".join(unknown)}')
-        return args
-
-    def _known(self) -> list[str]:
-        """Return the options and the choices of this parser."""
-        return [str(name) for action in self._actions
-                for name in (*action.option_strings, *(action.choices or ()))]
-
-
-def parser(wanted: Collection[str] = tuple(COMMANDS)) -> _Parser:
-    """Return the parser of the command line, with the options of the wanted commands."""
-    top = _Parser(
-        prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
-        'gravity as the reference.')
-    top.add_argument('--version', action='version', version=__version__)
-    commands = top.add_subparsers(title='commands', dest='command', metavar='COMMAND')
-    for name, command in COMMANDS.items():
-        what = command.summary
-        made = commands.add_parser(name, help=what, description=f'{what[0].upper()}{what[1:]}.')
-        if name in wanted:
-            add_options(made, command)
-    return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -82,31 +32,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with one line on standard error.
 
     """
-    use_plain_characters()
-    if '_ARGCOMPLETE' in os.environ:
-        _complete()
-    own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
-    try:
+    with _leaving():
+        from .commands import parser
+        from .terminal import open_streams, use_plain_characters
+        from ..errors import AccelCalibError, crash_words, system_error
+
+        open_streams()
+        use_plain_characters()
+        if '_ARGCOMPLETE' in os.environ:
+            _complete()
+        own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
         top = parser(own[:1])
         args = top.parse_command(own, own[0] if own else '')
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    if not args.command:
-        top.print_help()
-        return 0
-    args.for_ros = for_ros
-    try:
+        if not args.command:
+            top.print_help()
+            return 0
+        args.for_ros = for_ros
         from .frame import run  # imports numpy and rich
 
+    try:
         return run(args)
     except AccelCalibError as err:
-        return _refuse(args.command, str(err))
+        line = str(err)
     except OSError as err:
-        return _refuse(args.command, str(system_error(err)))
+        line = str(system_error(err))
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as err:  # a defect of this program, which no user should see as a traceback
-        return _refuse(args.command, crash_words(err))
+        line = crash_words(err)
+    return _refuse(args.command, line)
+
+
+@contextmanager
+def _leaving() -> Iterator[None]:
+    """Let Ctrl-C end the program without words, while modules load and nothing is written."""
+    try:
+        before = signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
+    except ValueError:  # not in the main thread, which gets Ctrl-C
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _complete() -> None:
@@ -115,6 +83,8 @@ def _complete() -> None:
         import argcomplete
     except ImportError:
         return  # the shell then shows no completions
+    from .commands import parser
+
     argcomplete.autocomplete(parser())
 
 
@@ -125,6 +95,9 @@ def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
 
 
 def _refuse(command: str, line: str) -> int:
+    from .options import BAD_INPUT
+    from .terminal import in_one_line
+
     print(f'accel-calib {command}: {in_one_line(line)}', file=sys.stderr)
     return BAD_INPUT
 

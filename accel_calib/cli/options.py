@@ -12,11 +12,47 @@ fields; `accel_calib.cli.inputs` makes the record.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+import re
+from typing import Any, NoReturn
 
-Parser = argparse.ArgumentParser
+from .terminal import in_one_line
+
+BAD_INPUT = 2
+"""Exit status for invalid input."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, with the nearest known name."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line, and exit with status 2."""
+        known = self._known()
+        given = message.partition(' (choose')[0]
+        wrong = re.findall(r"'([^']+)'", given) or given.split()
+        near = [name for word in wrong if word not in known
+                for name in get_close_matches(word, known, 1)]
+        meant = f' (did you mean {near[0]}?)' if near else ''
+        self.exit(BAD_INPUT, f'{self.prog}: {in_one_line(message)}{meant}; see {self.prog} '
+                  '--help\n')
+
+    def parse_command(self, arguments: Sequence[str], command: str) -> argparse.Namespace:
+        """Parse arguments; the parser of the command reports unknown options."""
+        if any('\0' in each for each in arguments):
+            self.error('an argument has the character NUL, expected text')
+        args, unknown = self.parse_known_args(arguments)
+        if unknown:
+            own = next((action.choices[command] for action in self._actions
+                        if isinstance(action.choices, dict) and command in action.choices), self)
+            own.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return args
+
+    def _known(self) -> list[str]:
+        """Return the options and the choices of this parser."""
+        return [str(name) for action in self._actions
+                for name in (*action.option_strings, *(action.choices or ()))]
 
 
 def positive(text: str) -> float:
@@ -25,6 +61,15 @@ def positive(text: str) -> float:
     if not 0.0 < value < float('inf'):
         raise argparse.ArgumentTypeError(f'{text}: expected a positive number')
     return value
+
+
+def utf8(text: str) -> str:
+    """Return an argument that can be stored: text in UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f'{ascii(text)}: expected text in UTF-8') from None
+    return text
 
 
 def _columns(text: str) -> dict[str, str]:
@@ -40,7 +85,7 @@ def _columns(text: str) -> dict[str, str]:
 
 
 _TYPES: dict[str, Any] = {'float': positive, 'float | None': positive, 'int | None': int}
-"""Types of options by those of the fields of records; others are texts."""
+"""Types of options by those of the fields of records; others are text."""
 
 _CAPTURE: dict[str, dict[str, Any]] = {
     'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
@@ -88,7 +133,7 @@ def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]])
     for name, about in options.items():
         field = record.__dataclass_fields__[name]
         kind = ({'action': 'store_true'} if field.type == 'bool' else
-                {'default': field.default, 'type': _TYPES.get(field.type)})
+                {'default': field.default, 'type': _TYPES.get(field.type, utf8)})
         made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **about})
 
 

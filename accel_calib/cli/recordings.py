@@ -122,9 +122,6 @@ def run_simulate(args: argparse.Namespace) -> Done:
     """Simulate poses or a recording, and write the table."""
     from ..api import simulate
 
-    if args.poses < 1 or args.samples < 1 or args.noise < 0.0:
-        raise InputError(f'--poses is {args.poses}, --samples {args.samples} and --noise '
-                         f'{args.noise}, expected at least 1, 1 and 0', 'correct these options')
     chosen = {name: getattr(args, name) for name in signature(simulate).parameters
               if hasattr(args, name) and name != 'also'}
     table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)

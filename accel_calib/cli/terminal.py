@@ -14,6 +14,7 @@ from __future__ import annotations
 import codecs
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import os
 import signal
 import sys
 
@@ -24,6 +25,17 @@ _PLAIN = {'±': '+-', '°': ' deg', '²': '2', '³': '3', '⁻': '-', '¹': '1',
 """Replacements for an output that has not these characters."""
 
 _HANDLER = 'accel_calib.plain'
+_STANDARD_ERROR = 2
+
+
+def open_streams() -> None:
+    """Open what is closed of the standard streams, so that no other file gets its number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= _STANDARD_ERROR:
+        pass
+    os.close(number)
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))
 
 
 def use_plain_characters() -> None:

@@ -117,7 +117,8 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
 def _messages(tables: Mapping[str, _Table]) -> list[Message]:
     """Return the messages of each sensor: by the field I, or by the number in the name."""
     found = []
-    for name, table in tables.items():
+    for name, stated in tables.items():
+        table = {key: values for key, values in stated.items() if values.dtype.kind in 'iuf'}
         match = _NAME.fullmatch(name)
         stamp = next((key for key in _STAMPS if key in table), '')
         needed = _RATES if name.startswith('GYR') else _READING
@@ -135,8 +136,6 @@ def _messages(tables: Mapping[str, _Table]) -> list[Message]:
 def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
     """Return the number of the sensor of each message; damaged numbers are 0."""
     stated = table.get('I', np.full(count, number))
-    if stated.dtype.kind not in 'iuf':
-        return np.full(count, number)
     return np.clip(np.nan_to_num(stated.astype(float)), 0.0, _MOST_SENSORS).astype(np.int64)
 
 

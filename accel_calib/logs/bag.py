@@ -314,7 +314,11 @@ def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
         if not {type(message[position]) for message in block} <= {*kinds}:
             bad = next(message for message in block if type(message[position]) not in kinds)
             raise ValueError(f'a message on {bad[0].topic} has the {what} '
-                             f'{str(bad[position])[:20]!r}')
+                             f'{_beginning(bad[position])!r}')
+
+
+def _beginning(cell: Any) -> Any:
+    return cell[:20] if isinstance(cell, (str, bytes)) else cell
 
 
 def _types(connection: Connection, *, ros2: bool) -> Typestore:

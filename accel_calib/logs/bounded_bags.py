@@ -78,6 +78,9 @@ _READ_TABLES = ('topics', 'messages', 'schema', 'message_definitions')
 _PLAIN = re.compile(r'CREATE (TABLE|INDEX|UNIQUE INDEX)\s', re.IGNORECASE)
 
 _LARGEST_METADATA = 16 * _MB
+_LARGEST_MESSAGE = 256 * _MB
+"""Largest cell of a db3 file, of its topics and of its messages [bytes]."""
+
 _LARGEST_EXPANDED = 64 * _MB
 _DEEPEST_METADATA = 50
 _ZSTD_MAGIC = re.compile(rb'\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18')
@@ -213,11 +216,13 @@ class _Sqlite(Sqlite3Reader):
         """Open the file, and check that it consists of plain tables."""
         self._size = self.path.stat().st_size
         self._steps = 0
-        with self._counted():
+        with self._limited():
             flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
             with closing(apsw.Connection(f'file:{self.path}?immutable=1', flags)) as connection:
                 _check_schema(connection, self._size)
             super().open()
+        assert self.dbconn is not None
+        self.dbconn.limit(apsw.SQLITE_LIMIT_LENGTH, _LARGEST_MESSAGE)
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
                  stop: int | None = None) -> _Messages:
@@ -232,12 +237,13 @@ class _Sqlite(Sqlite3Reader):
             self._steps = 0
 
     @contextmanager
-    def _counted(self) -> Iterator[None]:
-        """Count the steps of all connections that this thread opens in the block."""
+    def _limited(self) -> Iterator[None]:
+        """Limit steps and cells of all connections that this thread opens in the block."""
         thread = threading.get_ident()
 
         def hook(connection: apsw.Connection) -> None:
             if threading.get_ident() == thread:
+                connection.limit(apsw.SQLITE_LIMIT_LENGTH, _LARGEST_METADATA)
                 connection.set_progress_handler(self._count, _EVERY)
 
         apsw.connection_hooks.append(hook)

@@ -262,14 +262,14 @@ class _WholeReads(io.BufferedReader):
     """
     A file that moves on by as many bytes as were asked for, beyond its end, too.
 
-    `pyulog` goes back by the stated length of a damaged message. If fewer bytes were left, it
-    would go back too far and read the same bytes without end.
+    `pyulog` goes back by the stated length of a damaged message. If fewer bytes were left, or
+    none, it would go back too far and read the same bytes without end.
 
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
-        if size is not None and 0 < len(data) < size:
+        if size is not None and len(data) < size:
             self.seek(size - len(data), io.SEEK_CUR)
         return data
 

@@ -54,7 +54,7 @@ Make = Callable[[Rng], Files]
 Read = Callable[[Path, Rng], object]
 
 _NUMBER = re.compile(rb'-?\d+\.?\d*')
-_REFUSAL = re.compile(r'(note: [^\n]*\n(  [^\n]*\n)*)*accel-calib [^\n]*\n')
+_REFUSAL = re.compile(r'(read as: [^\n]*\n|note: [^\n]*\n(  [^\n]*\n)*)*accel-calib [^\n]*\n')
 """What a refused command prints: one line, after notes about a calibration edited by hand."""
 
 LONGEST_LINE = 700

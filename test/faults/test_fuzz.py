@@ -17,7 +17,7 @@ from accel_calib.logs import read_log
 from faults import inputs
 from faults.fuzz import KINDS, outcomes
 from faults.inputs import Files
-from faults.sample import FACTOR
+from faults.sample import FACTOR, sample
 from inside import ULG_MAGIC
 import pytest
 
@@ -86,10 +86,29 @@ def test_a_stated_name_that_the_system_refuses_is_damage(tmp_path: Path) -> None
 def test_a_cut_definition_of_a_ulog_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('pyulog')
     unknown = struct.pack('<HB', 9000, ord('z')) + bytes(9000)
-    cut = struct.pack('<HB', 9000, 0) + bytes(10)
-    log = Files('log.ulg', {'log.ulg': ULG_MAGIC + bytes(9) + unknown + cut})
-    monkeypatch.setitem(KINDS, 'cut', (lambda: lambda rng: log, lambda path, rng: read_log(path)))
-    assert dict(outcomes('cut', 1, seed=1)) == {0: 'refused'}
+    cut = struct.pack('<HB', 9000, 0)
+    logs = iter([ULG_MAGIC + bytes(9) + rest for rest in (
+        unknown + cut + bytes(10), unknown + cut, b'\x12\x01\0\0')])
+    monkeypatch.setitem(KINDS, 'cut', (
+        lambda: lambda rng: Files('log.ulg', {'log.ulg': next(logs)}),
+        lambda path, rng: read_log(path)))
+    assert {*dict(outcomes('cut', 3, seed=1)).values()} == {'refused'}
+
+
+def test_a_field_of_a_flight_log_may_state_any_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('pymavlink')
+    sound = next(each for each in inputs.sound('bin') if each.name == 'two_imus.bin')
+    data = sound.content[sound.name]
+    letters = data.index(b'TimeUS,I,GyrX') - 16
+    count = data.index(b'\0', letters) - letters
+    changed = iter(sample(
+        [data[:at] + letter + data[at + 1:] for at in range(letters, letters + count)
+         for letter in (b'n', b'N', b'a', b'q', b'b', b'g', b'\xff')], 2 * count))
+    monkeypatch.setitem(KINDS, 'typed', (
+        lambda: lambda rng: Files('log.bin', {'log.bin': next(changed)}),
+        lambda path, rng: read_log(path)))
+    found = dict(outcomes('typed', 2 * count if FACTOR == 1 else 7 * count, seed=1))
+    assert {*found.values()} == {'read', 'refused'}
 
 
 def test_a_message_of_a_flight_log_with_a_field_without_name_is_left_out(tmp_path: Path) -> None:
