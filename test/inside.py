@@ -37,9 +37,8 @@ from accel_calib.calibrate.prior import common_sensors, typical_spread, without_
 from accel_calib.capture import rounding_left
 from accel_calib.capture.trend import _long_run as long_run
 from accel_calib.capture.trend import lines_through
-from accel_calib.cli.commands import COMMANDS
+from accel_calib.cli.commands import COMMANDS, parser
 from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
-from accel_calib.cli.commands import parser
 from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.terminal import in_one_line
@@ -101,7 +100,7 @@ from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
 from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
 from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
-from accel_calib.live.server import PageServer, policy_hash
+from accel_calib.live.server import PageServer
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.live.viewer import qr_code, reachable
 from accel_calib.logs import (
@@ -165,7 +164,7 @@ from accel_calib.report.page import calibration_page, linear_figures
 from accel_calib.report.page import page as refinement_page
 from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
-from accel_calib.report.sheet import snippets
+from accel_calib.report.sheet import sheet, snippets
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store
 from accel_calib.session import worker

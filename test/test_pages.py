@@ -22,10 +22,13 @@ from inside import (
     refinement_page,
     residuals_of,
     residuals_of_refinement,
+    sheet,
     snippets,
 )
+from live_bench import chromium, PATIENCE
 import numpy as np
 from page_parser import parsed
+from playwright.sync_api import expect, sync_playwright
 import pytest
 
 pytest.importorskip('matplotlib')
@@ -111,6 +114,52 @@ def test_hostile_names_are_text(calibration, poses):
                             [hostile, hostile])
     assert shown.count('<script>') == 1
     assert '<b onload' not in shown
+
+
+@pytest.fixture(scope='module')
+def browser():
+    with sync_playwright() as playwright:
+        started = chromium(playwright)
+        yield started
+        started.close()
+
+
+def opened(browser, path, text):
+    """Return a page of this text in a browser, and a list of what its console says."""
+    path.write_text(text, encoding='utf-8')
+    page, complaints = browser.new_page(), []
+    page.on('console', lambda line: complaints.append(line.text))
+    page.on('pageerror', lambda error: complaints.append(str(error)))
+    page.goto(path.as_uri())
+    return page, complaints
+
+
+def test_the_script_of_a_page_runs_under_its_policy(browser, text, tmp_path):
+    page, complaints = opened(browser, tmp_path / 'page.html', text)
+    expect(page.locator('#tip')).to_be_hidden()
+    page.locator('figure.live').first.focus()
+    page.keyboard.press('ArrowRight')
+    expect(page.locator('#tip')).to_be_visible()
+    expect(page.locator('#tip')).to_contain_text('row 2')
+    assert page.locator('.lit').count() > 1
+    assert page.locator('main').evaluate('(e) => getComputedStyle(e).maxWidth') != 'none'
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.parametrize('has_script', [True, False])
+def test_the_policy_of_a_page_stops_what_is_not_its_own(browser, tmp_path, has_script):
+    hostile = ('<script>document.title = "ran"</script><img src="x:" onerror="document.title = 1">'
+               '<link rel="stylesheet" href="https://127.0.0.1:9/x.css">'
+               '<iframe srcdoc="x"></iframe><form action="https://127.0.0.1:9/">')
+    page, complaints = opened(browser, tmp_path / 'page.html',
+                              sheet('Title', [hostile], script=has_script))
+    for each in ('script', 'event handler', 'image', 'stylesheet'):
+        assert any(each in line for line in complaints), (each, complaints)
+    assert page.title() == 'Title'
+    with page.expect_console_message(lambda line: 'form' in line.text, timeout=PATIENCE):
+        page.evaluate('document.forms[0].submit()')
+    page.close()
 
 
 @pytest.mark.parametrize(('model', 'units', 'known'), [

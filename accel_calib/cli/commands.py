@@ -24,6 +24,7 @@ from .. import __version__
 if TYPE_CHECKING:
     from ..finding import NextStep
 
+
 class Command(NamedTuple):
     """
     A command.

@@ -68,7 +68,7 @@ def utf8(text: str) -> str:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise argparse.ArgumentTypeError(f'{ascii(text)}: expected text in UTF-8') from None
+        raise argparse.ArgumentTypeError(f'{text!a}: expected text in UTF-8') from None
     return text
 
 

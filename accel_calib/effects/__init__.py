@@ -112,15 +112,16 @@ from .thermal import (
     ThermalStream,
 )
 
-__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
-           'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS',
-           'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'ONE', 'PROCESSES', 'PRODUCT',
-           'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE',
-           'AtContext', 'Context', 'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream',
-           'acting_temperature', 'by_axis', 'check_context', 'correct', 'covariate_names',
-           'curve_pairs', 'curve_unit', 'difference', 'effect_named', 'empirical_name',
-           'empirical_parts', 'fitted_places', 'force_slope', 'included', 'is_effect', 'kind_of',
-           'know', 'length_rows', 'linear_values', 'model_with', 'parameter_basis',
-           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
-           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of',
-           'value_unit', 'variable_of', 'variable_words', 'with_linear_part', 'with_vector']
+__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE',
+           'EFFECTS', 'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
+           'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'ONE', 'PROCESSES',
+           'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES',
+           'WANDER', 'WAVE', 'AtContext', 'Context', 'Effect', 'Model', 'ModelForm', 'OwnEffect',
+           'ThermalStream', 'acting_temperature', 'by_axis', 'check_context', 'correct',
+           'covariate_names', 'curve_pairs', 'curve_unit', 'difference', 'effect_named',
+           'empirical_name', 'empirical_parts', 'fitted_places', 'force_slope', 'included',
+           'is_effect', 'kind_of', 'know', 'length_rows', 'linear_values', 'model_with',
+           'parameter_basis', 'parameter_names', 'parse_effect', 'predict', 'rate_at',
+           'reading_of', 'sensor_force', 'simulate_poses', 'simulate_recording', 'times',
+           'too_large', 'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
+           'with_linear_part', 'with_vector']

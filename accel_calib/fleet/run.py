@@ -55,6 +55,9 @@ _NEWEST = 0.2
 
 _CONNECT_S = 30.0
 
+_HERE = '127.0.0.1'
+"""Address of a cluster on this machine; other machines do not reach it."""
+
 _CONFIG = {'distributed.worker.profile.enabled': False,
            'distributed.scheduler.worker-saturation': 1.0,
            'distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED': 'critical'}
@@ -121,8 +124,8 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
             yield client
         return
     with dask.config.set(_CONFIG), \
-            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=':0',
-                         silence_logs='ERROR') as local, \
+            LocalCluster(n_workers=workers, threads_per_worker=1, host=_HERE,
+                         dashboard_address=f'{_HERE}:0', silence_logs='ERROR') as local, \
             Client(local, set_as_default=False) as client:
         yield client
 

@@ -15,10 +15,8 @@ come from a fixed list.
 from __future__ import annotations
 
 import asyncio
-from base64 import b64encode
 from collections import deque
 from concurrent.futures import Future
-from hashlib import sha256
 import hmac
 from importlib.resources import files
 from ipaddress import ip_address
@@ -30,7 +28,7 @@ from urllib.parse import urlsplit
 
 from . import messages
 from .viewer import check_installed, not_bound, reachable, STUCK_S, TooManyError, Viewer
-from ..report.sheet import part_of_page
+from ..report.sheet import policy
 from ..session import Answer
 from ..stored.exports import Exported, FORMATS
 
@@ -60,18 +58,6 @@ _HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
                 "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
                 "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
                 "frame-ancestors 'none'")}
-
-
-def policy_hash(script: str) -> str:
-    """Return the source of an inline script for a Content-Security-Policy."""
-    return f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'"
-
-
-def _report_policy() -> str:
-    """Return the policy of the calibration page: its own script alone, and styles inside of it."""
-    return (f"default-src 'none'; script-src {policy_hash(part_of_page('script.js'))}; style-src "
-            "'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
-            "frame-ancestors 'self'")
 
 
 _NO_TOKEN = 'this link has no token, so it only shows; open the link with the token, which the ' \
@@ -312,8 +298,8 @@ class PageServer:
         success, text = await self._asked(self._desk.page)
         if not success:
             return web.Response(status=404, text=f'{text}\n')
-        return web.Response(text=text, content_type='text/html',
-                            headers={'Content-Security-Policy': _report_policy()})
+        allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
+        return web.Response(text=text, content_type='text/html', headers=allowed)
 
     async def _export(self, request: web.Request, name: str) -> web.Response:
         """Return an export as a download."""

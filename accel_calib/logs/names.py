@@ -163,7 +163,8 @@ def may_cause(name: str) -> bool:
     """Return whether a column can be a cause, other than what is computed from the readings."""
     known = meaning(name)
     return (known.quantity not in ('reading', 'rate', 'time') and not known.free
-            and bare_name(name) not in COUNTERS and not (OTHER_WORDS - CAUSES).intersection(known.group))
+            and bare_name(name) not in COUNTERS
+            and not (OTHER_WORDS - CAUSES).intersection(known.group))
 
 
 @lru_cache(maxsize=4096)

@@ -12,8 +12,10 @@ with a name in `Drawing.hover` gets the text that the page shows when the marker
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from functools import cache
+from hashlib import sha256
 from html import escape
 from importlib.resources import files
 import io
@@ -65,9 +67,19 @@ def sheet(title: str, body: Iterable[str], *, script: bool = True) -> str:
     live = ('<div id="tip" role="status" aria-live="polite"></div>\n'
             f'<script>{part_of_page("script.js")}</script>\n') if script else ''
     return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            f'<meta http-equiv="Content-Security-Policy" content="{policy(script=script)}">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
             f'<title>{escape(title)}</title>\n<style>{part_of_page("style.css")}</style>\n</head>'
             f'\n<body>\n<main>\n{"".join(body)}</main>\n{live}</body>\n</html>\n')
+
+
+@cache
+def policy(*, script: bool = True) -> str:
+    """Return the Content-Security-Policy of a page: its own script, and nothing from outside."""
+    digest = b64encode(sha256(part_of_page('script.js').encode()).digest()).decode()
+    own = f"script-src 'sha256-{digest}'; " if script else ''
+    return (f"default-src 'none'; {own}style-src 'unsafe-inline'; img-src data:; "
+            "base-uri 'none'; form-action 'none'")
 
 
 def rated_sheet(title: str, rating: Rating, body: Iterable[str]) -> str:
