@@ -76,7 +76,7 @@ from accel_calib.effects import (
 )
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
-from accel_calib.estimate import distinct, kinds, noise_of_means, originals, unseen_mistakes
+from accel_calib.estimate import believable, distinct, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of

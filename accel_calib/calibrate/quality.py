@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .calibration import Calibration, check_sensor, Quality, Rejected
 from .context import with_history
 from ..effects import correct, Model, sensor_force
-from ..estimate import coverage, Fit, judge, noise_of_means, Rival, unseen_mistakes, WEAK_DILUTION
+from ..estimate import believable, coverage, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
 from ..finding import Finding
 from ..table import Floats, Poses
 from ..text import listed
@@ -78,7 +78,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     before = errors_before(poses_g, units, vectors=vectors)
     after = errors_after(model, poses_g, vectors=vectors)
     floor = None
-    if noise_of_means(poses_g) is not None:
+    if believable(poses_g.noise) is not None:
         known = poses_g if vectors else _without_orientation(poses_g)
         scale = judge(Model(model.values), known).equations.scale
         floor = _rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
@@ -178,7 +178,7 @@ def _held_out(fit: Fit) -> Floats | None:
         return None
     left_out = np.linalg.solve(own, data.residual[:, :, np.newaxis])[:, :, 0]
     if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
-        noise = noise_of_means(fit.poses_g)
+        noise = believable(fit.poses_g.noise)
         scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
         left_out = scaled @ np.linalg.inv(fit.model.linear_part[0]).T
         return np.linalg.norm(left_out, axis=1)

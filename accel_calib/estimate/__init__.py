@@ -20,7 +20,7 @@ from .closed_form import (
     sensing_axes,
     TIES,
 )
-from .equations import Equations, kinds, noise_of_means, originals
+from .equations import believable, Equations, kinds, originals
 from .fit import estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
     Combination,
@@ -48,10 +48,10 @@ from .robust import covariance_with, fit_norm, outliers, Rival, rivals, start_of
 
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',
-           'Prior', 'Rival', 'by_pose', 'closed_form', 'covariance_with', 'coverage', 'dilution',
-           'distinct', 'error_left_in', 'estimate', 'faces', 'fit_12', 'fit_norm', 'fit_sphere',
-           'free_parameters', 'identifiability', 'information_of', 'judge', 'kinds', 'left_out',
-           'lower_triangular', 'noise_of_means', 'originals', 'outliers', 'outliers_among',
-           'over_the_sphere', 'pose_noise', 'poses_needed', 'relative_weights', 'rivals',
-           'rows_of', 'sensing_axes', 'solve', 'start_of', 'uncovered', 'unseen_mistakes',
-           'variance_factor']
+           'Prior', 'Rival', 'believable', 'by_pose', 'closed_form', 'covariance_with',
+           'coverage', 'dilution', 'distinct', 'error_left_in', 'estimate', 'faces', 'fit_12',
+           'fit_norm', 'fit_sphere', 'free_parameters', 'identifiability', 'information_of',
+           'judge', 'kinds', 'left_out', 'lower_triangular', 'originals', 'outliers',
+           'outliers_among', 'over_the_sphere', 'pose_noise', 'poses_needed', 'relative_weights',
+           'rivals', 'rows_of', 'sensing_axes', 'solve', 'start_of', 'uncovered',
+           'unseen_mistakes', 'variance_factor']

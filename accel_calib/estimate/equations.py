@@ -39,7 +39,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 import math
 from typing import Any, NamedTuple, Protocol
@@ -88,11 +87,6 @@ def believable(noise: Floats | None) -> Floats | None:
     return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
 
 
-def noise_of_means(poses_g: Poses) -> Floats | None:
-    """Return the believable (n, 3) noise of the pose means [g]; None if it is not known."""
-    return believable(poses_g.noise)
-
-
 def originals(poses_g: Poses) -> Indices:
     """
     Return the (n,) index of the first pose that each pose in g is a copy of, or its own.
@@ -100,7 +94,7 @@ def originals(poses_g: Poses) -> Indices:
     Context, such as the temperature, is compared, too.
 
     """
-    reading, noise = poses_g.reading, noise_of_means(poses_g)
+    reading, noise = poses_g.reading, believable(poses_g.noise)
     found = np.arange(len(reading))
     cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
     place = reading / cell
@@ -159,7 +153,7 @@ class Measured:
 
 def measured(poses_g: Poses) -> Measured:
     """Return poses in g as the equations use them, without the noise that is not believable."""
-    noise, reading = noise_of_means(poses_g), poses_g.reading
+    reading, noise = poses_g.reading, believable(poses_g.noise)
     s = np.full(reading.shape, USUAL_NOISE_G) if noise is None else noise
     known, shared, alone = kinds(poses_g)
 
@@ -193,6 +187,10 @@ class Equations:
         Number of independent equations.
     noise_known : bool
         Whether the noise was measured; otherwise the noise of all poses is `USUAL_NOISE_G`.
+    residual : (m,) array
+        Residuals in units of the noise.
+    pose : (m,) array of int
+        Index of the pose that each equation belongs to.
 
     """
 
@@ -201,20 +199,12 @@ class Equations:
     scale: Floats
     count: int
     noise_known: bool
-
-    @cached_property
-    def residual(self) -> Floats:
-        """(m,) array, the residuals in units of the noise."""
-        return _joined([part.residual for part in self.parts])
-
-    @cached_property
-    def pose(self) -> Indices:
-        """(m,) array, index of the pose that each equation belongs to."""
-        return _joined([part.pose for part in self.parts])
+    residual: Floats
+    pose: Indices
 
     def columns(self, model: Model) -> Floats:
         """Return the (m, p) derivative of the prediction by the values of a model, per noise."""
-        return _joined([part.columns(model) for part in self.parts])
+        return np.concatenate([part.columns(model) for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:
         """Return the (n,) residuals of poses [g]: signed for one equation each, else RMS."""
@@ -224,10 +214,6 @@ class Equations:
             signed[self.pose] = sizes
             return signed
         return np.sqrt(np.bincount(self.pose, sizes ** 2, len(self.scale)))
-
-
-def _joined(arrays: list[NDArray[Any]]) -> NDArray[Any]:
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 class _Part(Protocol):
@@ -252,9 +238,10 @@ def equations(model: Model, poses: Measured) -> Equations:
             parts.append(part)
             force[kind.which], scale[kind.which] = part.force, part.scale
     groups = poses.shared.group
-    count = sum(len(part.residual) for part in parts) - (2 * (int(groups[-1]) + 1)
-                                                         if len(groups) else 0)
-    return Equations(tuple(parts), force, scale, count, poses.noise_known)
+    residual = np.concatenate([part.residual for part in parts])
+    count = len(residual) - (2 * (int(groups[-1]) + 1) if len(groups) else 0)
+    return Equations(tuple(parts), force, scale, count, poses.noise_known, residual,
+                     np.concatenate([part.pose for part in parts]))
 
 
 class _Alone:

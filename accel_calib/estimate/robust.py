@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .closed_form import closed_form
-from .equations import noise_of_means
+from .equations import believable
 from .fit import estimate, Fit, judge, NotConvergedError
 from .outliers import (
     belief_beside,
@@ -212,7 +212,7 @@ def _agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
     """Return the indices of all poses but `most`, selected so that they agree best."""
     count = len(poses_g)
     reading = poses_g.reading
-    noise = noise_of_means(poses_g)
+    noise = believable(poses_g.noise)
     noise = np.ones_like(reading) if noise is None else noise
     nearest = _subsets(count, most, _free(name))
     for _ in range(_CONCENTRATIONS):

@@ -44,6 +44,7 @@ from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, those
 from inside import (
     axes_of,
+    believable,
     change,
     distinct,
     doubts_about_flat,
@@ -55,7 +56,6 @@ from inside import (
     Model,
     mounting,
     mounting_figures,
-    noise_of_means,
     on_one_scale,
     originals,
     outlier,
@@ -174,7 +174,7 @@ def noise() -> Any:
     return [
         _grid(factor, (-1, 0, 1, 2, 3, 5, 9, 30, 200), (True, False)),
         _grid(copies, (1e-3, 0.0)), rounding_left(np.linspace(0.0, 0.6, 25)),
-        [noise_of_means(_table(SIDES[:6], std=each, count=np.full(6, 16.0))) for each in (
+        [believable(_table(SIDES[:6], std=each, count=np.full(6, 16.0)).noise) for each in (
             std, std * [[1], [1], [1], [0.05], [0.2], [7]], std * 1e-8, std * 0.0)],
         _grid(sample, (1999, 2001, 6001, 9000), (0, 1, 3, 700, 2500))]
 
