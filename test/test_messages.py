@@ -3,6 +3,7 @@
 
 """Serialized Imu messages: layout and correction."""
 
+from itertools import product
 import struct
 
 from accel_calib.calibrate import fit_poses, level, thermal_stream
@@ -230,8 +231,10 @@ def test_no_force_beyond_100_g_is_published(calibration):
     layout = layout_of(bytes(data))
     rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, 'imu')
     place = layout.place(ACCELERATION)
-    for reading in (1e3, -1e300):
-        struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
+    for reading, axis in product((1e3, -1e300), range(3)):
+        values = [0.0, 0.0, 0.0]
+        values[axis] = reading
+        struct.pack_into('<3d', data, place, *values)
         with pytest.raises(InputError, match='expected less than 100 g; check the calibration'):
             rewriter(bytes(data), 20.0)
     for reading in (np.nan, np.inf):

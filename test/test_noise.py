@@ -295,7 +295,8 @@ def test_the_figures_are_printed_written_and_drawn(
     text = (tmp_path / 'noise.html').read_text()
     for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density'):
         assert words in text
-    assert 'http' not in text
+    assert 'http:' not in text
+    assert 'https:' not in text
 
 
 def test_a_calibration_turns_counts_into_g(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_figure_of_a_curve_shows_the_truth_within_its_band(bumpy):
     step = bumpy.steps[-1]
     assert bumpy.verdict == 'described'
     assert step.effect == 'empirical'
-    parts = {part.name: part for part in curve_parts(bumpy, step.curve)}
+    parts = {part.name: part for part in curve_parts(bumpy, step.name)}
     for name, part in parts.items():
         truth = bump(part.at) - np.mean(bump(part.poses)) if name == 'z' else 0.0
         np.testing.assert_array_less(np.abs(part.change - truth), 6.0 * part.deviation + 2e-4)

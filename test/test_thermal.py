@@ -125,6 +125,7 @@ def samples(count=3000):
     time[count // 2:] += 500.0
     warm = stepped(25.0 + 6.0 * np.sin(time / 90.0), 0.06)
     warm[rng.random(count) < 0.05] = np.nan
+    warm[3::50] = 0.0
     return time, warm
 
 
