@@ -158,6 +158,17 @@ def test_slow_turning_is_not_still(speed, noise):
         assert np.abs(result.poses.reading[0] - [0.0, 0.0, 1.0]).max() < 5e-3 + noise
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_a_sensor_that_is_tilted_and_tilted_back_in_a_short_dwell_is_not_still(seed):
+    time, reading, truth = turned(seed, noise=1e-4, dwell=(1.6, 1.7))
+    start, end, force = truth[3]
+    share = np.clip((time - start) / (end - start), 0.0, 1.0)
+    aside = np.cross(force, [1.0, 0.0, 0.0])
+    tilt = 0.003 * (end - start) * (1.0 - np.abs(2.0 * share - 1.0))
+    moved = reading + tilt[:, np.newaxis] * aside / np.linalg.norm(aside)
+    assert_all_found(captured(time, moved), [*truth[:3], *truth[4:]])
+
+
 def rests_with_a_gyro(turned_one, seconds=3.0, noise=0.05, count=8):
     """Return readings and rates of rests; one rest is turned at 1 °/s."""
     rng = np.random.default_rng(3)
