@@ -234,7 +234,7 @@ class Commands:
     def _levelled(self, calibration: Calibration, rest: Dwell) -> Calibration:
         """Return a calibration levelled by a rest; check it against the given mounting."""
         session = self._session
-        levelled = level(calibration, rest.mean, session.settings.frame,
+        levelled = level(calibration, rest.mean, session.frame,
                          session.sensor.context_of(rest, calibration))
         if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
             raise InputError('this pose differs by more than 10° of tilt from the mounting in '

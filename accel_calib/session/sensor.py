@@ -31,7 +31,15 @@ from .guidance import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
 from .settings import CalibratorSettings, capture_settings
 from .stream import StreamStatistics
-from ..calibrate import Calibration, GyroBias, Outside, outside, SampleNoise, thermal_stream
+from ..calibrate import (
+    Calibration,
+    GyroBias,
+    on_topics,
+    Outside,
+    outside,
+    SampleNoise,
+    thermal_stream,
+)
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rest_errors
 from ..effects import Context, Model, ThermalStream
@@ -67,9 +75,10 @@ class Sensor:
     calibration : Calibration or None
         The calibration in use.
     applied : Calibration or None
-        The calibration that corrects messages: without the mounting if `rotates` is false.
-    offered : Calibration or None
-        A calibration that waits for ~/save or ~/undo.
+        The calibration that corrects messages: in their frame, or without the mounting if
+        `rotates` is false.
+    offered, previewed : Calibration or None
+        A calibration that waits for ~/save or ~/undo, and the same in the frame of messages.
     rating : Rating or None
         Rating of the calibration that is offered or in use; None while it is not known.
     refinement : Refinement or None
@@ -101,6 +110,7 @@ class Sensor:
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None
         self.offered: Calibration | None = None
+        self.previewed: Calibration | None = None
         self.rating: Rating | None = None
         self.refinement: Refinement | None = None
         self.changes = self.fitted_poses = 0
@@ -110,7 +120,7 @@ class Sensor:
         self.scale = 1.0
         self.rest: Dwell | None = None
         self.gravity: Floats | None = None
-        self._g, self._rotates = settings.gravity, settings.rotate
+        self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
@@ -148,6 +158,7 @@ class Sensor:
     def offer(self, calibration: Calibration | None) -> None:
         """Publish this calibration on ~/preview only; None: discard the offered one."""
         self.offered = calibration
+        self.previewed = calibration and on_topics(calibration, self._frame)
         self.changes += 1
 
     def adopt(self, calibration: Calibration | None) -> None:
@@ -165,8 +176,9 @@ class Sensor:
     def set_rotates(self, rotates: bool) -> None:
         """Turn corrected messages into the levelled frame, or leave them in that of the sensor."""
         self._rotates, self.applied = rotates, self.calibration
-        if self.calibration is not None and not rotates:
-            self.applied = self.calibration.in_sensor_frame
+        if self.calibration is not None:
+            self.applied = (on_topics(self.calibration, self._frame) if rotates
+                            else self.calibration.in_sensor_frame)
         self._hold()
 
     @property

@@ -41,7 +41,15 @@ from .worker import (
     Still,
     Task,
 )
-from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..calibrate import (
+    Calibration,
+    FrameName,
+    in_frame,
+    mounting_of,
+    mounting_words,
+    on_topics,
+    with_given_mounting,
+)
 from ..compare import status
 from ..errors import InputError
 from ..table import Floats, Poses
@@ -125,6 +133,11 @@ class Session:
             if store is not None:
                 self._adopt_loaded(load(store))
         self._show_poses(store=False)
+
+    @property
+    def frame(self) -> FrameName:
+        """Levelled frame of calibrations; messages in `ned` are those of `ros`, turned."""
+        return 'ros' if self.settings.frame == 'ned' else self.settings.frame
 
     @property
     def name(self) -> str:
@@ -266,13 +279,12 @@ class Session:
 
     def _show_frame(self) -> None:
         """Show poses and mounting in the frame of the sensor, which was not known before."""
-        frame_id, calibration = self.frame_id, self.sensor.calibration
+        frame_id = self.frame_id
         if frame_id and frame_id == self.settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
-        if frame_id and calibration is not None and calibration.is_levelled:
-            self._events.append(Mounting(calibration.rotation, frame_id))
+        self._show_mounting()
         plan = self.sensor.guide.plan
         if plan is not None:
             self._events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
@@ -326,6 +338,11 @@ class Session:
             self.sensor.adopt(None)
             self.rate(None)
             return
+        if calibration.is_levelled and calibration.frame != self.frame:
+            self.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
+                     f'frame is {self.settings.frame}: it is turned, and a measured heading is '
+                     'kept')
+            calibration = in_frame(calibration, self.frame)
         stored, calibration = calibration, self.with_given(calibration)
         if stored.is_levelled and not np.allclose(stored.rotation[:, 2],
                                                   calibration.rotation[:, 2]):
@@ -333,11 +350,18 @@ class Session:
                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.sensor.adopt(calibration)
         self.rate(refinement, rating)
-        self.log('info', f'correcting with {title(calibration)}')
+        levelled = calibration.is_levelled and self.settings.rotate
+        self.log('info', f'correcting with {title(calibration)}; messages are in the frame '
+                 f'{self.settings.frame if levelled else "of the sensor"}')
         for finding in calibration.noted:
             self.log(_SEVERITY[finding.level], finding.words)
-        if calibration.is_levelled:
-            self._events.append(Mounting(calibration.rotation, self.frame_id or ''))
+        self._show_mounting()
+
+    def _show_mounting(self) -> None:
+        calibration = self.sensor.calibration
+        if self.frame_id and calibration is not None and calibration.is_levelled:
+            levelled = on_topics(calibration, self.settings.frame)
+            self._events.append(Mounting(levelled.rotation, self.frame_id))
 
     def offer(self, calibration: Calibration | None, refinement: Refinement | None = None,
               rating: Rating | None = None) -> None:
