@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import Any
 
-from accel_calib.session import CalibratorSettings, checks, Log, Session, state, Task
+from accel_calib.session import CalibratorSettings, checks, Log, Result, Session, state, Task
 from inside import next_action
 import numpy as np
 from shared import answer_of
@@ -24,6 +24,7 @@ class Driver:
         self.now = 0.0
         self.stamp = 1000.0
         self.log: list[Log] = []
+        self.results: list[str] = []
         self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
         self.handle()
 
@@ -34,6 +35,8 @@ class Driver:
                 self.log += [Log('info', words)] if words else []
             elif isinstance(event, Log):
                 self.log.append(event)
+            elif isinstance(event, Result):
+                self.results.append(event.text)
 
     def done(self, task: Task) -> str:
         """Return the answer of a command."""

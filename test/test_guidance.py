@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from accel_calib.finding import STEPS
@@ -12,6 +14,7 @@ from driven import Driver, Person
 from inside import next_action
 import numpy as np
 import pytest
+from shared import run_json
 
 pytestmark = pytest.mark.usefixtures('home')
 
@@ -71,3 +74,50 @@ def test_each_step_of_a_session_is_one_of_the_known_steps() -> None:
     person.rest(person.flat)
     assert next_action(driver.session).kind == 'unit'
     assert {'connect', 'unit', 'poses', 'fit', 'level', 'accept', 'done'} <= set(STEPS)
+
+
+def figures(driver: Driver) -> dict[str, Any]:
+    return json.loads(driver.results[-1])  # type: ignore[no-any-return]
+
+
+def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    driver = Driver(sensor='arm')
+    Person(driver, warming, warming=1.2).follow()
+    kinds = [json.loads(text)['next']['kind'] for text in driver.results]
+    assert kinds[-1] == 'done'
+    assert {'refine', 'level'} <= set(kinds)
+    store = driver.session.files.store
+    _, fit = run_json(capsys, 'fit', store.poses)
+    _, refined = run_json(capsys, 'refine', store.poses)
+    found, calibration = figures(driver), driver.session.sensor.calibration
+    assert set(found) >= {*fit, *refined} - {'file', 'read_as', 'read_lines'}
+    for result in (found, refined):
+        assert 'offset_temperature' in [step['effect'] for step in result['steps']]
+    assert (found['rating'], found['in_use'], found['verdict']) == ('GOOD', True, 'explained')
+    assert found['next'] == {'kind': 'done', 'text': next_action(driver.session).words,
+                             'command': ''}
+    for key in ('offset', 'gain', 'rotation', 'offset_sd', 'gain_sd'):
+        np.testing.assert_allclose(found[key], getattr(calibration, key), atol=1e-12)
+
+
+def test_an_offered_result_is_reported_as_not_in_use() -> None:
+    driver = Driver(confirm=True)
+    person = Person(driver, healthy)
+    person.follow()
+    person.rest(person.flat, 4.0)
+    for command in ('calibrate_at_rest', 'set_level'):
+        driver.done(getattr(driver.session.commands, command)())
+        assert figures(driver)['in_use'] is False
+        assert figures(driver)['next']['command'] == '~/save'
+    driver.done(driver.session.commands.save())
+    assert figures(driver)['in_use'] is True
+
+
+@pytest.mark.parametrize('command', ['set_level', 'calibrate_at_rest'])
+def test_a_mounting_alone_is_reported(command: str) -> None:
+    driver = Driver(auto_capture=False)
+    Person(driver, healthy).rest([0.1, 0.0, 1.0], 4.0)
+    driver.done(getattr(driver.session.commands, command)())
+    assert figures(driver)['rotation'][2] != [0.0, 0.0, 1.0]
+    assert not driver.logged('error')

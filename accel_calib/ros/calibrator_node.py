@@ -31,7 +31,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -48,6 +48,7 @@ from ..session import (
     Log,
     LogFilter,
     Mounting,
+    Result,
     Session,
     ShowPoses,
     state,
@@ -95,13 +96,15 @@ class Calibrator:
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
+        self._result = node.create_publisher(String, '~/result', LATCHED)
         self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._overrides = QoSOverridingOptions.with_default_policies()
         outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
                    self._published(Vector3Stamped, '~/linear_acceleration')]
         self.stream = Stream(self.session, outputs, self._handle_events)
         self._heard: list[Any] = []
-        self._said = [*outputs, self._still, self._poses, self._progress, self._diagnostics]
+        self._said = [*outputs, self._still, self._poses, self._progress, self._result,
+                      self._diagnostics]
         self._page = Page(node, self.session, self.stream, self._worker, call_soon, self._log)
         self._still.publish(Bool(data=False))
         self._serve()
@@ -197,6 +200,8 @@ class Calibrator:
             self._page.show_poses(event)
         elif isinstance(event, Mounting):
             self._broadcast(event)
+        elif isinstance(event, Result):
+            self._result.publish(String(data=event.text))
         else:
             self._worker.run(event, self._on_done)
 

@@ -14,6 +14,7 @@ uses a steady clock.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+import json
 import math
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -28,7 +29,7 @@ from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
 from .store import Store, writing_advice
 from .stream import AGAIN, Reports, SILENT, StreamStatistics
-from .work import plan_for, rated
+from .work import plan_for, rated, result_of
 from .worker import (
     Calibrations,
     Compute,
@@ -36,6 +37,7 @@ from .worker import (
     Files,
     Log,
     Mounting,
+    Result,
     Severity,
     ShowPoses,
     Still,
@@ -52,6 +54,7 @@ from ..calibrate import (
 )
 from ..compare import status
 from ..errors import InputError
+from ..findings import rating_json
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import units_of
@@ -370,19 +373,28 @@ class Session:
         self.rate(refinement, rating)
 
     def rate(self, refinement: Refinement | None, rating: Rating | None = None) -> None:
-        """Note the rating of the present calibration; add a task for it if it is not known."""
+        """Add a task that rates the present calibration, if need be, and reports it as JSON."""
         sensor = self.sensor
         sensor.refinement = refinement
         if rating is not None or sensor.present is None:
             sensor.rating = rating
-        else:
-            self._events.append(self._rated(sensor, sensor.present))
+        if sensor.present is not None:
+            self._events.append(self._rated(sensor, sensor.present, rating))
 
-    def _rated(self, sensor: Sensor, calibration: Calibration) -> Task:
-        """Rate a calibration, and note the rating unless another one has replaced it."""
-        rating: Rating = yield Compute(rated, calibration, sensor.refinement)
-        if sensor.present is calibration:
-            sensor.rating = rating
+    def _rated(self, sensor: Sensor, calibration: Calibration, rating: Rating | None) -> Task:
+        """Rate a calibration, and report it, unless another one has replaced it."""
+        refinement = sensor.refinement
+        if rating is None:
+            rating = yield Compute(rated, calibration, refinement)
+            if sensor.present is calibration:
+                sensor.rating = rating
+        found = yield Compute(result_of, calibration, refinement, self.settings.model)
+        action = next_action(self)
+        if rating is not None and action is not None and sensor.present is calibration:
+            service = f'~/{action.command}' if action.command else ''
+            self._events.append(Result(json.dumps({
+                **found, 'in_use': sensor.offered is not calibration,
+                **rating_json(rating, action.kind, action.words, service)})))
         return ''
 
     def set_mounting(self, rotation: Floats) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,18 +23,19 @@ from ..calibrate import (
     level,
     lies_in_cone,
     next_pose,
+    outlook,
     PRIOR,
 )
 from ..capture import Dwell, poses_from
 from ..effects import LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate import coverage, fit_sphere, pose_noise
-from ..findings import rate, rate_refinement, Rating
+from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
 from ..geometry import spread_directions
 from ..refine import PlannedPose, refine, Refinement, refitted
 from ..refine.words import residual_words, verdict_words
 from ..table import Floats, Poses
-from ..text import counted, listed, now
+from ..text import counted, listed, now, plain
 from ..units import MG, Units
 
 _DIRECTIONS = 100
@@ -193,6 +195,14 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
 def rated(calibration: Calibration, refinement: Refinement | None) -> Rating:
     """Return the rating of a calibration, and of the refinement that it is from."""
     return rate(calibration, refinement=refinement)
+
+
+def result_of(calibration: Calibration, refinement: Refinement | None, model: str
+              ) -> dict[str, Any]:
+    """Return a calibration, and its refinement, for JSON as on the command line."""
+    found = {} if refinement is None else refinement_json(refinement)
+    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
+    return cast('dict[str, Any]', plain(whole))
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:
