@@ -276,8 +276,10 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
         rotation = with_heading_of(calibration.rotation, rotation)
     others = without(calibration.noted, 'flat_pose', 'heading')
     levelled = replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
+    asked = kept and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT
+    doubts = () if asked else doubts_about_flat(rotation, frame)  # asked once
     return replace(levelled, noted=(
-        *wiring(levelled), *without(others, 'wiring'), *doubts_about_flat(rotation, frame),
+        *wiring(levelled), *without(others, 'wiring'), *doubts,
         *((_ARBITRARY_HEADING,) if arbitrary else ())))
 
 
@@ -299,11 +301,11 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
     return with_mounting(calibration, rotation)
 
 
-def with_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
-    """Return a calibration with another ΔR, whose heading is known."""
+def with_mounting(calibration: Calibration, rotation: Floats, *known: str) -> Calibration:
+    """Return a calibration with another ΔR; heading and these kinds of findings are known."""
     turned = replace(calibration, model=Model(calibration.model.values, rotation))
     return replace(turned, noted=(*wiring(turned),
-                                  *without(turned.noted, 'wiring', 'heading')))
+                                  *without(turned.noted, 'wiring', 'heading', *known)))
 
 
 def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
@@ -316,7 +318,7 @@ def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibrati
     """
     if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:
         rotation = with_heading_of(rotation, calibration.rotation)
-    return with_mounting(calibration, rotation)
+    return with_mounting(calibration, rotation, 'flat_pose')
 
 
 def _in_sensor_axes(calibration: Calibration, reading: Floats, context: Context | None) -> Floats:

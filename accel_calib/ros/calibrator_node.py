@@ -35,7 +35,16 @@ from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from .declare import declared, follow, LATCHED, mismatches, name_of, SENSOR, STREAM
+from .declare import (
+    declared,
+    follow,
+    LATCHED,
+    mismatches,
+    name_of,
+    published_by_others,
+    SENSOR,
+    STREAM,
+)
 from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
 from .stream import Stream
 from .transforms import MountingBroadcaster, watch_static
@@ -156,6 +165,8 @@ class Calibrator:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
+        self.session.imus, self.session.thermometers = (
+            published_by_others(self._node, kind) for kind in (Imu, Temperature))
         self.session.mismatches = mismatches(self._node, self._heard, self._said)
         self.stream.flush()
         self.session.tick()

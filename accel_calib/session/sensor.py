@@ -56,6 +56,9 @@ if TYPE_CHECKING:
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
 
+_WITHOUT_NEW = 60.0
+"""Time without a new pose after which the robot probably cannot be turned further [s]."""
+
 _NONE = np.zeros((1, 3))
 _AT_REST: Triple = (0.0, 0.0, 0.0)
 
@@ -125,6 +128,7 @@ class Sensor:
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
         self._refused = 0, ''
+        self._new_pose = 0, math.inf
         self._prepared: tuple[Calibration, OneReading] | None = None
 
     @property
@@ -136,6 +140,16 @@ class Sensor:
     def all_fitted(self) -> bool:
         """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
         return 0 < self.guide.poses == self.fitted_poses and not self.guide.follows
+
+    def note_poses(self, stamp: float) -> None:
+        """Note the time of a new pose, by header stamps [s]."""
+        count = len(self.live.book.poses())
+        if count != self._new_pose[0]:
+            self._new_pose = count, stamp
+
+    def is_stuck(self, stamp: float) -> bool:
+        """Return whether a fit is refused, or no pose has been new for a minute."""
+        return bool(self.refused_advice) or stamp - self._new_pose[1] >= _WITHOUT_NEW
 
     def refuse(self, advice: str) -> None:
         """Note that a fit to the present poses is refused, and what to do."""
@@ -230,6 +244,10 @@ class Sensor:
     def _compare(self, least: float) -> None:
         part = None if self.rest is None else self._uncounted(self.rest)
         self.drift = self._past if part is None else self._with(part, least)
+        found, past = self.drift, self._past
+        if found is not None and past is not None and found.change and not past.change:
+            # What was reported during a rest ends by the rule of `drift`, not with the rest.
+            self._past = replace(past, change=found.change, since=found.since)
 
     def _uncounted(self, rest: Dwell) -> Dwell | None:
         """Return the part of a rest that was not counted yet, or None if it is too short."""
@@ -271,12 +289,18 @@ class Sensor:
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
-        """Return the quantities that are outside of the range of the calibration now."""
+        """
+        Return the quantities that are outside of the range of the calibration now.
+
+        The time leaves its range for ever, and the last value holds: no pose can be taken there.
+
+        """
         if self.calibration is None:
             return {}
         now = {key: np.array([value]) for key, value in {
             **known, 'std': np.zeros(3), **self.temperatures.columns}.items()}
-        return {key: each for key, each in outside(self.calibration, now).items() if each.count}
+        return {key: each for key, each in outside(self.calibration, now).items()
+                if each.count and key != 'time'}
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""

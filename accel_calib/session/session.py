@@ -98,6 +98,8 @@ class Session:
         Whether messages are corrected.
     publishers : tuple of str or None
         Names of the nodes that publish the messages; None: the samples come from a board.
+    imus, thermometers : tuple of str
+        Topics with messages of Imus and of temperatures that other nodes publish.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     computing : int
@@ -124,6 +126,8 @@ class Session:
         self.problem = ''
         self.publishers: tuple[str, ...] | None = ()
         self.mismatches: tuple[str, ...] = ()
+        self.imus: tuple[str, ...] = ()
+        self.thermometers: tuple[str, ...] = ()
         self.enabled, self.still, self.still_since = True, False, math.nan
         self.computing, self.ended = 0, False
         _check_frames(settings)
@@ -173,6 +177,8 @@ class Session:
         self._report_still()
         self.reports.faults()
         self.reports.limits()
+        self.reports.hand()
+        self.reports.thermometers()
         self._events += self.commands.due()
 
     def close(self) -> None:
@@ -252,9 +258,9 @@ class Session:
         if sensor.drift is not None and sensor.has_changed is not before:
             self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
         if change.doubted:
-            self.log('warning', f'the sensor may have moved during '
-                     f'{counted(change.doubted, "pose")}, according to later rests; a fit '
-                     'leaves out such poses if the others are sufficient')
+            self.log('warning', f'{counted(change.doubted, "pose")} taken while the sensor moved '
+                     'or vibrated, as by motors: later rests are quieter; a fit leaves out such '
+                     'poses if the others are sufficient')
         if change.poses:
             new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
             self.poses_changed(ended=bool(change.ended), new_rest=new)
@@ -416,6 +422,7 @@ class Session:
 
     def poses_changed(self, *, ended: bool, new_rest: bool = False) -> None:
         """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
+        self.sensor.note_poses(self.statistics.stamp)
         self._show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True
