@@ -1,15 +1,17 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, counts, dates and tables as text."""
+"""Numbers, counts, dates, tables and results as text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape
 from itertools import repeat
 import math
+from pathlib import Path
+from typing import Any
 
 _ZERO = 1e-12
 """Values below are zero but for rounding."""
@@ -84,3 +86,16 @@ def listed(noun: str, items: Sequence[object]) -> str:
 def now() -> str:
     """Return the date of a result: ISO 8601, UTC, to the second."""
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
+
+
+def plain(value: Any) -> Any:
+    """Convert a value for JSON: arrays to lists, numbers that are not finite to None."""
+    if hasattr(value, 'tolist'):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -61,7 +61,7 @@ TOPICS = {
 PARAMETERS = {
     'units': (str, 'Unit of the incoming linear_acceleration: m/s2, g or native.'),
     'model': (str, 'Model for ~/fit: auto, 4, 7, 9 or 10.'),
-    'frame': (str, 'Levelled frame: ros, ned, android or win8.'),
+    'frame': (str, 'Levelled frame of the messages: ros, ned or android.'),
     'output_frame_id': (str, 'frame_id of messages in the levelled frame.'),
     'rotate': (bool, 'Whether to turn corrected messages into the levelled frame.'),
     'mounting_rpy': (list, 'Roll, pitch and yaw of the sensor on the robot [rad], such as '

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import Any
 
-from accel_calib.session import CalibratorSettings, checks, Log, Session, state, Task
+from accel_calib.session import CalibratorSettings, checks, Log, Result, Session, state, Task
 from inside import next_action
 import numpy as np
 from shared import answer_of
@@ -24,6 +24,7 @@ class Driver:
         self.now = 0.0
         self.stamp = 1000.0
         self.log: list[Log] = []
+        self.results: list[str] = []
         self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
         self.handle()
 
@@ -34,6 +35,8 @@ class Driver:
                 self.log += [Log('info', words)] if words else []
             elif isinstance(event, Log):
                 self.log.append(event)
+            elif isinstance(event, Result):
+                self.results.append(event.text)
 
     def done(self, task: Task) -> str:
         """Return the answer of a command."""
@@ -77,7 +80,7 @@ class Person:
                  flat: Any = (0.0, 0.0, 1.0), can_reach: Any = lambda up: True) -> None:
         self.driver, self.sensor, self.warming, self.flat = driver, sensor, warming, flat
         self.can_reach = can_reach
-        self.temperature, self.steps = 25.0, []
+        self.temperature, self.steps, self.called = 25.0, [], []
         self._up, self._rng = np.array(flat, float), np.random.default_rng(5)
 
     def rest(self, up: Any, seconds: float = 2.0) -> None:
@@ -94,6 +97,12 @@ class Person:
         self._up = np.asarray(up, float)
         self.temperature += self.warming
 
+    def nearest(self, up: Any) -> Any:
+        """Return the direction on the way to another one that the robot can reach."""
+        way = (self.flat + share * (np.array(up) - self.flat) for share in (0.3, 0.1))
+        return next((each / np.linalg.norm(each) for each in way
+                     if self.can_reach(each / np.linalg.norm(each))), np.array(self.flat))
+
     def follow(self, most: int = 80) -> str:
         """Do one step after the other; return the kind of the last one."""
         self.rest(self.flat)
@@ -106,9 +115,12 @@ class Person:
                 break
             if now.direction and self.can_reach(np.array(now.direction)):
                 self.rest(now.direction)
+            elif now.direction and not action.command:  # what it can do: stay, or tilt a little
+                self.rest(self.nearest(now.direction), 20.0)
             elif action.command:
                 if action.kind == 'level':
                     self.rest(self.flat, 4.0)
+                self.called.append(action.command)
                 self.driver.done(getattr(self.driver.session.commands, action.command)())
             else:
                 break

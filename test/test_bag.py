@@ -3,7 +3,7 @@
 
 """Bags of every kind, written by `rosbags`, read and corrected without ROS."""
 
-from accel_calib.calibrate import fit_poses
+from accel_calib.calibrate import fit_poses, level
 from accel_calib.capture import capture
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import read_recording
@@ -122,3 +122,20 @@ def test_a_calibration_of_another_sensor_writes_no_bag(recording, tmp_path):
     with pytest.raises(InputError, match='in exists'):
         correct_bag(path, other, path)
     assert [item.name for item in tmp_path.iterdir()] == ['in']
+
+
+def test_a_bag_in_ned_is_forward_right_down_and_one_of_gravity_is_refused(recording, tmp_path):
+    path = write_bag(tmp_path / 'recording.bag', 'bag', recording)
+    poses = capture(read_recording(path), UNITS).poses
+    fitted = fit_poses(poses, UNITS, sensor='imu_link')
+    by_frame = {frame: level(fitted, poses.reading[0], frame) for frame in ('ros', 'ned', 'win8')}
+    out = {frame: tmp_path / f'{frame}.bag' for frame in by_frame}
+    for frame in ('ros', 'ned'):
+        correct_bag(path, by_frame[frame], out[frame])
+    ros, ned = (read_recording(out[frame]) for frame in ('ros', 'ned'))
+    for key in ('reading', 'rate'):
+        np.testing.assert_allclose(ned[key], ros[key] * [1.0, -1.0, -1.0], atol=1e-9)
+    np.testing.assert_allclose(np.abs(by_frame['ned'].rotation[:, 2]),
+                               np.abs(by_frame['ros'].rotation[:, 2]))
+    with pytest.raises(InputError, match='win8, whose readings are gravity'):
+        correct_bag(path, by_frame['win8'], out['win8'])

@@ -113,7 +113,7 @@ def test_offset_and_gain_are_distinguished_where_the_attitudes_allow() -> None:
     state = rested(monitor(calibration), calibration, truth, [UP] * 5, rng, shift=0.005 * UP)
     assert state.change is not None
     assert not state.change.clear
-    assert 'has changed by' not in status(state)
+    assert 'the offset or the gain has changed' in status(state)
 
 
 def test_change_clears_only_when_rests_clearly_read_1_g_again() -> None:
@@ -129,7 +129,24 @@ def test_change_clears_only_when_rests_clearly_read_1_g_again() -> None:
     state = rested(state, calibration, truth, [z], rng)
     assert state.change is not None
     state = rested(state, calibration, truth, [z] * 5, rng)
+    assert state.change is not None
+    state = rested(state, calibration, truth, [z] * 6, rng)
     assert (state.change, state.since, state.lasted) == (None, 0, 0)
+
+
+def test_a_lasting_change_is_reported_once_and_with_one_cause() -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        truth = sensor(rng)
+        state, reports, clear = monitor(calibration := made(truth, rng)), 0, set()
+        for up in random_directions(60, rng):
+            before = state.change
+            state = rested(state, calibration, truth, [1.015 * up], rng)
+            reports += (before is None) is not (state.change is None)
+            if state.change is not None and state.change.clear:
+                clear.add(state.change.kind)
+        assert reports == 1
+        assert clear <= {'gain'}
 
 
 def test_sensor_that_repeats_worse_than_stated_is_not_reported_as_changed() -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import json
 import math
 from pathlib import Path
 import re
@@ -22,7 +23,7 @@ import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 
 GRAVITY = 9.80665
 NODE = 'calibrator'
@@ -248,6 +249,10 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
         assert bench.exchange(bench.came_out, lambda raw=raw: raw) == raw
         assert bench.call(end).success
         assert path.exists() is (end == 'save')
+    results = bench.listen(String, 'calibrator/result', latched=True)
+    bench.spin(lambda: results and json.loads(results[-1].data)['in_use'])
+    np.testing.assert_allclose(json.loads(results[-1].data)['offset'],
+                               read_calibration(path).offset, atol=1e-9)
     bench.exchange(bench.came_out, lambda: bench.imu([0.3, 0.4, 9.7]))
     bench.spin(lambda: np.linalg.norm(force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05
                or bench.send(bench.imu([0.3, 0.4, 9.7])))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import os
 from pathlib import Path
 import struct
@@ -15,6 +16,7 @@ from accel_calib.logs import layout_of
 from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
+from inside import Model
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -56,12 +58,17 @@ def full(bench: Any, reading: Any = READING, **fields: Any) -> Imu:
                      angular_velocity=Vector3(x=RATE[0], y=RATE[1], z=RATE[2]), **fields)
 
 
-def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored) -> None:
+@pytest.mark.parametrize('frame', ['ros', 'ned'])
+def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored, frame: str
+                                                    ) -> None:
     path = stored(flat=FLAT)
+    axes = np.diag([1.0, -1.0, -1.0]) if frame == 'ned' else np.eye(3)
     calibration = read_calibration(path)
+    calibration = replace(calibration, model=Model(calibration.model.values,
+                                                   calibration.rotation @ axes))
     rotation, gain = calibration.model.rotation, calibration.gain
     heard = bench.listen(Imu, 'imu/data_calibrated')
-    bench.calibrator(calibration_file=path, output_frame_id='base_link')
+    bench.calibrator(calibration_file=path, output_frame_id='base_link', frame=frame)
     sent: list[Imu] = []
 
     def make() -> Imu:

@@ -12,10 +12,11 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+from accel_calib.calibrate import level, set_heading
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import Level, state
+from accel_calib.session import CalibratorSettings, changed, Level, state
 from accel_calib.stored import read_calibration, write_calibration
 from driven import Driver, RATE
 from inside import (
@@ -345,10 +346,10 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
         temperature=np.linspace(20.0, 30.0, 20)))
     driver = Driver(calibration_file=str(path))
-    for temperature, level in ((25.0, Level.OK), (40.0, Level.WARN)):
+    for temperature, severity in ((25.0, Level.OK), (40.0, Level.WARN)):
         driver.session.statistics.temperature = temperature
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
-        assert driver.finding('calibration').level == level
+        assert driver.finding('calibration').level == severity
     assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
         driver.finding('calibration').words)
     calibration = read_calibration(path)
@@ -553,3 +554,63 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
                               temperature=np.repeat(warm, 10))[-1]
     assert state.progress(driver.session).corrected == pytest.approx(
         np.linalg.norm(corrected) / GRAVITY, abs=1e-3)
+
+
+# Frames
+
+
+def levelled(driver: Driver, readings: Readings) -> Any:
+    """Level a sensor that is turned by 40°, with the heading measured; return its ΔR."""
+    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
+    driver.feed(readings([mounting @ [0.0, 0.0, 1.0]], dwell=6.0)[:200])
+    driver.done(driver.session.commands.set_level())
+    driver.feed(readings([mounting @ [-0.6, 0.0, 0.8]], dwell=6.0)[:200])
+    driver.done(driver.session.commands.set_heading())
+    return mounting
+
+
+@pytest.mark.parametrize(('frame', 'axes'), [
+    ('ros', np.eye(3)), ('ned', np.diag([1.0, -1.0, -1.0])),
+    ('android', [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])])
+def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_another(
+        stored: Stored, readings: Readings, frame: str, axes: Any) -> None:
+    path = stored()
+    found = read_calibration(path)
+    write_calibration(path, replace(found, model=Model(found.model.values)))
+    for before in ('ros', frame):
+        driver = Driver(calibration_file=str(path), frame=before)
+        mounting = levelled(driver, readings)
+        driver.session.close()
+    for after in ('ros', frame):
+        driver = Driver(calibration_file=str(path), frame=after)
+        expected = mounting @ (np.eye(3) if after == 'ros' else axes)
+        np.testing.assert_allclose(driver.session.sensor.applied.rotation, expected, atol=0.01)
+        driver.feed(readings([mounting @ [0.0, 0.0, 1.0]], dwell=6.0)[:200])
+        gravity = driver.session.sensor.gravity / GRAVITY
+        np.testing.assert_allclose(gravity, np.array(expected).T @ mounting @ [0, 0, 1],
+                                   atol=0.01)
+        assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
+        driver.done(driver.session.commands.set_level())
+        np.testing.assert_allclose(driver.session.sensor.applied.rotation, expected, atol=0.01)
+        assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
+        driver.session.close()
+
+
+@pytest.mark.parametrize('frame', ['ned', 'win8'])
+def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
+        stored: Stored, frame: Any) -> None:
+    path = stored()
+    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
+    found = replace(read_calibration(path), model=Model(read_calibration(path).model.values))
+    per_g = found.predict(np.array([mounting @ [0, 0, 1.0], mounting @ [-0.6, 0, 0.8]]) * GRAVITY)
+    documents = set_heading(level(found, per_g[0], frame), per_g[1])
+    write_calibration(path, documents)
+    driver = Driver(calibration_file=str(path), frame='ned')
+    np.testing.assert_allclose(driver.session.sensor.applied.rotation,
+                               mounting @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
+    assert f'is for the frame {frame}, but frame is ned: it is turned' in driver.logged('warning')
+
+
+def test_a_frame_whose_readings_are_gravity_is_refused_for_messages() -> None:
+    with pytest.raises(InputError, match="'win8', expected one of ros, ned, android"):
+        changed(CalibratorSettings(), {'frame': 'win8'})

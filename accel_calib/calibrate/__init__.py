@@ -43,11 +43,13 @@ from .context import (
 from .fit import deviations_g, fit_poses, gated, sound_rows, sure_rows, uncertainty_g
 from .mounting import (
     flat_direction,
+    in_frame,
     level,
     level_by_rows,
     mounting_figures,
     mounting_of,
     mounting_words,
+    on_topics,
     set_heading,
     with_given_mounting,
 )
@@ -83,9 +85,10 @@ __all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PR
            'SampleContext', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
            'converted', 'determines', 'deviations_g', 'directions_of', 'errors_after',
            'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
-           'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'level',
-           'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of', 'mounting_only',
-           'mounting_words', 'next_pose', 'of_samples', 'only_norm', 'outlook', 'outside',
-           'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'sample_noise_of',
-           'set_heading', 'sound_rows', 'sure_rows', 'thermal_stream', 'uncertainty_g', 'verify',
-           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise', 'words_of']
+           'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_frame', 'in_g',
+           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
+           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
+           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
+           'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows', 'thermal_stream',
+           'uncertainty_g', 'verify', 'with_given_mounting', 'with_history', 'with_previous',
+           'with_rest_noise', 'words_of']

@@ -17,6 +17,9 @@ frame      axes                                   flat reading  third column of 
 =========  =====================================  ============  ======================
 
 (NED follows AN5286: the reading is positive along gravity, so that a flat pose reads +1 g on z.)
+`ned` and `win8` are conventions of gravity. Messages are specific force, so that `on_topics` turns
+ΔR into another frame for them.
+
 One flat pose does not determine the heading. The heading is zero by the convention of the angles
 of each frame. For `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
 
@@ -61,6 +64,10 @@ _ARBITRARY_HEADING = Finding(
     'defines it is within 10° of the vertical', 'take a second pose with the nose of the robot '
     'down (~/set_heading or --nose-down), or give the mounting (mounting_rpy or base_frame)')
 
+_FORWARD_RIGHT_DOWN = np.diag([1.0, -1.0, -1.0])
+"""From forward-right-down to forward-left-up."""
+
+_SAME_HEADING = 1e-6
 _VERTICAL = 1e-9
 _DIGITS = 9
 _LEAST_HEADING_ANGLE = np.radians(10.0)
@@ -135,6 +142,43 @@ def _triad(first: Floats, second: Floats) -> Floats:
                          'tilt the nose of the robot further down')
     normal = normal / np.linalg.norm(normal)
     return np.column_stack([np.cross(normal, unit), normal, unit])
+
+
+def in_frame(calibration: Calibration, frame: FrameName) -> Calibration:
+    """
+    Return a calibration with the same mounting in another frame.
+
+    A heading that is known stays; one that follows from the convention of the frame follows from
+    that of the other frame.
+
+    """
+    before, rotation = calibration.frame, calibration.rotation
+    if frame == before or not calibration.is_levelled:
+        return calibration
+    flat = rotation @ flat_direction(before)
+    turned = mounting(flat, frame)
+    if not np.allclose(mounting(flat, before), rotation, atol=_SAME_HEADING):
+        turned = with_heading(turned, rotation @ _NOSE_DOWN[before], frame)
+    return replace(calibration, model=Model(calibration.model.values, turned), frame=frame)
+
+
+def on_topics(calibration: Calibration, frame: str) -> Calibration:
+    """
+    Return a calibration with the ΔR of messages, which are specific force (REP-145).
+
+    In `ned`, messages are forward-right-down: those of `ros`, turned by 180° about x. InputError
+    for `win8`, whose readings are gravity.
+
+    """
+    if not calibration.is_levelled or frame in ('ros', 'android'):
+        return calibration
+    if frame == 'win8':
+        raise InputError('the mounting is in the frame win8, whose readings are gravity, but '
+                         'messages are specific force (REP-145), expected ros, ned or android',
+                         'level the calibration again in one of them, or do not rotate')
+    level_up = in_frame(calibration, 'ros')
+    return replace(level_up, model=Model(level_up.model.values,
+                                         level_up.rotation @ _FORWARD_RIGHT_DOWN))
 
 
 def mounting_of(rpy: Sequence[float]) -> Floats:
@@ -232,8 +276,10 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
         rotation = with_heading_of(calibration.rotation, rotation)
     others = without(calibration.noted, 'flat_pose', 'heading')
     levelled = replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
+    asked = kept and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT
+    doubts = () if asked else doubts_about_flat(rotation, frame)  # asked once
     return replace(levelled, noted=(
-        *wiring(levelled), *without(others, 'wiring'), *doubts_about_flat(rotation, frame),
+        *wiring(levelled), *without(others, 'wiring'), *doubts,
         *((_ARBITRARY_HEADING,) if arbitrary else ())))
 
 
@@ -255,11 +301,11 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
     return with_mounting(calibration, rotation)
 
 
-def with_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
-    """Return a calibration with another ΔR, whose heading is known."""
+def with_mounting(calibration: Calibration, rotation: Floats, *known: str) -> Calibration:
+    """Return a calibration with another ΔR; heading and these kinds of findings are known."""
     turned = replace(calibration, model=Model(calibration.model.values, rotation))
     return replace(turned, noted=(*wiring(turned),
-                                  *without(turned.noted, 'wiring', 'heading')))
+                                  *without(turned.noted, 'wiring', 'heading', *known)))
 
 
 def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
@@ -272,7 +318,7 @@ def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibrati
     """
     if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:
         rotation = with_heading_of(rotation, calibration.rotation)
-    return with_mounting(calibration, rotation)
+    return with_mounting(calibration, rotation, 'flat_pose')
 
 
 def _in_sensor_axes(calibration: Calibration, reading: Floats, context: Context | None) -> Floats:

@@ -16,7 +16,7 @@ from rich import box
 from rich.table import Table
 
 from .fit import error_line, short_if_known
-from .frame import Done, plain, rated, rating_lines, table, working
+from .frame import Done, rated, rating_lines, table, working
 from .inputs import intake, rows_between, stored_calibration
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
@@ -30,7 +30,7 @@ from ..findings import (
 )
 from ..stored import read_calibration
 from ..table import check_units
-from ..text import short
+from ..text import plain, short
 from ..units import MG
 
 FAILED = 1

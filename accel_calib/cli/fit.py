@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -16,18 +15,17 @@ from rich.table import Table
 
 from .frame import console, Done, progress, rated, rating_lines, table, working
 from .inputs import given, intake, log_options, plan_of, rows_between, settings
-from ..calibrate import (
-    Calibration,
-    GyroBias,
-    Outlook,
-    outlook,
+from ..calibrate import Calibration, GyroBias, Outlook, outlook
+from ..findings import (
+    calibration_json,
+    effect_figures,
+    linear_figures,
+    Rating,
+    refinement_json,
 )
-from ..estimate import sensing_axes
-from ..findings import effect_figures, linear_figures, Rating
 from ..intake import Intake
 from ..pipeline import calibrated, Outcome
 from ..stored import write_calibration
-from ..table import Floats
 from ..text import counted, short, with_sd
 from ..units import MG
 
@@ -54,7 +52,7 @@ def run_fit(args: argparse.Namespace) -> Done:
                                    stored=str(args.output or 'calibration.yaml'),
                                    notes=found.lines)
         stored.append(f'stored in {args.report}')
-    return Done({'file': args.poses, **calibration_result(calibration, ahead),
+    return Done({'file': args.poses, **calibration_json(calibration, ahead),
                  **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines},
                 [*_shown(found, calibration, ahead), *stored,
                  *rating_lines(rating, args)],
@@ -91,17 +89,15 @@ def error_line(result: dict[str, Any]) -> str:
 
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
-    from .refine import refinement_result
-
     with intake(args, args.log) as found, working('fitting'):
         outcome = calibrated(found.poses, found.units, plan_of(args))
     stored = _stored_outcome(args, found, outcome)
     ahead = outlook(outcome.calibration, 'auto')
     refinement, rating = outcome.refinement, outcome.rating
     return Done(
-        {'file': args.log, **calibration_result(outcome.calibration, ahead), **rated(rating, args),
+        {'file': args.log, **calibration_json(outcome.calibration, ahead), **rated(rating, args),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
-         'refinement': None if refinement is None else refinement_result(refinement)},
+         'refinement': None if refinement is None else refinement_json(refinement)},
         [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
          *rating_lines(rating, args)], BAD_RATING if rating.name == 'BAD' else 0)
 
@@ -151,34 +147,6 @@ def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
     yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
 
 
-def calibration_result(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
-    """Return a calibration for JSON, with what its poses determine."""
-    return {
-        'model': calibration.name, 'method': calibration.method,
-        'units': calibration.units.name, 'sensor': calibration.sensor,
-        'frame': calibration.frame, 'offset': calibration.offset, 'gain': calibration.gain,
-        'rotation': calibration.model.rotation, 'offset_sd': calibration.offset_sd,
-        'gain_sd': calibration.gain_sd, 'parameters': calibration.parameters,
-        'covariance': calibration.covariance,
-        'poses_used': len(calibration.poses) - len(calibration.rejected),
-        'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
-        **asdict(calibration.quality), 'reason': calibration.reason,
-        'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
-        **_outlook(ahead)}
-
-
-def _rest_noise(calibration: Calibration) -> dict[str, Any]:
-    """Return the gyro bias [rad/s] and the noise of a sample for JSON; None if not known."""
-    gyro, noise = calibration.gyro, calibration.noise
-    return {'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
-            'noise_force': noise and _known(noise.force),
-            'noise_rate': noise and _known(noise.rate)}
-
-
-def _known(values: Floats) -> Floats | None:
-    return None if np.isnan(values).all() else values
-
-
 def _gyro_line(gyro: GyroBias) -> str:
     """Return the gyro bias as a line of text, in °/s."""
     values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
@@ -187,34 +155,6 @@ def _gyro_line(gyro: GyroBias) -> str:
              f' at {gyro.temperature:.1f} °C, changes by '
              f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
     return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
-
-
-def _outlook(found: Outlook) -> dict[str, Any]:
-    """Return what the poses determine, and the next pose, for JSON."""
-    seen, asked = found.identifiability, found.next_pose
-    unseen = seen.open_parameters
-    return {
-        'uncertainty_mg': found.uncertainty_mg,
-        'identifiability': {
-            'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
-            'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
-                           for name, deviation in seen.deviations.items()},
-            'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
-                             for open_ in seen.undetermined]},
-        'next_pose': None if asked.direction is None else {
-            'direction': asked.direction, 'words': asked.words}}
-
-
-def _own_names(calibration: Calibration) -> dict[str, Any]:
-    """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
-    if calibration.form.sensing_axes:
-        axes = sensing_axes(calibration.gain, calibration.offset)
-        return {'shifts': axes.shifts, 'scales': axes.scales,
-                'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
-    if 'reference' in calibration.poses:
-        return {'matrix': calibration.gain @ calibration.model.rotation,
-                'shift': calibration.offset}
-    return {}
 
 
 def calibration_lines(calibration: Calibration) -> Iterator[Any]:

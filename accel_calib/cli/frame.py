@@ -34,7 +34,6 @@ import sys
 from textwrap import wrap
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -43,7 +42,7 @@ from .options import BAD_INPUT
 from .terminal import plain_character
 from ..disk import replaceable, write_atomically
 from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
-from ..text import counted
+from ..text import counted, plain
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -206,10 +205,10 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
     """Return a rating for JSON."""
-    return {'rating': rating.name, 'rating_reason': rating.reason,
-            'findings': [each.stated for each in rating.findings],
-            'next': {'kind': rating.next.kind, 'text': rating.next.text,
-                     'command': next_command(rating.next, args)}}
+    from ..findings import rating_json
+
+    step = rating.next
+    return rating_json(rating, step.kind, step.text, next_command(step, args))
 
 
 def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
@@ -262,19 +261,6 @@ def write_json(target: str | None, result: object) -> None:
         print(text)
     else:
         write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
-
-
-def plain(value: object) -> Any:
-    """Convert arrays to lists, numbers that are not finite to None, and paths to text."""
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
 
 
 def _for_each(args: argparse.Namespace) -> list[argparse.Namespace]:

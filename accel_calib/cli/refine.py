@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from .fit import error_line
 from .frame import Done, rated, rating_lines, working
 from .inputs import intake, prior, rows_between, stored_calibration
 from ..effects import effect_named
-from ..findings import rate_refinement
+from ..findings import rate_refinement, refinement_json
 from ..intake import Intake
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
@@ -31,7 +30,7 @@ def run_refine(args: argparse.Namespace) -> Done:
     found, result = _refined(args)
     stored = list(_stored(args, result))
     rating = rate_refinement(result)
-    return Done({'file': args.poses, **refinement_result(result), **rated(rating, args),
+    return Done({'file': args.poses, **refinement_json(result), **rated(rating, args),
                  'read_as': found.read_as},
                 [*found.lines, *_shown(args, result, stored), *rating_lines(rating, args)],
                 refusal=result.refusal if args.output else ())
@@ -98,23 +97,6 @@ def _in_a_line(result: dict[str, Any]) -> str:
     names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
     return (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
             f'{short(result["remaining_gap_mg"])} mg')
-
-
-def refinement_result(result: Refinement) -> dict[str, Any]:
-    """Return a refinement for JSON."""
-    return {
-        'verdict': result.verdict, 'base': result.calibration.name,
-        'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
-        'gap_mg': result.gap_mg,
-        'steps': [{**asdict(step), 'words': effect_named(step.name).words}
-                  for step in result.steps],
-        'remaining_gap_mg': result.remaining_gap_mg,
-        'disturbed_poses': result.disturbed_poses,
-        'not_testable': [{'effect': effect, 'needs': needs}
-                         for effect, needs in result.not_testable],
-        'advice': result.advice, 'plan': result.plan.lines,
-        'warnings': result.calibration.warnings,
-        'refusal': result.refusal[0] if result.refusal else None}
 
 
 def _steps_table(result: Refinement) -> Table:

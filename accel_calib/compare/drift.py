@@ -23,7 +23,8 @@ alternative is a change that began at the third last rest or earlier:
 The likelihood of the alternative is averaged over instants, kinds and sizes. The change may
 continue to vary by `_WANDER` of its size, for example with temperature. By Markov's inequality the
 ratio exceeds `SURE` by chance in at most one of `SURE` rests. One or two knocks are not a lasting
-change; three rests that agree are.
+change; three rests that agree are. A change that was reported is over after `MEMORY` rests in
+succession without it, so that rests in orientations that hide it do not clear it.
 
 """
 
@@ -197,6 +198,8 @@ class Drift:
         The lasting change; None if the sensor is unchanged.
     since : int
         Number of the first rest with the change, 1-based; 0 without a change.
+    without : int
+        Number of rests in succession in which a reported change was clearly absent.
 
     """
 
@@ -208,6 +211,7 @@ class Drift:
     scatter: float = 1.0
     change: LastingChange | None = None
     since: int = 0
+    without: int = 0
 
     @property
     def stated(self) -> float:
@@ -289,10 +293,17 @@ def compared(before: Drift, rest: RestError, least: float) -> Drift:
     found = change(*seen)
     if found is not None and abs(found.error) >= least:
         since = before.since or after.count - found.rests + 1
-        return replace(after, change=found, since=since)
-    if before.change is not None and is_over(before.change, *seen):
-        return replace(after, change=None, since=0)
-    return after
+        return replace(after, change=_of_one_kind(before.change, found), since=since, without=0)
+    if before.change is None or not is_over(before.change, *seen):
+        return replace(after, without=0)
+    if before.without + 1 < MEMORY:
+        return replace(after, without=before.without + 1)
+    return replace(after, change=None, since=0, without=0)
+
+
+def _of_one_kind(before: LastingChange | None, found: LastingChange) -> LastingChange:
+    """Return a change whose kind is clear only if it is the kind of the report before."""
+    return replace(found, clear=found.clear and (before is None or before.kind == found.kind))
 
 
 def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
@@ -328,9 +339,9 @@ def status(state: Drift) -> str:
 
 
 def _kind(found: LastingChange) -> str:
-    """Return a text about what changed, if the orientations of the rests show it."""
+    """Return a text about what changed."""
     if not found.clear:
-        return ''
+        return '; the offset or the gain has changed'
     if len(found.shift) == 1:  # the gain
         return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
     x, y, z = found.shift * MG

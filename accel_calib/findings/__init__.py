@@ -24,6 +24,7 @@ it must not be used. All limits are in `LIMITS`.
 
 from .expected import Expected
 from .figures import (
+    calibration_json,
     change_in_words,
     CROSS,
     effect_figures,
@@ -33,6 +34,8 @@ from .figures import (
     in_words,
     linear_figures,
     OFFSETS,
+    rating_json,
+    refinement_json,
     residual_figures,
     scale_of,
 )
@@ -40,6 +43,6 @@ from .limits import GOOD_MG, Limit, LIMITS
 from .verdicts import rate, rate_comparison, rate_refinement, rate_verification, Rating
 
 __all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'OFFSETS', 'Expected', 'Figure', 'Limit',
-           'Rating', 'change_in_words', 'effect_figures', 'figures_of', 'in_words',
-           'linear_figures', 'rate', 'rate_comparison', 'rate_refinement', 'rate_verification',
-           'residual_figures', 'scale_of']
+           'Rating', 'calibration_json', 'change_in_words', 'effect_figures', 'figures_of',
+           'in_words', 'linear_figures', 'rate', 'rate_comparison', 'rate_refinement',
+           'rate_verification', 'rating_json', 'refinement_json', 'residual_figures', 'scale_of']

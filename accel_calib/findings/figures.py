@@ -6,7 +6,8 @@ The figures of a result: one table of names, units, values and standard deviatio
 
 Every surface shows these figures: terminal, pages, live page, JSON and Parquet. `figures_of` has
 all of a calibration: its residuals [mg], V and W in the unit of the readings, and the values of
-the other effects in the units of the catalogue.
+the other effects in the units of the catalogue. The functions at the end make the JSON of results,
+for the command line and the topic ``~/result``.
 
 The parameters of `accel_calib.compare` do not depend on the axes of the model. `scale_of` states
 how they are shown: offsets in mg, gains minus 1 and cross-axis gains in %. For native units, 1 g
@@ -17,14 +18,21 @@ is the mean of the sensitivities.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, Quality, Verification
+from ..calibrate import Calibration, Outlook, Quality, Verification
 from ..effects import AXES, effect_named, LADDER, value_unit
+from ..estimate import sensing_axes
+from ..table import Floats
 from ..text import signed
 from ..units import MG
+
+if TYPE_CHECKING:
+    from .verdicts import Rating
+    from ..refine import Refinement
 
 OFFSETS = ('offset.x', 'offset.y', 'offset.z')
 GAINS = ('gain.x', 'gain.y', 'gain.z')
@@ -125,3 +133,83 @@ def change_in_words(name: str, change: float, sd: float) -> str:
     """Return the change of a parameter as ``+value ± sd unit``."""
     _, factor, unit = scale_of(name)
     return signed(change * factor, sd * factor, unit)
+
+
+def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
+    """Return a calibration for JSON, with what its poses determine."""
+    return {
+        'model': calibration.name, 'method': calibration.method,
+        'units': calibration.units.name, 'sensor': calibration.sensor,
+        'frame': calibration.frame, 'offset': calibration.offset, 'gain': calibration.gain,
+        'rotation': calibration.model.rotation, 'offset_sd': calibration.offset_sd,
+        'gain_sd': calibration.gain_sd, 'parameters': calibration.parameters,
+        'covariance': calibration.covariance,
+        'poses_used': len(calibration.poses) - len(calibration.rejected),
+        'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
+        **asdict(calibration.quality), 'reason': calibration.reason,
+        'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
+        **_outlook(ahead)}
+
+
+def _rest_noise(calibration: Calibration) -> dict[str, Any]:
+    """Return the gyro bias [rad/s] and the noise of a sample for JSON; None if not known."""
+    gyro, noise = calibration.gyro, calibration.noise
+    return {'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
+            'noise_force': noise and _known(noise.force),
+            'noise_rate': noise and _known(noise.rate)}
+
+
+def _known(values: Floats) -> Floats | None:
+    return None if np.isnan(values).all() else values
+
+
+def _outlook(found: Outlook) -> dict[str, Any]:
+    """Return what the poses determine, and the next pose, for JSON."""
+    seen, asked = found.identifiability, found.next_pose
+    unseen = seen.open_parameters
+    return {
+        'uncertainty_mg': found.uncertainty_mg,
+        'identifiability': {
+            'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
+            'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
+                           for name, deviation in seen.deviations.items()},
+            'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
+                             for open_ in seen.undetermined]},
+        'next_pose': None if asked.direction is None else {
+            'direction': asked.direction, 'words': asked.words}}
+
+
+def _own_names(calibration: Calibration) -> dict[str, Any]:
+    """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
+    if calibration.form.sensing_axes:
+        axes = sensing_axes(calibration.gain, calibration.offset)
+        return {'shifts': axes.shifts, 'scales': axes.scales,
+                'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
+    if 'reference' in calibration.poses:
+        return {'matrix': calibration.gain @ calibration.model.rotation,
+                'shift': calibration.offset}
+    return {}
+
+
+def refinement_json(result: Refinement) -> dict[str, Any]:
+    """Return a refinement for JSON."""
+    return {
+        'verdict': result.verdict, 'base': result.calibration.name,
+        'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
+        'gap_mg': result.gap_mg,
+        'steps': [{**asdict(step), 'words': effect_named(step.name).words}
+                  for step in result.steps],
+        'remaining_gap_mg': result.remaining_gap_mg,
+        'disturbed_poses': result.disturbed_poses,
+        'not_testable': [{'effect': effect, 'needs': needs}
+                         for effect, needs in result.not_testable],
+        'advice': result.advice, 'plan': result.plan.lines,
+        'warnings': result.calibration.warnings,
+        'refusal': result.refusal[0] if result.refusal else None}
+
+
+def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str, Any]:
+    """Return a rating for JSON, with the kind of the next step, its words and its command."""
+    return {'rating': rating.name, 'rating_reason': rating.reason,
+            'findings': [each.stated for each in rating.findings],
+            'next': {'kind': kind, 'text': text, 'command': command}}

@@ -26,6 +26,7 @@ from .correction import corrected, output_frame, output_scale
 from ..calibrate import (
     Calibration,
     check_sensor,
+    on_topics,
     Outside,
     SampleContext,
 )
@@ -94,7 +95,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     InputError
         If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
         that the calibration needs, if the readings are clearly in another unit, if only one of
-        calibration and messages is in native units, or if `out` exists.
+        calibration and messages is in native units, if the mounting is in the frame win8, or if
+        `out` exists.
     StoredCalibrationError
         If the calibration belongs to another sensor.
     OSError
@@ -108,7 +110,7 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         name = bag.imu_topic(topic)
         sensor = bag.first_frame_id(name)
         check_sensor(calibration, sensor)
-        calibration = calibration.in_units(units)
+        calibration = on_topics(calibration.in_units(units), calibration.frame)
         context = context_of(bag, name, sensor, temperature_topic, supply_topic)
         context = context.needed(bag, calibration.model.needs)
         with _new(out) as folder:

@@ -252,17 +252,23 @@ def _separating(step: Step) -> str:
             f'{TO_SEPARATE[family]}')
 
 
+def times_typical(step: Step) -> float:
+    """Return the largest value of an effect relative to that of typical parts; 0: not known."""
+    if step.effect == EMPIRICAL:
+        return 0.0
+    effect = effect_named(step.name)
+    return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
+               default=0.0) / effect.typical
+
+
 def _remarks(step: Step) -> list[str]:
     """Return a remark on values that are far larger than in common parts."""
-    if step.effect == EMPIRICAL:
+    times = times_typical(step)
+    if times <= _FAR:
         return []
     effect = effect_named(step.name)
-    largest = max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
-                  default=0.0)
-    if largest <= _FAR * effect.typical:
-        return []
-    return [f'{step.effect} is {largest:.2g} {effect.unit}, typical parts have about '
-            f'{effect.typical:.2g}: check that the sensor causes it, and not the setup']
+    return [f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical parts have '
+            f'about {effect.typical:.2g}: check that the sensor causes it, and not the setup']
 
 
 def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,

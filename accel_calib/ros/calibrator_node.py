@@ -31,11 +31,20 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from .declare import declared, follow, LATCHED, mismatches, name_of, SENSOR, STREAM
+from .declare import (
+    declared,
+    follow,
+    LATCHED,
+    mismatches,
+    name_of,
+    published_by_others,
+    SENSOR,
+    STREAM,
+)
 from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
 from .stream import Stream
 from .transforms import MountingBroadcaster, watch_static
@@ -48,6 +57,7 @@ from ..session import (
     Log,
     LogFilter,
     Mounting,
+    Result,
     Session,
     ShowPoses,
     state,
@@ -95,13 +105,15 @@ class Calibrator:
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
+        self._result = node.create_publisher(String, '~/result', LATCHED)
         self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._overrides = QoSOverridingOptions.with_default_policies()
         outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
                    self._published(Vector3Stamped, '~/linear_acceleration')]
         self.stream = Stream(self.session, outputs, self._handle_events)
         self._heard: list[Any] = []
-        self._said = [*outputs, self._still, self._poses, self._progress, self._diagnostics]
+        self._said = [*outputs, self._still, self._poses, self._progress, self._result,
+                      self._diagnostics]
         self._page = Page(node, self.session, self.stream, self._worker, call_soon, self._log)
         self._still.publish(Bool(data=False))
         self._serve()
@@ -153,6 +165,8 @@ class Calibrator:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
+        self.session.imus, self.session.thermometers = (
+            published_by_others(self._node, kind) for kind in (Imu, Temperature))
         self.session.mismatches = mismatches(self._node, self._heard, self._said)
         self.stream.flush()
         self.session.tick()
@@ -197,6 +211,8 @@ class Calibrator:
             self._page.show_poses(event)
         elif isinstance(event, Mounting):
             self._broadcast(event)
+        elif isinstance(event, Result):
+            self._result.publish(String(data=event.text))
         else:
             self._worker.run(event, self._on_done)
 

@@ -108,6 +108,15 @@ def name_of(endpoint: TopicEndpointInfo) -> str:
     return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
 
 
+def published_by_others(node: Node, kind: Any) -> tuple[str, ...]:
+    """Return the topics with messages of a type that other nodes publish."""
+    name, own = f'sensor_msgs/msg/{kind.__name__}', (node.get_namespace(), node.get_name())
+    topics = [topic for topic, kinds in node.get_topic_names_and_types() if name in kinds]
+    return tuple(topic for topic in topics
+                 if any((each.node_namespace, each.node_name) != own
+                        for each in node.get_publishers_info_by_topic(topic)))
+
+
 def mismatches(node: Node, subscriptions: Iterable[Any], publishers: Iterable[Any]
                ) -> tuple[str, ...]:
     """

@@ -162,7 +162,7 @@ class Stream:
         gyro = session.sensor.gyro if session.settings.gyro_bias else None
         bias = _NO_BIAS if gyro is None else gyro.at(self._temperature)
         for output, calibration in ((self._calibrated, self._applied),
-                                    (self._preview, self._offered)):
+                                    (self._preview, session.sensor.previewed)):
             output.prepare(self._layout, calibration, session)
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())

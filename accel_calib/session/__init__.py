@@ -35,6 +35,7 @@ from .worker import (
     Log,
     LogFilter,
     Mounting,
+    Result,
     Severity,
     ShowPoses,
     Step,
@@ -45,7 +46,7 @@ from .worker import (
 )
 
 __all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
-           'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Session',
-           'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
+           'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',
+           'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
            'WorkerProcess', 'changed', 'checks', 'default_of', 'expected', 'figures', 'parameter',
            'state', 'title', 'words_of_state', 'worst']

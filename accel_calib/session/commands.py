@@ -19,10 +19,11 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import next_action
+from .guidance import is_partial, next_action
 from .sensor import Sensor
 from .store import Store, writing_advice
-from .work import at_rest, change_words, fit, Fitted, is_partial, plan_for, refined
+from .stream import thermometer_words
+from .work import at_rest, change_words, fit, Fitted, plan_for, refined
 from .worker import Calibrations, Compute, Files, Found, Part, Task
 from ..calibrate import (
     Calibration,
@@ -176,7 +177,7 @@ class Commands:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
         fitted = yield from self._sound('refine', refined, session.units, session.name,
-                                        session.sensor.present)
+                                        session.sensor.present, thermometer_words(session))
         session.sensor.guide.follow(fitted.planned)
         return (yield from self._use_fit(fitted, offered=offered))
 
@@ -215,8 +216,11 @@ class Commands:
         rest = self._rest()
         headed = set_heading(calibration, rest.mean,
                              self._session.sensor.context_of(rest, calibration))
-        return (yield from self._use_mounting(headed, ['the heading is set by this pose'],
-                                              offered=offered))
+        words = ['the heading is set by this pose']
+        if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
+            words.append('the front of the robot is now on the other side of the sensor: if the '
+                         'nose was up, tilt it down and call ~/set_heading again')
+        return (yield from self._use_mounting(headed, words, offered=offered))
 
     def calibrate_at_rest(self, *, offered: bool = False) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
@@ -234,7 +238,7 @@ class Commands:
     def _levelled(self, calibration: Calibration, rest: Dwell) -> Calibration:
         """Return a calibration levelled by a rest; check it against the given mounting."""
         session = self._session
-        levelled = level(calibration, rest.mean, session.settings.frame,
+        levelled = level(calibration, rest.mean, session.frame,
                          session.sensor.context_of(rest, calibration))
         if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
             raise InputError('this pose differs by more than 10° of tilt from the mounting in '

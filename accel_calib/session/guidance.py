@@ -21,8 +21,8 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from .stream import stream_faults
-from ..calibrate import NextPose
+from .stream import slow_turn, stream_faults
+from ..calibrate import NextPose, PRIOR
 from ..compare import status
 from ..errors import InputError
 from ..finding import NextStep
@@ -33,9 +33,14 @@ from ..units import MG, Units
 if TYPE_CHECKING:
     from .sensor import Sensor
     from .session import Session
+    from ..calibrate import Calibration
 
 _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
+
+
+FEWEST_IN_CONE = 4
+"""Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
 
 
 class _Figure(NamedTuple):
@@ -328,7 +333,33 @@ def next_action(session: Session) -> Action | None:
         words = '; '.join(faults[name] for name in names if name in faults)
         if words:
             return Action(kind, words)
-    return action
+    if action is None or action.kind != 'poses':
+        return action
+    action, held = _within_reach(session, action), slow_turn(session)
+    return replace(action, words=f'{held}; {action.words}') if held else action
+
+
+def _within_reach(session: Session, action: Action) -> Action:
+    """Return a step that a robot which cannot be turned further can do, too."""
+    sensor = session.sensor
+    if not sensor.is_stuck(session.statistics.stamp) or sensor.has_changed:
+        return action
+    present = sensor.present
+    if present is None and not sensor.refused_advice and sensor.guide.poses >= FEWEST_IN_CONE:
+        return Action('poses', f'{action.words}; if it cannot be turned further, call ~/fit',
+                      'fit')
+    if present is None:
+        return Action('poses', f'{action.words}; if it cannot be turned over, place the robot '
+                      'level, hold it still and call ~/calibrate_at_rest', 'calibrate_at_rest')
+    if not is_partial(present):
+        return action
+    return (Action('done', f'use the calibration in these orientations; for others: '
+                   f'{action.words}') if present.is_levelled else _level_step())
+
+
+def is_partial(calibration: Calibration) -> bool:
+    """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
+    return calibration.method == PRIOR or not calibration.model.effects
 
 
 def _with_sensor(sensor: Sensor) -> Action | None:
@@ -346,6 +377,9 @@ def _with_sensor(sensor: Sensor) -> Action | None:
         return None
     if rating is not None and rating.name == 'GOOD':
         return _after_good(sensor, rating.next)
+    if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
+        return Action('level', f'{rating.reason}; if it is mounted so, place it level again and '
+                      'call ~/set_level once more', 'set_level')
     if sensor.refused_advice:
         return Action('poses', sensor.refused_advice)
     if rating is None or not sensor.all_fitted:
@@ -353,9 +387,13 @@ def _with_sensor(sensor: Sensor) -> Action | None:
     return _calling(rating.next.kind, rating.next.text)
 
 
+def _level_step() -> Action:
+    return Action('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
+                  'alone is done', 'set_level')
+
+
 def _after_good(sensor: Sensor, after: NextStep) -> Action:
     """Return the step after a good fit."""
     if sensor.calibration is not None and not sensor.calibration.is_levelled:
-        return Action('level', 'place the robot level, hold it still and call ~/set_level; a '
-                      'sensor alone is done', 'set_level')
+        return _level_step()
     return Action('done', after.text if after.kind == 'done' else 'use the calibration')

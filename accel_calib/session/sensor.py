@@ -31,7 +31,15 @@ from .guidance import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
 from .settings import CalibratorSettings, capture_settings
 from .stream import StreamStatistics
-from ..calibrate import Calibration, GyroBias, Outside, outside, SampleNoise, thermal_stream
+from ..calibrate import (
+    Calibration,
+    GyroBias,
+    on_topics,
+    Outside,
+    outside,
+    SampleNoise,
+    thermal_stream,
+)
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rest_errors
 from ..effects import Context, Model, ThermalStream
@@ -47,6 +55,9 @@ if TYPE_CHECKING:
 
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
+
+_WITHOUT_NEW = 60.0
+"""Time without a new pose after which the robot probably cannot be turned further [s]."""
 
 _NONE = np.zeros((1, 3))
 _AT_REST: Triple = (0.0, 0.0, 0.0)
@@ -67,9 +78,10 @@ class Sensor:
     calibration : Calibration or None
         The calibration in use.
     applied : Calibration or None
-        The calibration that corrects messages: without the mounting if `rotates` is false.
-    offered : Calibration or None
-        A calibration that waits for ~/save or ~/undo.
+        The calibration that corrects messages: in their frame, or without the mounting if
+        `rotates` is false.
+    offered, previewed : Calibration or None
+        A calibration that waits for ~/save or ~/undo, and the same in the frame of messages.
     rating : Rating or None
         Rating of the calibration that is offered or in use; None while it is not known.
     refinement : Refinement or None
@@ -101,6 +113,7 @@ class Sensor:
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None
         self.offered: Calibration | None = None
+        self.previewed: Calibration | None = None
         self.rating: Rating | None = None
         self.refinement: Refinement | None = None
         self.changes = self.fitted_poses = 0
@@ -110,11 +123,12 @@ class Sensor:
         self.scale = 1.0
         self.rest: Dwell | None = None
         self.gravity: Floats | None = None
-        self._g, self._rotates = settings.gravity, settings.rotate
+        self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
         self._refused = 0, ''
+        self._new_pose = 0, math.inf
         self._prepared: tuple[Calibration, OneReading] | None = None
 
     @property
@@ -126,6 +140,16 @@ class Sensor:
     def all_fitted(self) -> bool:
         """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
         return 0 < self.guide.poses == self.fitted_poses and not self.guide.follows
+
+    def note_poses(self, stamp: float) -> None:
+        """Note the time of a new pose, by header stamps [s]."""
+        count = len(self.live.book.poses())
+        if count != self._new_pose[0]:
+            self._new_pose = count, stamp
+
+    def is_stuck(self, stamp: float) -> bool:
+        """Return whether a fit is refused, or no pose has been new for a minute."""
+        return bool(self.refused_advice) or stamp - self._new_pose[1] >= _WITHOUT_NEW
 
     def refuse(self, advice: str) -> None:
         """Note that a fit to the present poses is refused, and what to do."""
@@ -148,6 +172,7 @@ class Sensor:
     def offer(self, calibration: Calibration | None) -> None:
         """Publish this calibration on ~/preview only; None: discard the offered one."""
         self.offered = calibration
+        self.previewed = calibration and on_topics(calibration, self._frame)
         self.changes += 1
 
     def adopt(self, calibration: Calibration | None) -> None:
@@ -165,8 +190,9 @@ class Sensor:
     def set_rotates(self, rotates: bool) -> None:
         """Turn corrected messages into the levelled frame, or leave them in that of the sensor."""
         self._rotates, self.applied = rotates, self.calibration
-        if self.calibration is not None and not rotates:
-            self.applied = self.calibration.in_sensor_frame
+        if self.calibration is not None:
+            self.applied = (on_topics(self.calibration, self._frame) if rotates
+                            else self.calibration.in_sensor_frame)
         self._hold()
 
     @property
@@ -218,6 +244,10 @@ class Sensor:
     def _compare(self, least: float) -> None:
         part = None if self.rest is None else self._uncounted(self.rest)
         self.drift = self._past if part is None else self._with(part, least)
+        found, past = self.drift, self._past
+        if found is not None and past is not None and found.change and not past.change:
+            # What was reported during a rest ends by the rule of `drift`, not with the rest.
+            self._past = replace(past, change=found.change, since=found.since)
 
     def _uncounted(self, rest: Dwell) -> Dwell | None:
         """Return the part of a rest that was not counted yet, or None if it is too short."""
@@ -259,12 +289,18 @@ class Sensor:
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
-        """Return the quantities that are outside of the range of the calibration now."""
+        """
+        Return the quantities that are outside of the range of the calibration now.
+
+        The time leaves its range for ever, and the last value holds: no pose can be taken there.
+
+        """
         if self.calibration is None:
             return {}
         now = {key: np.array([value]) for key, value in {
             **known, 'std': np.zeros(3), **self.temperatures.columns}.items()}
-        return {key: each for key, each in outside(self.calibration, now).items() if each.count}
+        return {key: each for key, each in outside(self.calibration, now).items()
+                if each.count and key != 'time'}
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""

@@ -14,6 +14,7 @@ uses a steady clock.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+import json
 import math
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -28,7 +29,7 @@ from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
 from .store import Store, writing_advice
 from .stream import AGAIN, Reports, SILENT, StreamStatistics
-from .work import plan_for, rated
+from .work import plan_for, rated, result_of
 from .worker import (
     Calibrations,
     Compute,
@@ -36,14 +37,24 @@ from .worker import (
     Files,
     Log,
     Mounting,
+    Result,
     Severity,
     ShowPoses,
     Still,
     Task,
 )
-from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..calibrate import (
+    Calibration,
+    FrameName,
+    in_frame,
+    mounting_of,
+    mounting_words,
+    on_topics,
+    with_given_mounting,
+)
 from ..compare import status
 from ..errors import InputError
+from ..findings import rating_json
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import units_of
@@ -87,6 +98,8 @@ class Session:
         Whether messages are corrected.
     publishers : tuple of str or None
         Names of the nodes that publish the messages; None: the samples come from a board.
+    imus, thermometers : tuple of str
+        Topics with messages of Imus and of temperatures that other nodes publish.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     computing : int
@@ -113,6 +126,8 @@ class Session:
         self.problem = ''
         self.publishers: tuple[str, ...] | None = ()
         self.mismatches: tuple[str, ...] = ()
+        self.imus: tuple[str, ...] = ()
+        self.thermometers: tuple[str, ...] = ()
         self.enabled, self.still, self.still_since = True, False, math.nan
         self.computing, self.ended = 0, False
         _check_frames(settings)
@@ -125,6 +140,11 @@ class Session:
             if store is not None:
                 self._adopt_loaded(load(store))
         self._show_poses(store=False)
+
+    @property
+    def frame(self) -> FrameName:
+        """Levelled frame of calibrations; messages in `ned` are those of `ros`, turned."""
+        return 'ros' if self.settings.frame == 'ned' else self.settings.frame
 
     @property
     def name(self) -> str:
@@ -157,6 +177,8 @@ class Session:
         self._report_still()
         self.reports.faults()
         self.reports.limits()
+        self.reports.hand()
+        self.reports.thermometers()
         self._events += self.commands.due()
 
     def close(self) -> None:
@@ -236,9 +258,9 @@ class Session:
         if sensor.drift is not None and sensor.has_changed is not before:
             self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
         if change.doubted:
-            self.log('warning', f'the sensor may have moved during '
-                     f'{counted(change.doubted, "pose")}, according to later rests; a fit '
-                     'leaves out such poses if the others are sufficient')
+            self.log('warning', f'{counted(change.doubted, "pose")} taken while the sensor moved '
+                     'or vibrated, as by motors: later rests are quieter; a fit leaves out such '
+                     'poses if the others are sufficient')
         if change.poses:
             new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
             self.poses_changed(ended=bool(change.ended), new_rest=new)
@@ -266,13 +288,12 @@ class Session:
 
     def _show_frame(self) -> None:
         """Show poses and mounting in the frame of the sensor, which was not known before."""
-        frame_id, calibration = self.frame_id, self.sensor.calibration
+        frame_id = self.frame_id
         if frame_id and frame_id == self.settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
-        if frame_id and calibration is not None and calibration.is_levelled:
-            self._events.append(Mounting(calibration.rotation, frame_id))
+        self._show_mounting()
         plan = self.sensor.guide.plan
         if plan is not None:
             self._events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
@@ -326,6 +347,11 @@ class Session:
             self.sensor.adopt(None)
             self.rate(None)
             return
+        if calibration.is_levelled and calibration.frame != self.frame:
+            self.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
+                     f'frame is {self.settings.frame}: it is turned, and a measured heading is '
+                     'kept')
+            calibration = in_frame(calibration, self.frame)
         stored, calibration = calibration, self.with_given(calibration)
         if stored.is_levelled and not np.allclose(stored.rotation[:, 2],
                                                   calibration.rotation[:, 2]):
@@ -333,11 +359,18 @@ class Session:
                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.sensor.adopt(calibration)
         self.rate(refinement, rating)
-        self.log('info', f'correcting with {title(calibration)}')
+        levelled = calibration.is_levelled and self.settings.rotate
+        self.log('info', f'correcting with {title(calibration)}; messages are in the frame '
+                 f'{self.settings.frame if levelled else "of the sensor"}')
         for finding in calibration.noted:
             self.log(_SEVERITY[finding.level], finding.words)
-        if calibration.is_levelled:
-            self._events.append(Mounting(calibration.rotation, self.frame_id or ''))
+        self._show_mounting()
+
+    def _show_mounting(self) -> None:
+        calibration = self.sensor.calibration
+        if self.frame_id and calibration is not None and calibration.is_levelled:
+            levelled = on_topics(calibration, self.settings.frame)
+            self._events.append(Mounting(levelled.rotation, self.frame_id))
 
     def offer(self, calibration: Calibration | None, refinement: Refinement | None = None,
               rating: Rating | None = None) -> None:
@@ -346,19 +379,28 @@ class Session:
         self.rate(refinement, rating)
 
     def rate(self, refinement: Refinement | None, rating: Rating | None = None) -> None:
-        """Note the rating of the present calibration; add a task for it if it is not known."""
+        """Add a task that rates the present calibration, if need be, and reports it as JSON."""
         sensor = self.sensor
         sensor.refinement = refinement
         if rating is not None or sensor.present is None:
             sensor.rating = rating
-        else:
-            self._events.append(self._rated(sensor, sensor.present))
+        if sensor.present is not None:
+            self._events.append(self._rated(sensor, sensor.present, rating))
 
-    def _rated(self, sensor: Sensor, calibration: Calibration) -> Task:
-        """Rate a calibration, and note the rating unless another one has replaced it."""
-        rating: Rating = yield Compute(rated, calibration, sensor.refinement)
-        if sensor.present is calibration:
-            sensor.rating = rating
+    def _rated(self, sensor: Sensor, calibration: Calibration, rating: Rating | None) -> Task:
+        """Rate a calibration, and report it, unless another one has replaced it."""
+        refinement = sensor.refinement
+        if rating is None:
+            rating = yield Compute(rated, calibration, refinement)
+            if sensor.present is calibration:
+                sensor.rating = rating
+        found = yield Compute(result_of, calibration, refinement, self.settings.model)
+        action = next_action(self)
+        if rating is not None and action is not None and sensor.present is calibration:
+            service = f'~/{action.command}' if action.command else ''
+            self._events.append(Result(json.dumps({
+                **found, 'in_use': sensor.offered is not calibration,
+                **rating_json(rating, action.kind, action.words, service)})))
         return ''
 
     def set_mounting(self, rotation: Floats) -> None:
@@ -380,6 +422,7 @@ class Session:
 
     def poses_changed(self, *, ended: bool, new_rest: bool = False) -> None:
         """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
+        self.sensor.note_poses(self.statistics.stamp)
         self._show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True

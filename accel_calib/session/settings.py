@@ -124,6 +124,7 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
 
 _MODELS = tuple(name for name in MODEL_NAMES
                 if name not in MODELS or not MODELS[name].known_orientation)
+_FRAMES = tuple(name for name in FRAMES if name != 'win8')  # its readings are gravity
 _CAPTURE = CaptureSettings()
 
 
@@ -147,7 +148,8 @@ class CalibratorSettings:
         'leaves out outliers, or the algebraic cost function of AN5286', choices=METHODS,
         live=True)
     frame: FrameName = parameter(
-        'ros', 'Levelled frame for ~/set_level', choices=FRAMES)
+        'ros', 'Levelled frame of the messages, which are specific force (REP-145): ros is '
+        'forward-left-up, ned forward-right-down, android right-forward-up', choices=_FRAMES)
     rotate: bool = parameter(
         True, 'Turn corrected messages into the levelled frame once the mounting is known. false: '
         'correct offset and gain alone, and stay in the frame of the sensor', live=True)

@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import next_action, Progress
+from .guidance import is_partial, next_action, Progress
 from .sensor import title
 from .stream import SILENT, stream_faults
-from .work import is_partial
 from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
 from ..finding import has
@@ -151,6 +150,9 @@ def _calibration(session: Session) -> Check:
     sensor = session.sensor
     if session.problem:
         return Check('calibration', Level.ERROR, session.problem)
+    if not session.enabled:
+        return Check('calibration', Level.WARN, f'{words_of_state(session)}: call ~/enable with '
+                     'true to correct them')
     if sensor.calibration is None:
         count = counted(len(sensor.live.book.poses()), 'pose')
         state = '' if sensor.offered else f'no calibration yet, captured {count}: '

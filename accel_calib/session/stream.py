@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 _SPAN = 5.0
 """Time over which rate and faults are counted [s]."""
 
+_HELD = 3.0
+"""Time without shaking after which a sensor that is not still is turning slowly [s]."""
+
+_TURNS = 0.1
+"""Slowest turn that is reported [°/s]; the noise of the readings looks like slower ones."""
+
 SILENT = 2.0
 """Time without messages after which the stream counts as silent [s]."""
 
@@ -78,6 +84,7 @@ class StreamStatistics:
         self.reading: Floats | None = None
         self.newest: Floats | None = None
         self._batches: deque[_Batch] = deque()
+        self._track: deque[tuple[float, Floats, float]] = deque()
 
     def add(self, rows: Floats, arrived: float) -> None:
         """Count messages; parameters as in `Session.push`."""
@@ -94,6 +101,19 @@ class StreamStatistics:
         self.stamp, self.arrived = float(stamps[-1]), arrived
         self.reading, self.newest = rows[:, 1:4].mean(axis=0), rows[-1, 1:4]
         self.spread = float(np.max(rows[:, 1:4].std(axis=0)))
+        self._track.append((self.stamp, self.reading, self.spread))
+        while not 0.0 <= self.stamp - self._track[0][0] <= _HELD:
+            self._track.popleft()
+
+    def turn_rate(self, threshold: float, expected: float) -> float:
+        """Return the rate of a slow turn without shaking [°/s]; 0 if there is none."""
+        if self._track and (max(spread for *_, spread in self._track) < threshold
+                            and self.stamp - self._track[0][0] > 0.8 * _HELD):
+            means = np.array([mean for _, mean, _ in self._track])
+            way = float(np.sum(np.linalg.norm(np.diff(means, axis=0), axis=1))) / expected
+            rate = math.degrees(way) / (self.stamp - self._track[0][0])
+            return rate if rate > _TURNS else 0.0
+        return 0.0
 
     def drop(self, name: str, count: int = 1) -> None:
         """Count dropped messages; `name` is ``not_finite``, ``foreign`` or ``implausible``."""
@@ -159,6 +179,24 @@ class StreamStatistics:
         return ''
 
 
+def thermometer_words(session: Session) -> str:
+    """Return how the node would get a temperature; empty if it has one."""
+    if math.isfinite(session.statistics.temperature):
+        return ''
+    topics = ' or '.join(session.thermometers)
+    return (f'restart the node with temperature:={topics}' if topics else
+            'publish the temperature of the sensor on the topic temperature')
+
+
+def slow_turn(session: Session) -> str:
+    """Return that the sensor turns slowly, and what to do; empty if it is still or shaken."""
+    statistics, live = session.statistics, session.sensor.live
+    if live.still or session.units.is_native or statistics.age > SILENT:
+        return ''
+    rate = statistics.turn_rate(live.detector.threshold, session.units.per_g)
+    return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
+
+
 _DROPPED_SHOWN_FOR = 60.0
 """Duration of the warning after a dropped message [s]."""
 
@@ -172,7 +210,7 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 def stream_faults(session: Session) -> dict[str, str]:
     """Return by kind what is wrong with the messages, and what to do."""
     statistics, topic, publishers = session.statistics, session.topic, session.publishers
-    silence = '' if session.mismatches else _silence(statistics, topic, publishers)
+    silence = '' if session.mismatches else _silence(statistics, topic, publishers, session.imus)
     faults = {
         'publishers': _publishers(topic, publishers), 'mismatches': '; '.join(session.mismatches),
         'silence' if publishers else 'no_publisher': silence, 'stamps': statistics.stamp_fault,
@@ -185,10 +223,12 @@ def _publishers(topic: str, names: Sequence[str] | None) -> str:
         return ''
     count = 'two' if len(names) == 2 else str(len(names))
     return (f'{count} publishers on the topic {topic}: {", ".join(names)}; expected one sensor: '
-            'stop the others, or give each sensor its own topic')
+            'stop the others, or give each sensor its own topic; a driver that was killed '
+            'disappears after about 20 s')
 
 
-def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str] | None) -> str:
+def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str] | None,
+             imus: Sequence[str]) -> str:
     if min(statistics.age, statistics.dropped_ago) <= SILENT:
         return ''
     if publishers is None:
@@ -197,8 +237,9 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
     if publishers:
         return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
                 'the driver')
+    there = f', such as {" or ".join(imus)}' if imus else ''
     return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
-            'imu/data_raw to its topic')
+            f'imu/data_raw to its topic{there}')
 
 
 def _dropped(statistics: StreamStatistics) -> dict[str, str]:
@@ -284,6 +325,20 @@ class Reports:
                     f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
                     f'limits of {key}', _FAULT_AGAIN)
         self._left = frozenset(left)
+
+    def hand(self) -> None:
+        """Log that the sensor turns slowly while a pose is waited for."""
+        words = slow_turn(self._session)
+        if words and self._session.settings.auto_capture:
+            self._session.log('info', f'no pose yet: {words}', 'slow_turn', AGAIN)
+
+    def thermometers(self) -> None:
+        """Log which temperatures are published if none arrives."""
+        session = self._session
+        if (session.thermometers and session.statistics.messages
+                and math.isnan(session.statistics.temperature)):
+            session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
+                        'thermometers', 10.0 * _FAULT_AGAIN)
 
     def faults(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
+from typing import Any, cast
 
 import numpy as np
 
-from .guidance import Plan
+from .guidance import FEWEST_IN_CONE, is_partial, Plan
 from .sensor import gyro_bias_of_rest
 from .settings import CalibratorSettings
 from ..calibrate import (
@@ -22,25 +23,25 @@ from ..calibrate import (
     level,
     lies_in_cone,
     next_pose,
-    PRIOR,
+    outlook,
 )
 from ..capture import Dwell, poses_from
 from ..effects import LADDER, Model
 from ..errors import RefusedFitError
 from ..estimate import coverage, fit_sphere, pose_noise
-from ..findings import rate, rate_refinement, Rating
+from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
 from ..geometry import spread_directions
 from ..refine import PlannedPose, refine, Refinement, refitted
-from ..refine.words import residual_words, verdict_words
+from ..refine.words import residual_words, times_typical, verdict_words
 from ..table import Floats, Poses
-from ..text import counted, listed, now
+from ..text import counted, listed, now, plain
 from ..units import MG, Units
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
 
-_FEWEST_IN_CONE = 4
-"""Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
+_BEYOND = 100.0
+"""Ratio to the typical size above which an effect is not caused by the sensor."""
 
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
@@ -95,7 +96,7 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
     """
     full = before is not None and not is_partial(before)
     up = poses_up(poses, units)
-    few = not units.is_native and len(up) >= _FEWEST_IN_CONE and lies_in_cone(up)
+    few = not units.is_native and len(up) >= FEWEST_IN_CONE and lies_in_cone(up)
     if before is not None and is_refined(before):
         calibration = refitted(before, poses, sensor=sensor, date=now())
     elif few and not full:
@@ -111,11 +112,6 @@ def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str
     headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
                      frame=before.frame)
     return level(headed, reading, before.frame, context)
-
-
-def is_partial(calibration: Calibration) -> bool:
-    """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
-    return calibration.method == PRIOR or not calibration.model.effects
 
 
 def is_refined(calibration: Calibration) -> bool:
@@ -173,16 +169,24 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None) -> Fitted:
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = ''
+            ) -> Fitted:
     """
     Return the refinement of a calibration (None: of a fit).
 
+    An effect far beyond those of parts is refused; `hint` says which quantity may be missing.
     RefusedFitError if there are too few poses; InputError if the readings are clearly in another
     unit.
 
     """
     refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
                         date=now())
+    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
+    if beyond and not refinement.refusal:
+        refinement = replace(refinement, refusal=(
+            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
+            f'find what else changed with it; {hint}' if hint else 'find what else changed with '
+            'it: check the mounting and the setup, and take the poses again'))
     rating = rate_refinement(refinement)
     words = [story(refinement, rating)]
     if not refinement.refusal:
@@ -193,6 +197,14 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None)
 def rated(calibration: Calibration, refinement: Refinement | None) -> Rating:
     """Return the rating of a calibration, and of the refinement that it is from."""
     return rate(calibration, refinement=refinement)
+
+
+def result_of(calibration: Calibration, refinement: Refinement | None, model: str
+              ) -> dict[str, Any]:
+    """Return a calibration, and its refinement, for JSON as on the command line."""
+    found = {} if refinement is None else refinement_json(refinement)
+    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
+    return cast('dict[str, Any]', plain(whole))
 
 
 def poses_up(poses: Poses, units: Units) -> Floats:

@@ -283,7 +283,14 @@ class Mounting:
     frame_id: str
 
 
-Event = Log | Mounting | Still | ShowPoses | Task
+@dataclass(frozen=True)
+class Result:
+    """The last fit, refinement or levelling, as JSON."""
+
+    text: str
+
+
+Event = Log | Mounting | Result | Still | ShowPoses | Task
 """What a session reports: log lines, what to publish, and tasks to run."""
 
 
