@@ -275,3 +275,21 @@ def test_without_a_gap_the_calibration_is_that_of_the_fit(seed):
     assert found.calibration.quality == fitted.quality
     assert found.disturbed_poses == tuple(pose.row for pose in fitted.rejected)
     assert found.remaining_gap_mg == pytest.approx(fitted.quality.rms_after_mg)
+
+
+def test_a_stored_curve_over_the_rate_of_temperature_is_compared_with_new_poses():
+    rng = np.random.default_rng(77)
+    model, axes = with_effects(rng), np.array([0.005, -0.004, 0.003])
+
+    def taken(count, offset=0.0):
+        time = np.cumsum(rng.uniform(10.0, 40.0, count))
+        warm = 25.0 + 8.0 * np.sin(time / 300.0 + rng.uniform(0.0, 6.0))
+        poses = poses_of(model, rng, random_directions(count, rng), temperature=warm, time=time)
+        course = np.outer(np.tanh(np.gradient(warm, time) / 0.008), axes)
+        return poses.with_columns(reading=poses.reading + course + offset)
+
+    first = refine(taken(80), G)
+    assert [step.variable for step in first.steps] == ['temperature_rate']
+    assert refine(taken(40), G, base=first.calibration).verdict == 'no_gap'
+    moved = refine(taken(40, axes), G, base=first.calibration)
+    assert [step.effect for step in moved.steps] == ['offset']

@@ -255,7 +255,8 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
     fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
     quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
-    return found if quiet else replace(found, verdict='unexplained')
+    return replace(found, verdict='no_gap' if quiet else 'unexplained',
+                   noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
 def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
@@ -264,7 +265,7 @@ def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
     state = State(judge(Model(fitted.model.values), poses_g))
     gap_mg = state.gap_mg(state.fit.residual)
     return Refinement(
-        verdict, fitted.quality.noise_floor_mg, gap_mg, gap_mg, (),
+        verdict, state.floor_mg, gap_mg, gap_mg, (),
         tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
         state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
         PosePlan())

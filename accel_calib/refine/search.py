@@ -184,7 +184,9 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
 def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
     """Return what was found without the effects of the variable of a curve that replaces them."""
     variable = empirical_parts(curve.name)[1]
-    shared = [name for name in found.near.names if effect_named(name).needs == (variable,)]
+    entries = {name: effect_named(name) for name in found.near.names}
+    shared = [name for name, entry in entries.items()
+              if (entry.over or entry.needs) == (variable,)]
     fewer = {name: values for name, values in found.final.model.values.items()
              if name not in shared}
     state = fitted_state(Model(fewer), found.final.poses_g) if shared else None
