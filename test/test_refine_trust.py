@@ -6,15 +6,26 @@
 from dataclasses import replace
 import json
 
+import accel_calib as ac
 from accel_calib.calibrate import fit_poses, verify, with_history
+from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_poses, write_table
 from accel_calib.refine import refine
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
-from inside import advice_for, main, Model, model_with, search_effects, simulate_poses
+from inside import (
+    advice_for,
+    main,
+    Model,
+    model_with,
+    search_effects,
+    simulate_poses,
+    verdict_words,
+)
 import numpy as np
+import pandas as pd
 import pytest
 from shared import random_directions, sensor
 
@@ -139,10 +150,10 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     scattered = poses.with_columns(reading=poses.reading + 0.002 * rng.normal(size=(60, 3)))
     found = search_effects(with_history(scattered, Model({})),
                            fit_poses(poses, G, model='10').model)
-    lines = advice_for('unexplained', replace(found, **structure), (), (), 0)
+    lines = advice_for(replace(found, **structure), (), (), 0, unexplained=True)
     assert any('gap remains' in line for line in lines)
     assert not any('no structure' in line for line in lines)
-    assert any('no structure' in line for line in advice_for('unexplained', found, (), (), 0))
+    assert any('no structure' in line for line in advice_for(found, (), (), 0, unexplained=True))
 
 
 @pytest.mark.parametrize(('poses', 'repeats'), [(24, 5), (12, 5)])
@@ -293,3 +304,30 @@ def test_a_stored_curve_over_the_rate_of_temperature_is_compared_with_new_poses(
     assert refine(taken(40), G, base=first.calibration).verdict == 'no_gap'
     moved = refine(taken(40, axes), G, base=first.calibration)
     assert [step.effect for step in moved.steps] == ['offset']
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_twelve_poses_that_cannot_tell_explain_nothing(seed):
+    hidden = ('quadratic', 'offset_temperature', 'offset_drift', 'hysteresis')[seed]
+    made = generator.simulate(np.random.default_rng([55, seed]), {hidden: 5.0},
+                              generator.Setup(poses=12))
+    try:
+        found = ac.refine(pd.DataFrame(made.columns))
+    except RefusedFitError:
+        return
+    many = any(len(step.rivals) > 3 for step in found.steps)
+    assert found.undecided == (bool(found.steps) and (many or bool(found.refusal)))
+    assert not found.undecided or found.verdict == 'unexplained'
+    assert ('Not enough poses' in verdict_words(found)) == found.undecided
+    assert not any('clamp' in line or 'a gap remains' in line for line in found.advice)
+
+
+def test_a_slow_change_of_the_offset_is_described_and_not_explained():
+    rng = np.random.default_rng(41)
+    model = with_effects(rng)
+    poses = poses_of(model, rng, random_directions(60, rng), time=np.arange(60) * 30.0)
+    walk = np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3
+    found = refine(poses.with_columns(reading=poses.reading + walk), G)
+    assert 'offset_wander' in [step.effect for step in found.steps]
+    assert found.verdict == 'described'
+    assert 'a slow change of the offset' in verdict_words(found)
