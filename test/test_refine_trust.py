@@ -331,3 +331,51 @@ def test_a_slow_change_of_the_offset_is_described_and_not_explained():
     assert 'offset_wander' in [step.effect for step in found.steps]
     assert found.verdict == 'described'
     assert 'a slow change of the offset' in verdict_words(found)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_mount_that_turned_is_named_where_the_orientation_is_known(seed):
+    rng = np.random.default_rng([88, seed])
+    model, turn = with_effects(rng), np.radians(0.3) * random_directions(1, rng)[0]
+
+    def taken(count, axes=np.zeros(3), *, known=True):
+        up = random_directions(count, rng)
+        poses = poses_of(model, rng, up + np.cross(up, axes))
+        return poses.with_columns(reference=up) if known else poses
+
+    base = fit_poses(taken(30), G)
+    turned = refine(taken(30, turn), G, base=base)
+    assert [step.effect for step in turned.steps] == ['misalignment']
+    found = [turned.steps[0].parameters[axis] for axis in 'xyz']
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(turn), rel=0.1)
+    assert refine(taken(30), G, base=base).verdict == 'no_gap'
+    blind = fit_poses(taken(30, known=False), G)
+    assert any('mount that has turned' in line
+               for line in refine(taken(30, turn, known=False), G, base=blind).advice)
+
+
+@pytest.mark.parametrize('noisier', [2.0, 4.0])
+def test_new_poses_that_are_noisier_than_stated_are_no_walk(noisier):
+    for seed in range(4):
+        rng = np.random.default_rng([99, seed])
+        model = with_effects(rng)
+        base = fit_poses(poses_of(model, rng, random_directions(60, rng)), G)
+        noise = 0.003 / 10.0  # of the mean of a pose [g]
+        new = poses_of(model, rng, random_directions(40, rng), time=np.arange(40) * 20.0)
+        more = rng.normal(size=(40, 3)) * noise * np.sqrt(noisier ** 2 - 1.0)
+        found = refine(new.with_columns(reading=new.reading + more), G, base=base)
+        assert found.steps == ()
+        assert found.verdict != 'explained'
+
+
+def test_a_wave_in_noisy_new_poses_is_still_found():
+    rng = np.random.default_rng(98)
+    model = with_effects(rng)
+    base = fit_poses(poses_of(model, rng, random_directions(60, rng)), G)
+    time = np.arange(60) * 20.0
+    new = poses_of(model, rng, random_directions(60, rng), time=time)
+    wave = np.outer(np.sin(time / 150.0), [0.006, -0.005, 0.004])
+    more = rng.normal(size=(60, 3)) * 6e-4
+    found = refine(new.with_columns(reading=new.reading + wave + more), G, base=base)
+    assert found.steps
+    assert found.remaining_gap_mg < 0.5 * found.gap_mg

@@ -217,7 +217,7 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
 
     """
-    lines = _other_sensor(found)
+    lines = [*_other_sensor(found), *_unseen_turn(found)]
     lines += [_separating(step) for step in steps if step.rivals]
     lines += [line for step in steps for line in _remarks(step)]
     if left_out:
@@ -256,6 +256,15 @@ def _other_sensor(found: Found) -> list[str]:
                     f'{np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much for '
                     'one sensor; fit a new calibration from its own poses']
     return []
+
+
+def _unseen_turn(found: Found) -> list[str]:
+    """Return a line if the sensor may have turned since the stored calibration, unseen."""
+    poses_g = found.base.poses_g
+    if 'new' not in poses_g or 'reference' in poses_g:
+        return []
+    return ['a mount that has turned since the calibration cannot show: only |force| = 1 g is '
+            'known; take poses of known orientation (ref_x, ref_y, ref_z) with both']
 
 
 def _separating(step: Step) -> str:
