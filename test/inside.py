@@ -158,7 +158,7 @@ from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import _is_better as is_better_than_walk
 from accel_calib.refine.search import search as search_effects
 from accel_calib.refine.sets import accepted, explored, Near, probabilities
-from accel_calib.refine.words import advice_for, attitude_words
+from accel_calib.refine.words import advice_for, attitude_words, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page, linear_figures
 from accel_calib.report.page import page as refinement_page

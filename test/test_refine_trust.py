@@ -6,15 +6,26 @@
 from dataclasses import replace
 import json
 
+import accel_calib as ac
 from accel_calib.calibrate import fit_poses, verify, with_history
+from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_poses, write_table
 from accel_calib.refine import refine
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
-from inside import advice_for, main, Model, model_with, search_effects, simulate_poses
+from inside import (
+    advice_for,
+    main,
+    Model,
+    model_with,
+    search_effects,
+    simulate_poses,
+    verdict_words,
+)
 import numpy as np
+import pandas as pd
 import pytest
 from shared import random_directions, sensor
 
@@ -139,10 +150,10 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     scattered = poses.with_columns(reading=poses.reading + 0.002 * rng.normal(size=(60, 3)))
     found = search_effects(with_history(scattered, Model({})),
                            fit_poses(poses, G, model='10').model)
-    lines = advice_for('unexplained', replace(found, **structure), (), (), 0)
+    lines = advice_for(replace(found, **structure), (), (), 0, unexplained=True)
     assert any('gap remains' in line for line in lines)
     assert not any('no structure' in line for line in lines)
-    assert any('no structure' in line for line in advice_for('unexplained', found, (), (), 0))
+    assert any('no structure' in line for line in advice_for(found, (), (), 0, unexplained=True))
 
 
 @pytest.mark.parametrize(('poses', 'repeats'), [(24, 5), (12, 5)])
@@ -275,3 +286,96 @@ def test_without_a_gap_the_calibration_is_that_of_the_fit(seed):
     assert found.calibration.quality == fitted.quality
     assert found.disturbed_poses == tuple(pose.row for pose in fitted.rejected)
     assert found.remaining_gap_mg == pytest.approx(fitted.quality.rms_after_mg)
+
+
+def test_a_stored_curve_over_the_rate_of_temperature_is_compared_with_new_poses():
+    rng = np.random.default_rng(77)
+    model, axes = with_effects(rng), np.array([0.005, -0.004, 0.003])
+
+    def taken(count, offset=0.0):
+        time = np.cumsum(rng.uniform(10.0, 40.0, count))
+        warm = 25.0 + 8.0 * np.sin(time / 300.0 + rng.uniform(0.0, 6.0))
+        poses = poses_of(model, rng, random_directions(count, rng), temperature=warm, time=time)
+        course = np.outer(np.tanh(np.gradient(warm, time) / 0.008), axes)
+        return poses.with_columns(reading=poses.reading + course + offset)
+
+    first = refine(taken(80), G)
+    assert [step.variable for step in first.steps] == ['temperature_rate']
+    assert refine(taken(40), G, base=first.calibration).verdict == 'no_gap'
+    moved = refine(taken(40, axes), G, base=first.calibration)
+    assert [step.effect for step in moved.steps] == ['offset']
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_twelve_poses_that_cannot_tell_explain_nothing(seed):
+    hidden = ('quadratic', 'offset_temperature', 'offset_drift', 'hysteresis')[seed]
+    made = generator.simulate(np.random.default_rng([55, seed]), {hidden: 5.0},
+                              generator.Setup(poses=12))
+    try:
+        found = ac.refine(pd.DataFrame(made.columns))
+    except RefusedFitError:
+        return
+    many = any(len(step.rivals) > 3 for step in found.steps)
+    assert found.undecided == (bool(found.steps) and (many or bool(found.refusal)))
+    assert not found.undecided or found.verdict == 'unexplained'
+    assert ('Not enough poses' in verdict_words(found)) == found.undecided
+    assert not any('clamp' in line or 'a gap remains' in line for line in found.advice)
+
+
+def test_a_slow_change_of_the_offset_is_described_and_not_explained():
+    rng = np.random.default_rng(41)
+    model = with_effects(rng)
+    poses = poses_of(model, rng, random_directions(60, rng), time=np.arange(60) * 30.0)
+    walk = np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3
+    found = refine(poses.with_columns(reading=poses.reading + walk), G)
+    assert 'offset_wander' in [step.effect for step in found.steps]
+    assert found.verdict == 'described'
+    assert 'a slow change of the offset' in verdict_words(found)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_mount_that_turned_is_named_where_the_orientation_is_known(seed):
+    rng = np.random.default_rng([88, seed])
+    model, turn = with_effects(rng), np.radians(0.3) * random_directions(1, rng)[0]
+
+    def taken(count, axes=np.zeros(3), *, known=True):
+        up = random_directions(count, rng)
+        poses = poses_of(model, rng, up + np.cross(up, axes))
+        return poses.with_columns(reference=up) if known else poses
+
+    base = fit_poses(taken(30), G)
+    turned = refine(taken(30, turn), G, base=base)
+    assert [step.effect for step in turned.steps] == ['misalignment']
+    found = [turned.steps[0].parameters[axis] for axis in 'xyz']
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(turn), rel=0.1)
+    assert refine(taken(30), G, base=base).verdict == 'no_gap'
+    blind = fit_poses(taken(30, known=False), G)
+    assert any('mount that has turned' in line
+               for line in refine(taken(30, turn, known=False), G, base=blind).advice)
+
+
+@pytest.mark.parametrize('noisier', [2.0, 4.0])
+def test_new_poses_that_are_noisier_than_stated_are_no_walk(noisier):
+    for seed in range(4):
+        rng = np.random.default_rng([99, seed])
+        model = with_effects(rng)
+        base = fit_poses(poses_of(model, rng, random_directions(60, rng)), G)
+        noise = 0.003 / 10.0  # of the mean of a pose [g]
+        new = poses_of(model, rng, random_directions(40, rng), time=np.arange(40) * 20.0)
+        more = rng.normal(size=(40, 3)) * noise * np.sqrt(noisier ** 2 - 1.0)
+        found = refine(new.with_columns(reading=new.reading + more), G, base=base)
+        assert found.steps == ()
+        assert found.verdict != 'explained'
+
+
+def test_a_wave_in_noisy_new_poses_is_still_found():
+    rng = np.random.default_rng(98)
+    model = with_effects(rng)
+    base = fit_poses(poses_of(model, rng, random_directions(60, rng)), G)
+    time = np.arange(60) * 20.0
+    new = poses_of(model, rng, random_directions(60, rng), time=time)
+    wave = np.outer(np.sin(time / 150.0), [0.006, -0.005, 0.004])
+    more = rng.normal(size=(60, 3)) * 6e-4
+    found = refine(new.with_columns(reading=new.reading + wave + more), G, base=base)
+    assert found.steps
+    assert found.remaining_gap_mg < 0.5 * found.gap_mg

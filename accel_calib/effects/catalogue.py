@@ -284,7 +284,7 @@ CHANGES: dict[str, Effect] = {
                               factor=lambda context, shape: context['new'], needs=('new',),
                               includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
                               base=name)
-    for name in ('offset', 'gain', 'axis_gain', 'cross_axis')}
+    for name in ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')}
 """Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
 

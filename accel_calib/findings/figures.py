@@ -194,7 +194,7 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
 def refinement_json(result: Refinement) -> dict[str, Any]:
     """Return a refinement for JSON."""
     return {
-        'verdict': result.verdict, 'base': result.calibration.name,
+        'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
         'gap_mg': result.gap_mg,
         'steps': [{**asdict(step), 'words': effect_named(step.name).words}

@@ -107,7 +107,8 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     or was fitted to some of the new poses and still agrees with them.
 
     """
-    stored = in_g(calibration.used_poses, calibration.units)
+    stored = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
     if not len(stored) or not calibration.model.effects:
         return poses_g
     shared, edited = _shares(poses_g, stored), has(calibration.noted, 'edited')

@@ -152,11 +152,11 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
             ) -> Refinement:
     start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
     steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
-    verdict = verdict_of(found, bool(steps))
     missing, plan = untestable(found, steps), plan_poses(found)
+    verdict, _ = verdict_of(found, steps, refused=False)
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
-        advice = advice_for(verdict, found, steps, missing, len(calibration.rejected))
+        advice = advice_for(found, steps, missing, len(calibration.rejected))
         return _of_fit(calibration, alone, verdict, missing, (*advice, *plan.advice))
     rejected = _rejected(found, given)
     clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
@@ -164,11 +164,14 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
     if sensor or date:
         refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
-    advice = (*advice_for(verdict, found, steps, missing, len(outliers)), *plan.advice)
+    verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
+    unexplained = verdict == 'unexplained' and not undecided
+    advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),
+              *plan.advice)
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual),
         final.gap_mg(beside_walk(found)[0]), steps, outliers, missing, advice, refined, refusal,
-        final.poses_g, final.fit.equations.force, stages, plan)
+        final.poses_g, final.fit.equations.force, stages, plan, undecided)
 
 
 def _as_stored(calibration: Calibration, found: Found) -> State:
@@ -255,7 +258,8 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
     fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
     quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
-    return found if quiet else replace(found, verdict='unexplained')
+    return replace(found, verdict='no_gap' if quiet else 'unexplained',
+                   noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
 def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
@@ -264,7 +268,7 @@ def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
     state = State(judge(Model(fitted.model.values), poses_g))
     gap_mg = state.gap_mg(state.fit.residual)
     return Refinement(
-        verdict, fitted.quality.noise_floor_mg, gap_mg, gap_mg, (),
+        verdict, state.floor_mg, gap_mg, gap_mg, (),
         tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
         state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
         PosePlan())

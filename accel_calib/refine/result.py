@@ -60,6 +60,9 @@ from ..table import column_of, Floats, Poses
 from ..text import listed, table
 from ..units import MG
 
+MOST_RIVALS = 3
+"""Largest number of rivals of an effect that is called the explanation."""
+
 Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
 
 _LEAST_VISIBLE = 0.1
@@ -151,7 +154,8 @@ class Refinement:
     ----------
     verdict : {'no_gap', 'explained', 'described', 'unexplained'}
         No gap beyond the noise; the effects are named and the rest is noise; the rest is noise
-        only with an empirical curve; or a gap remains.
+        only with an empirical curve or a slow change of the offset; or a gap remains, or it is
+        not known what explains it (`undecided`).
     noise_floor_mg : float or None
         Expected residual of a correct model [mg]; None if the noise is not known.
     gap_mg, remaining_gap_mg : float
@@ -176,6 +180,9 @@ class Refinement:
         Residuals of the base and after each step.
     plan : PosePlan
         Poses that separate the effects from their rivals soonest.
+    undecided : bool
+        Whether the rest is noise, but the poses do not show which effects explain the gap: one has
+        more than `MOST_RIVALS` rivals, or the poses do not determine the refined calibration.
 
     """
 
@@ -193,6 +200,7 @@ class Refinement:
     force: Floats
     stages: tuple[Stage, ...]
     plan: PosePlan
+    undecided: bool = False
 
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
@@ -210,14 +218,16 @@ class Refinement:
         return (table(head, rows) if rows else '') + lines
 
 
-def verdict_of(found: Found, named: bool) -> Verdict:
-    """Return the verdict on a search; `named`: whether it has steps."""
+def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
+    """Return the verdict on a search, and whether it is undecided what explains the gap."""
     residual, _ = beside_walk(found)
     if found.final.fit.noise_known and not is_noise(float(residual @ residual), found.final.dof):
-        return 'unexplained'
-    if found.curve is not None:
-        return 'described'
-    return 'explained' if named else 'no_gap'
+        return 'unexplained', False
+    if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)):
+        return 'unexplained', True
+    if found.curve is not None or found.walk is not None:
+        return 'described', False
+    return 'explained' if steps else 'no_gap', False
 
 
 def steps_of(found: Found, start: State, date: str, *, joint: bool

@@ -129,21 +129,48 @@ def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
         everyone = np.delete(everyone, clip.poses)
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
-    found = _search(poses_g, base, also)
+    found = _with_own_noise(_search(poses_g, base, also), poses_g, base, also)
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
+
+
+def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+    """
+    Search again if new poses, or those of a stored calibration, are noisier than stated.
+
+    A walk or a curve could otherwise describe that one of them scatters more. The factors of the
+    noise are those of the residuals beside the named effects; the result is stated with the
+    measured noise.
+
+    """
+    if 'new' not in poses_g or not found.near.plain.worth or not (found.walk or found.curve):
+        return found
+    near = found.near
+    beside = near.plain.set_of(near.chosen.blocks, near.chosen.out)
+    own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(beside.onto ** 2, axis=1)
+    new, factor = poses_g['new'] > 0.0, np.ones(len(poses_g))
+    for group in (new, ~new):
+        rows = group[near.plain.pose]
+        factor[group] = max(np.sum(beside.residual[rows] ** 2) / max(np.sum(own[rows]), 1.0), 1.0)
+    if np.ptp(factor) == 0.0:
+        return found
+    scaled = poses_g.with_columns(std=poses_g['std'] * np.sqrt(factor)[:, np.newaxis])
+    again = _search(scaled, base, also)
+    kept = poses_g.take(np.delete(np.arange(len(poses_g)), again.outliers))
+    return replace(again, base=State(judge(again.base.model, kept)),
+                   final=State(judge(again.final.model, kept)))
 
 
 def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
-    begun, near = _settled(start, poses_g, base.effects, _ladder_effects(start), walks=False)
+    begun, near = _settled(start, poses_g, base.effects, _visible(start, LADDER), walks=False)
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
-    names = (*_ladder_effects(begun), *(name for name in EFFECTS if name not in LADDER),
-             *also, *covariate_names(causes(poses_g)), *_beside(begun.model, CHANGES))
+    names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
+             *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
     state, near = _settled(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
@@ -184,7 +211,9 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
 def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
     """Return what was found without the effects of the variable of a curve that replaces them."""
     variable = empirical_parts(curve.name)[1]
-    shared = [name for name in found.near.names if effect_named(name).needs == (variable,)]
+    entries = {name: effect_named(name) for name in found.near.names}
+    shared = [name for name, entry in entries.items()
+              if (entry.over or entry.needs) == (variable,)]
     fewer = {name: values for name, values in found.final.model.values.items()
              if name not in shared}
     state = fitted_state(Model(fewer), found.final.poses_g) if shared else None
@@ -360,17 +389,12 @@ def _without(state: State, poses_g: Poses, out: NDArray[np.intp]) -> State:
     return fitted_state(state.model, poses_g.take(kept)) or state
 
 
-def _ladder_effects(state: State) -> tuple[str, ...]:
-    """Return the effects of the ladder that can be added."""
+def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the effects of these names that a model lacks and the poses can show."""
+    present = {*state.model.values, *included(state.model.values)}
     unknown = not len(kinds(state.poses_g)[0])
-    return tuple(name for name in _beside(state.model, LADDER)
-                 if not (unknown and EFFECTS[name].known_orientation))
-
-
-def _beside(model: Model, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the effects of these names that a model neither has nor contains."""
-    present = {*model.values, *included(model.values)}
-    return tuple(name for name in names if name not in present)
+    return tuple(name for name in names if name not in present
+                 and not (unknown and effect_named(name).known_orientation))
 
 
 def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[str, ...]]:

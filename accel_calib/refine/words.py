@@ -51,22 +51,36 @@ _OTHER_SENSOR = 'this is probably another sensor'
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
     'explained': 'The gap is explained: only noise remains beyond the named effects.',
-    'described': 'The gap is described, not explained: only noise remains beyond an empirical '
-                 'curve, but no known effect has its form.',
+    'described': 'The gap is described, not explained: only noise remains beyond {}, but its '
+                 'cause is not known.',
     'unexplained': 'A gap remains that no effect of the catalogue explains.',
 }
 
 
 def verdict_words(result: Refinement) -> str:
     """Return the verdict as a sentence."""
-    words = _VERDICTS[result.verdict]
-    if result.verdict == 'unexplained' and result.steps:
+    walks = any(step.effect == WANDER for step in result.steps)
+    words = _VERDICTS[result.verdict].format(
+        'a slow change of the offset' if walks else 'an empirical curve')
+    if result.undecided:
+        words = _undecided(result)
+    elif result.verdict == 'unexplained' and result.steps:
         words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
                  'it.')
     if result.noise_floor_mg is None:
         words += (' The noise of the poses is not known (no std and count), so their scatter is '
                   'taken as the noise.')
     return words
+
+
+def _undecided(result: Refinement) -> str:
+    """Return why it is not known what explains a gap."""
+    if result.refusal:
+        why = result.refusal[0]
+    else:
+        most = max(result.steps, key=lambda step: len(step.rivals))
+        why = f'{len(most.rivals)} others explain it about as well as {most.effect}'
+    return f'Not enough poses: they cannot tell what explains the gap, because {why}.'
 
 
 def residual_words(result: Refinement) -> str:
@@ -194,16 +208,16 @@ def shown_name(name: str) -> str:
     return plain_name(kind_of(name))
 
 
-def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
-               untestable: tuple[tuple[str, str], ...], left_out: int) -> tuple[str, ...]:
+def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[str, str], ...],
+               left_out: int, *, unexplained: bool = False) -> tuple[str, ...]:
     """
     Return advice for the user, one line each.
 
     `untestable` are the effects that the data cannot show, and the data to record for them;
-    `left_out` is the number of poses that were left out.
+    `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
 
     """
-    lines = _other_sensor(found)
+    lines = [*_other_sensor(found), *_unseen_turn(found)]
     lines += [_separating(step) for step in steps if step.rivals]
     lines += [line for step in steps for line in _remarks(step)]
     if left_out:
@@ -213,7 +227,7 @@ def advice_for(verdict: str, found: Found, steps: tuple[Step, ...],
         lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
                      f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
                      'most effects: take 24 poses or more')
-    if verdict == 'unexplained':
+    if unexplained:
         lines += _unexplained(found, untestable)
     return tuple(lines)
 
@@ -242,6 +256,15 @@ def _other_sensor(found: Found) -> list[str]:
                     f'{np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much for '
                     'one sensor; fit a new calibration from its own poses']
     return []
+
+
+def _unseen_turn(found: Found) -> list[str]:
+    """Return a line if the sensor may have turned since the stored calibration, unseen."""
+    poses_g = found.base.poses_g
+    if 'new' not in poses_g or 'reference' in poses_g:
+        return []
+    return ['a mount that has turned since the calibration cannot show: only |force| = 1 g is '
+            'known; take poses of known orientation (ref_x, ref_y, ref_z) with both']
 
 
 def _separating(step: Step) -> str:
