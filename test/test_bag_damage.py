@@ -64,7 +64,7 @@ def with_loose_columns(file: Path, table: str) -> None:
 
 
 @pytest.mark.parametrize(('column', 'cell', 'words'), [
-    ('data', None, "a message on /imu has the content 'None'"),
+    ('data', None, "a message on /imu has the content None"),
     ('data', 'words', "a message on /imu has the content 'words'"),
     ('timestamp', 'words', "a message on /imu has the time of receipt 'words'")])
 def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str,
