@@ -40,7 +40,15 @@ from .context import (
     with_history,
     with_previous,
 )
-from .fit import deviations_g, fit_poses, gated, sound_rows, sure_rows, uncertainty_g
+from .fit import (
+    deviations_g,
+    fit_poses,
+    gated,
+    LARGEST_OFFSET_G,
+    sound_rows,
+    sure_rows,
+    uncertainty_g,
+)
 from .mounting import (
     flat_direction,
     level,
@@ -77,7 +85,7 @@ from .quality import (
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .unknown_orientation import directions_of, fit_unknown, only_norm
 
-__all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
+__all__ = ['LARGEST_OFFSET_G', 'BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
            'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias',
            'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
            'SampleContext', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
