@@ -85,10 +85,10 @@ from .quality import (
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .unknown_orientation import directions_of, fit_unknown, only_norm
 
-__all__ = ['LARGEST_OFFSET_G', 'BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
-           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias',
-           'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
-           'SampleContext', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
+__all__ = ['BASES', 'FLEET', 'FRAMES', 'LARGEST_OFFSET_G', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT',
+           'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName',
+           'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected',
+           'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
            'converted', 'determines', 'deviations_g', 'directions_of', 'errors_after',
            'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
            'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_g', 'level',
