@@ -290,9 +290,12 @@ def timed(spent: dict[str, float], stages: dict[str, tuple[Any, str]],
 def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
     """Return the cost by stage in one process [ms of processor per recording]."""
     spent: dict[str, float] = Counter()
-    with TemporaryDirectory(dir=folder) as out:
+    here = mock.patch.object(TASK.WorkerProcess, 'call_within',
+                             lambda self, limit_s, function, *given: function(*given))
+    with TemporaryDirectory(dir=folder) as out, here:
         store = Store(Path(out))
-        TASK.calibrate_recording(found[0], options, Store(store.folder / 'first'))  # imports
+        first = Store(store.folder / 'first')
+        TASK.calibrate_recording(found[0], options, first, RUN.LIMIT_S)  # imports
         with timed(spent, {
                 'all': (TASK, 'calibrate_recording'), 'hash': (TASK, 'content_hash'),
                 'read and capture': (TASK, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
@@ -301,7 +304,7 @@ def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, f
                 'write the calibration': (TASK, 'write_calibration'),
                 'write the row': (Store, 'add')}, time.process_time):
             for each in found:
-                TASK.calibrate_recording(each, options, store)
+                TASK.calibrate_recording(each, options, store, RUN.LIMIT_S)
         spent['other'] = 2.0 * spent['all'] - sum(spent.values())
         with timed(spent, {'merge': (Store, 'merge'), 'compare': (SENSORS, '_compared'),
                            'read the calibrations': (SENSORS, 'read_calibration'),

@@ -7,13 +7,15 @@ from collections.abc import Mapping
 from dataclasses import replace
 import json
 from pathlib import Path
+import subprocess
+import sys
 from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.geometry import unit
 from accel_calib.session import Step, Task
 from accel_calib.table import Floats
-from inside import main, Model, model_with
+from inside import COMMAND, main, Model, model_with
 import numpy as np
 import pytest
 
@@ -52,6 +54,23 @@ def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: 
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
+
+
+def run_on_small_disk(folder: Path, size_kb: int, *command: object
+                      ) -> tuple[subprocess.CompletedProcess[str], Path]:
+    """Run a command while a folder is a disk of this size; return also a copy of the folder."""
+    if subprocess.run(['unshare', '-r', '-m', 'true'], check=False).returncode:
+        pytest.skip('this user may not mount a file system')
+    copy = folder.with_name(f'{folder.name}_copy')
+    for each in (folder, copy):
+        each.mkdir()
+    script = (f'mount -t tmpfs -o size={size_kb}k tmpfs "$0" || exit 99; "$@"; status=$?; '
+              f'cp -r "$0/." "{copy}"; exit $status')
+    done = subprocess.run(['unshare', '-r', '-m', 'bash', '-c', script, str(folder),
+                           sys.executable, *COMMAND, *map(str, command)], check=False,
+                          capture_output=True, text=True)
+    assert done.returncode != 99, done.stderr
+    return done, copy
 
 
 def run(*arguments: object) -> int:

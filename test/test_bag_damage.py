@@ -14,12 +14,25 @@ from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
 from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
-from bag_files import a_calibration, copied, COUNT, execute, MAKES, messages, TOPICS
+from accel_calib.stored import write_calibration
+from bag_files import (
+    a_calibration,
+    copied,
+    COUNT,
+    execute,
+    MAKES,
+    messages,
+    ros1,
+    rosbag2,
+    TOPICS,
+)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
 from mcap_file import McapFile, STORE
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin
+from shared import run_on_small_disk
 
 
 @pytest.fixture(scope='module')
@@ -64,7 +77,7 @@ def with_loose_columns(file: Path, table: str) -> None:
 
 
 @pytest.mark.parametrize(('column', 'cell', 'words'), [
-    ('data', None, "a message on /imu has the content 'None'"),
+    ('data', None, 'a message on /imu has the content None'),
     ('data', 'words', "a message on /imu has the content 'words'"),
     ('timestamp', 'words', "a message on /imu has the time of receipt 'words'")])
 def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str,
@@ -175,3 +188,18 @@ def test_an_acceleration_beyond_any_sensor_is_refused(
                  lambda: correct_bag(path, calibration, tmp_path / 'out')):
         with pytest.raises(InputError, match=words):
             work()
+
+
+@pytest.mark.parametrize('size_kb', [8, 24])
+@pytest.mark.parametrize('name', ['out', 'out.db3', 'out.mcap', 'out.bag'])
+def test_a_copy_on_a_full_disk_is_one_line_and_nothing_stored(
+        name: str, size_kb: int, calibration: Calibration, tmp_path: Path) -> None:
+    write_calibration(tmp_path / 'c.yaml', calibration)
+    path = (ros1() if name.endswith('.bag') else rosbag2(StoragePlugin.SQLITE3))(tmp_path)
+    disk = tmp_path / 'disk'
+    done, copy = run_on_small_disk(
+        disk, size_kb, 'apply', path, '-c', tmp_path / 'c.yaml', '-o', disk / name)
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1), done.stderr
+    assert f'{disk}/' in done.stderr
+    assert 'No space left on device; free space on the disk' in done.stderr
+    assert list(copy.iterdir()) == []

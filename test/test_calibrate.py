@@ -9,7 +9,7 @@ from accel_calib.stored import read_calibration
 from inside import are_samples
 import numpy as np
 import pytest
-from shared import data, run
+from shared import data, run, run_on_small_disk
 
 OFFSET = (0.02, -0.01, 0.03)
 EFFECTS = ('--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005')
@@ -115,3 +115,23 @@ def test_samples_are_distinguished_from_poses(step, rows, count, samples):
     if count:
         columns['count'] = np.ones(rows)
     assert are_samples(columns) == samples
+
+
+def test_a_page_that_does_not_fit_on_the_disk_is_a_line_beside_the_calibration(
+        recording, tmp_path):
+    disk = tmp_path / 'disk'
+    done, copy = run_on_small_disk(
+        disk, 64, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'No space left on device' in done.stdout
+    assert read_calibration(copy / 'c.yaml').name
+    assert [each.name for each in copy.iterdir()] == ['c.yaml']
+
+
+def test_a_calibration_that_does_not_fit_on_the_disk_leaves_nothing(recording, tmp_path):
+    disk = tmp_path / 'disk'
+    done, copy = run_on_small_disk(
+        disk, 4, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+    assert 'No space left on device' in done.stderr
+    assert list(copy.iterdir()) == []

@@ -13,7 +13,7 @@ import sys
 
 from accel_calib.capture import CaptureSettings
 from accel_calib.stored import read_calibration
-from inside import main, parser, rotation_from_rpy, spread_directions
+from inside import COMMAND, main, parser, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
 from shared import run, run_json
@@ -204,7 +204,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, calibration, tmp_path, ca
 @pytest.mark.parametrize('command', ['fit poses.csv -o new.yaml', 'fit missing.csv'])
 def test_closed_streams_change_no_exit_status_and_no_file(closed, command, poses, tmp_path):
     done = subprocess.run(
-        ['sh', '-c', f'{sys.executable} -m accel_calib.cli.main {command} {closed}'],
+        ['sh', '-c', ' '.join([sys.executable, *COMMAND, command, closed])],
         capture_output=True, text=True, cwd=tmp_path, check=False,
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'TMPDIR': str(tmp_path)})
     assert done.returncode == (2 if 'missing' in command else 0), done.stderr
@@ -216,8 +216,8 @@ def test_closed_streams_change_no_exit_status_and_no_file(closed, command, poses
 def test_a_name_that_is_not_utf_8_is_refused_in_one_line(poses, tmp_path):
     for command in ('fit', 'calibrate'):
         done = subprocess.run(
-            [sys.executable, '-m', 'accel_calib.cli.main', command, str(poses), '-o',
-             str(tmp_path / 'new.yaml'), '--sensor', b'a\xff'], capture_output=True, text=True,
+            [sys.executable, *COMMAND, command, str(poses), '-o', str(tmp_path / 'new.yaml'),
+             '--sensor', b'a\xff'], capture_output=True, text=True,
             check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
         assert done.returncode == 2
         assert done.stderr.count('\n') == 1
@@ -226,23 +226,34 @@ def test_a_name_that_is_not_utf_8_is_refused_in_one_line(poses, tmp_path):
 
 
 INTERRUPTED_AT = """
-import signal, sys
+import runpy, signal, sys
+signal.signal(signal.SIGINT, {handler})  # a shell lets background commands ignore it
 def interrupt(event, about):
     if event == 'import' and about[0] == {name!r}:
         signal.raise_signal(signal.SIGINT)
 sys.addaudithook(interrupt)
-from accel_calib.cli.main import main
-sys.exit(main(['fit', {poses!r}]))
+sys.argv = ['accel-calib', 'fit', {poses!r}]
+runpy.run_module({module!r}, run_name='__main__')
 """
+
+
+def interrupted_at(name, handler, poses):
+    code = INTERRUPTED_AT.format(name=name, handler=handler, poses=str(poses), module=COMMAND[1])
+    return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
 
 
 @pytest.mark.parametrize('name', ['argparse', 'accel_calib.errors', 'numpy',
                                   'numpy.linalg._umath_linalg', 'rich.console', 'scipy.special'])
 def test_ctrl_c_while_modules_load_ends_without_words(name, poses):
-    done = subprocess.run(
-        [sys.executable, '-c', INTERRUPTED_AT.format(name=name, poses=str(poses))],
-        capture_output=True, text=True, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    done = interrupted_at(name, 'signal.default_int_handler', poses)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+def test_a_command_that_is_to_ignore_ctrl_c_ignores_it_also_while_modules_load(poses):
+    done = interrupted_at('rich.console', 'signal.SIG_IGN', poses)
+    assert done.returncode == 0, done.stderr
+    assert 'Residual' in done.stdout
 
 
 def commands():

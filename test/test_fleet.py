@@ -44,6 +44,7 @@ from inside import (
 )
 import numpy as np
 import pytest
+from shared import run_on_small_disk
 
 KilledWorker = pytest.importorskip('distributed').KilledWorker
 pytest.importorskip('pyarrow')
@@ -107,6 +108,63 @@ def test_a_bad_recording_is_a_row_with_its_error(client: Any, tmp_path: Path) ->
     assert rows[str(bad)]['advice']
     assert rows[str(few)]['error']
     assert rows[str(few)]['calibration'] is None
+
+
+def test_a_name_that_is_not_utf_8_is_a_row_with_its_error(client: Any, tmp_path: Path) -> None:
+    good, store = write_poses(tmp_path / 'in' / 'a.csv'), Store(tmp_path / 'out')
+    odd = [os.fsdecode(os.fsencode(good.parent) + name) for name in (b'/\xff.csv', b'/\xfe/b.csv')]
+    for each in odd:
+        write_poses(Path(each))
+    for status in ('ok', 'skipped'):
+        assert run(client, found_in(good.parent), QUICK, store).counts == {status: 1, 'unread': 2}
+    wrong = [row for row in rows_of(store.folder) if row['status'] == 'unread']
+    assert sorted(row['recording'] for row in wrong) == [
+        f'{good.parent}/\\xfe/b.csv', f'{good.parent}/\\xff.csv']
+    assert all('is not UTF-8' in row['error'] and row['advice'] for row in wrong)
+
+
+def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
+        client: Any, tmp_path: Path) -> None:
+    good, store = write_poses(tmp_path / 'a.csv'), Store(tmp_path / 'out')
+    endless = tmp_path / 'endless.csv'
+    with endless.open('w') as file:
+        file.write('time,ax,ay,az\n')
+        file.writelines(f'{k / 100},0,0,9.81\n' for k in range(2_000_000))
+    summary = run(client, found_in(good), QUICK, store)
+    summary = run(client, found_in(good, endless), QUICK, store, limit_s=0.5)
+    assert summary.counts == {'skipped': 1, 'unread': 1}
+    row = next(row for row in rows_of(store.folder) if row['status'] == 'unread')
+    assert row['recording'] == str(endless)
+    assert 'takes longer than 0.5 s' in row['error']
+    assert '--time-limit' in row['advice']
+
+
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    'truncated': lambda data: data[:len(data) // 2], 'empty': lambda data: b'',
+    'foreign': lambda data: b'{"key": 1}'}
+
+
+@pytest.mark.parametrize('damage', DAMAGE)
+@pytest.mark.parametrize('name', ['data.parquet', 'sensors.parquet', 'pending'])
+def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
+        name: str, damage: str, client: Any, tmp_path: Path) -> None:
+    folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
+    run(client, found_in(folder), QUICK, store)
+    before = state_of(store.folder)
+    if name == 'pending':
+        file = store.pending / 'robot_0%2Fimu_link' / '0123.json'
+        file.parent.mkdir(parents=True)
+        file.write_bytes(json.dumps({'key': '0123', 'content': '', 'sensor': ''}).encode())
+    else:
+        file = next(store.folder.rglob(name))
+    file.write_bytes(broken := DAMAGE[damage](file.read_bytes()))
+    summary = run(client, found_in(folder), QUICK, store)
+    aside, = summary.damaged
+    assert Path(aside).read_bytes() == broken
+    assert name in ('pending', Path(aside).name)
+    assert not file.exists() or file.read_bytes() != broken
+    assert state_of(store.folder) == before
+    assert run(client, found_in(folder), QUICK, store).damaged == ()
 
 
 def test_a_second_run_calibrates_only_what_is_new(client: Any, tmp_path: Path) -> None:
@@ -416,21 +474,11 @@ def killed(pattern: str, enough: int) -> Callable[[Site], None]:
 
 def full_disk(site: Site) -> None:
     """Run on a file system that is too small, and copy what is there."""
-    if subprocess.run(['unshare', '-r', '-m', 'true'], check=False).returncode:
-        pytest.skip('this user may not mount a file system')
-    site.results.mkdir()
-    copy, script = site.folder / 'copy', site.folder / 'script'
-    copy.mkdir()
-    script.write_text(
-        f'set -e; mount -t tmpfs -o size={FULL_KB}k tmpfs "{site.results}"\n'
-        '"$@" >/dev/null 2>"$0.full" && exit 7\n'
-        f'cp -r "{site.results}/." "{copy}"\n')
-    done = subprocess.run(
-        ['unshare', '-r', '-m', 'bash', str(script), sys.executable, *COMMAND,
-         *site.command('--workers', '2')], check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    (line,) = (site.folder / 'script.full').read_text().splitlines()
-    assert 'No space left on device' in line
+    done, copy = run_on_small_disk(site.results, FULL_KB, *site.command('--workers', '2'))
+    assert done.returncode == 2
+    assert 'No space left on device' in done.stderr
+    assert done.stderr.count('\n') == 1
+    site.results.rmdir()
     copy.replace(site.results)
 
 

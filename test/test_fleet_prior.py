@@ -142,6 +142,10 @@ def test_the_file_keeps_the_values_and_asks_for_the_model(
     ('offset.x', 'offset.q', 'names are'),
     ('mean:', 'mean_of:', "'mean'"),
     ('models:', 'other:', "'models'"),
+    ('sensors: 40', 'sensors: -5', 'sensors is -5, expected 1 or more'),
+    ('sensors: 40', 'sensors: .inf', 'sensors is inf, expected a whole number'),
+    ('mean:\n  - ', 'mean:\n  - 1e308  # ', 'mean contains a number of more than 1 in magnitude'),
+    ('covariance:\n  - - ', 'covariance:\n  - - 1e308  # ', 'covariance contains a number of m'),
 ])
 def test_a_damaged_file_is_refused(
         fleet: FleetPrior, tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -29,8 +29,8 @@ LAYERS = (
     ('messages',),
     ('intake', 'pipeline'),
     ('report',),
-    ('api', 'fleet', 'session'),
-    ('live',),
+    ('api', 'session'),
+    ('fleet', 'live'),
     ('ros',),
     ('cli',),
 )

@@ -40,7 +40,15 @@ from .context import (
     with_history,
     with_previous,
 )
-from .fit import deviations_g, fit_poses, gated, sound_rows, sure_rows, uncertainty_g
+from .fit import (
+    deviations_g,
+    fit_poses,
+    gated,
+    LARGEST_OFFSET_G,
+    sound_rows,
+    sure_rows,
+    uncertainty_g,
+)
 from .mounting import (
     flat_direction,
     in_frame,
@@ -79,14 +87,14 @@ from .quality import (
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .unknown_orientation import directions_of, fit_unknown, only_norm
 
-__all__ = ['BASES', 'FLEET', 'FRAMES', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT', 'PRIOR',
-           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName', 'GyroBias',
-           'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
-           'SampleContext', 'SampleNoise', 'Verification', 'carried_words', 'check_sensor',
-           'converted', 'determines', 'deviations_g', 'directions_of', 'errors_after',
-           'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
-           'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_frame', 'in_g',
-           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
+__all__ = ['BASES', 'FLEET', 'FRAMES', 'LARGEST_OFFSET_G', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT',
+           'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName',
+           'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected',
+           'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification', 'carried_words',
+           'check_sensor', 'converted', 'determines', 'deviations_g', 'directions_of',
+           'errors_after', 'errors_before', 'fit_findings', 'fit_partial', 'fit_poses',
+           'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of', 'in_frame',
+           'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
            'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
            'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows', 'thermal_stream',

@@ -297,6 +297,9 @@ def _fleet(made: options.Parser) -> None:
         'in the file)')
     add('--model-from', type=_regex, default='', metavar='REGEX', help='take the model of the '
         'sensor from its name')
+    add('--time-limit', type=options.positive, metavar='S', help='longest time of one recording; '
+        'one that takes longer is a row with an error, and is tried again by the next run '
+        '(default: 900 s)')
     made.add_argument('--export', action='append', default=[], choices=CALIBRATION_ALONE,
                       metavar='FORMAT', help='write each calibration in this format, too; can be '
                       f'repeated: {", ".join(CALIBRATION_ALONE)}')

@@ -16,6 +16,7 @@ from rich.table import Table
 from .frame import console, Done, progress, rated, rating_lines, table, working
 from .inputs import given, intake, log_options, plan_of, rows_between, settings
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
+from ..errors import system_error
 from ..findings import (
     calibration_json,
     effect_figures,
@@ -110,16 +111,19 @@ def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -
     page = args.output.with_suffix('.html')
     if not has_matplotlib():
         return [line, f'no page {page}: matplotlib is not installed']
-    with working('drawing the page'):
-        write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
-                               refinement=outcome.refinement, stored=str(args.output),
-                               notes=found.lines)
+    try:
+        with working('drawing the page'):
+            write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
+                                   refinement=outcome.refinement, stored=str(args.output),
+                                   notes=found.lines)
+    except OSError as err:  # the calibration is stored
+        return [line, f'no page {page}: {system_error(err)}']
     return [line, f'page: {page}']
 
 
 def run_fleet(args: argparse.Namespace) -> Done:
     """Calibrate many recordings on Dask."""
-    from ..fleet import cluster, Options, recordings, run, STATUS, Store
+    from ..fleet import cluster, LIMIT_S, Options, recordings, run, STATUS, Store
 
     with working('looking for recordings'):
         found = list({each.path: each for each in recordings(args.recordings)}.values())
@@ -129,7 +133,8 @@ def run_fleet(args: argparse.Namespace) -> Done:
         console(args).print(f'{counted(len(found), "recording")}; dashboard: '
                             f'{client.dashboard_link}')
         with progress('recordings') as moved:
-            summary = run(client, found, asked, Store(args.output.absolute()), moved)
+            summary = run(client, found, asked, Store(args.output.absolute()), moved,
+                          args.time_limit or LIMIT_S)
     return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
                  'sensors': summary.sensors}, _summary_lines(summary, args.output))
 
@@ -139,6 +144,8 @@ def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
     counts = summary.counts
     yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
            f'could not be read, {counts["skipped"]} skipped because they are done')
+    for path in summary.damaged:
+        yield f'note: a file of the results was damaged and was made again; it is now {path}'
     for row in summary.sensors:
         for change in row['changes']:
             if change['for_good']:

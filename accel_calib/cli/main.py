@@ -17,6 +17,7 @@ from contextlib import contextmanager
 import os
 import signal
 import sys
+from threading import current_thread, main_thread
 
 INTERRUPTED = 130
 
@@ -66,11 +67,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 @contextmanager
 def _leaving() -> Iterator[None]:
     """Let Ctrl-C end the program without words, while modules load and nothing is written."""
-    try:
-        before = signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
-    except ValueError:  # not in the main thread, which gets Ctrl-C
-        yield
+    before = signal.getsignal(signal.SIGINT)
+    if before == signal.SIG_IGN or current_thread() is not main_thread():
+        yield  # a command in the background, or not the thread that gets Ctrl-C
         return
+    signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     try:
         yield
     finally:

@@ -12,7 +12,8 @@ figures of `charts`. `run` submits the tasks.
 """
 
 from .inputs import Input, recordings
-from .run import cluster, run, Summary
+from .run import cluster, LIMIT_S, run, Summary
 from .task import Options, STATUS, Store
 
-__all__ = ['STATUS', 'Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings', 'run']
+__all__ = ['LIMIT_S', 'STATUS', 'Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings',
+           'run']

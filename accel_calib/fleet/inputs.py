@@ -206,7 +206,7 @@ def content_hash(path: Path) -> str:
         return made.hexdigest()
     for each in sorted(path.rglob('*')):
         if each.is_file():
-            name = each.relative_to(path).as_posix().encode()
+            name = os.fsencode(each.relative_to(path).as_posix())
             made.update(b'%d:%b%d:' % (len(name), name, each.stat().st_size))
             _add(made, each)
     return made.hexdigest()

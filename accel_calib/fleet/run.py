@@ -29,7 +29,16 @@ from .sensors import (
     read_sensors,
     write_sensors,
 )
-from .task import calibrate_recording, Done, Options, Row, Store, unread_row
+from .task import (
+    calibrate_recording,
+    Done,
+    is_damaged,
+    Options,
+    Row,
+    SENSORS_FILE,
+    Store,
+    unread_row,
+)
 from ..calibrate import FleetPrior
 from ..errors import InputError
 from ..logs import Progress
@@ -54,6 +63,9 @@ _NEWEST = 0.2
 """Weight of the newest task in the mean duration of a recording."""
 
 _CONNECT_S = 30.0
+
+LIMIT_S = 900.0
+"""Longest time of one recording [s], far above that of a day at 100 Hz."""
 
 _HERE = '127.0.0.1'
 """Address of a cluster on this machine; other machines do not reach it."""
@@ -81,12 +93,15 @@ class Summary:
         The rows of all sensors.
     priors : mapping of str to FleetPrior
         Typical values by model of sensor.
+    damaged : tuple of str
+        Damaged files of the results, under their new names; their content was made again.
 
     """
 
     counts: Counter[str]
     sensors: tuple[Row, ...]
     priors: Mapping[str, FleetPrior]
+    damaged: tuple[str, ...]
 
 
 @contextmanager
@@ -131,7 +146,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
 
 
 def run(client: Client, found: Sequence[Input], options: Options, store: Store,
-        progress: Progress = lambda done, count: None) -> Summary:
+        progress: Progress = lambda done, count: None, limit_s: float = LIMIT_S) -> Summary:
     """
     Calibrate recordings, and bring the data set up to date.
 
@@ -147,6 +162,8 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         The results.
     progress : function of two int
         Called with the number of recordings done and of all recordings.
+    limit_s : float
+        Longest time of one recording [s].
 
     Returns
     -------
@@ -162,10 +179,12 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
 
     """
     with store.locked():
+        damaged = tuple(_set_aside(client, store))
         _merge(client, store)  # what an interrupted run left
         counts: Counter[str] = Counter()
         unread: list[Row] = []
-        for item, result in mapped(client, calibrate_recording, found, options, store):
+        for item, result in mapped(client, calibrate_recording, found, options, store,
+                                   limit_s):
             done = _of_dead(item, options, result) if isinstance(result, Exception) else result
             counts[done.status] += 1
             unread += [] if done.row is None else [done.row]
@@ -174,7 +193,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         sensors = tuple(_merge(client, store))
         priors = _stored_priors(store)
         write_fleet_page(store, sensors, priors)
-        return Summary(counts, sensors, priors)
+        return Summary(counts, sensors, priors, damaged)
 
 
 def _stored_priors(store: Store) -> dict[str, FleetPrior]:
@@ -187,9 +206,20 @@ def _stored_priors(store: Store) -> dict[str, FleetPrior]:
     return priors
 
 
+def _set_aside(client: Client, store: Store) -> Iterator[str]:
+    """Move the damaged files of the results away, and yield their new names."""
+    for path, damaged in mapped(client, is_damaged, store.files()):
+        if isinstance(damaged, Exception):
+            raise damaged
+        if damaged:
+            yield str(store.set_aside(path))
+
+
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     rows, names = [], store.waiting()
+    if not (store.folder / SENSORS_FILE).exists():
+        names = sorted({*names, *store.sensors()})
     if not names:
         return read_sensors(store)
     for _, result in mapped(client, merge_sensor, names, store):

@@ -41,7 +41,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .task import Row, Store, write_parquet
+from .task import Row, SENSORS_FILE, Store, write_parquet
 from ..calibrate import Calibration, FleetPrior
 from ..compare import History, history_of, LEVEL
 from ..effects import LADDER, MODELS, parameter_names
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 _MOST_COMPARED = 100
 """Largest number of calibrations of a sensor that are compared: the newest ones."""
 
-_FILE = 'sensors.parquet'
 _YEAR_S = 365.25 * 86400.0
 _FEWEST_STEPS = 3
 """Smallest number of steps that distinguish a drift from a change."""
@@ -282,7 +281,7 @@ def write_sensors(store: Store, rows: Sequence[Row]) -> list[Row]:
     """Add or replace the rows of sensors, and return the rows of all of them."""
     known = {row['sensor']: row for row in (*read_sensors(store), *rows)}
     found = [known[name] for name in sorted(known)]
-    write_parquet(store.folder / _FILE, found, sensors_schema())
+    write_parquet(store.folder / SENSORS_FILE, found, sensors_schema())
     return found
 
 
@@ -290,7 +289,7 @@ def read_sensors(store: Store) -> list[Row]:
     """Return the rows of all sensors; none if there is no file."""
     import pyarrow.parquet as pq
 
-    path = store.folder / _FILE
+    path = store.folder / SENSORS_FILE
     return pq.ParquetFile(path).read().to_pylist() if path.exists() else []
 
 

@@ -26,6 +26,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import threading
 import time
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
@@ -43,6 +44,7 @@ from ..findings import residual_figures
 from ..intake import Intake, poses_of
 from ..logs import LogOptions
 from ..pipeline import calibrated, Outcome, Plan
+from ..session import WorkerProcess
 from ..stored import write_calibration
 from ..stored.exports import export
 from ..table import Poses
@@ -56,6 +58,7 @@ UNREAD = '~unread'
 """Folder of the rows of recordings that could not be read; no sensor has this folder."""
 
 _DATA = 'data.parquet'
+SENSORS_FILE = 'sensors.parquet'
 _TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
           'error', 'advice', 'rating', 'rating_reason', 'model', 'refined', 'units', 'calibration')
 _COUNTS = ('poses', 'poses_used')
@@ -149,16 +152,35 @@ class Store:
         for row in new:
             mark = self._mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.touch()
+            mark.write_text(name, encoding='utf-8')
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
         folder = self.pending / name
+        if not folder.exists():
+            return
         for path in folder.iterdir():  # with temporary files of killed workers
             if path.suffix != '.json' or self.has(path.stem):
                 path.unlink(missing_ok=True)
         if not any(folder.iterdir()):  # a worker of a killed program may still write
             folder.rmdir()
+
+    def files(self) -> Iterator[Path]:
+        """Yield all files with rows."""
+        for pattern in (SENSORS_FILE, f'recordings/*/{_DATA}', 'pending/*/*.json'):
+            yield from sorted(self.folder.glob(pattern))
+
+    def set_aside(self, path: Path) -> Path:
+        """Move a file with rows away, so that they are made again; return its new path."""
+        moved = self.folder / 'damaged' / str(time.time_ns()) / path.relative_to(self.folder)
+        moved.parent.mkdir(parents=True)
+        if path.name == _DATA:
+            sensor = path.parent.name.partition('=')[2]
+            for mark in self.folder.glob('done/*/*'):
+                if mark.read_text(encoding='utf-8') in ('', sensor):  # '': of older versions
+                    mark.unlink()
+        path.rename(moved)
+        return moved
 
     def replace_unread(self, rows: list[Row]) -> None:
         """Replace the rows of the recordings that could not be read."""
@@ -225,6 +247,26 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
     write_atomically(path, lambda file: pq.write_table(table, file.buffer))
 
 
+def is_damaged(path: Path) -> bool:
+    """Return whether a file of `Store.files` cannot be read; raise OSError of the disk."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        if path.suffix != '.json':
+            pq.ParquetFile(path).read()
+            return False
+        row = json.loads(path.read_text(encoding='utf-8'))
+        pa.Table.from_pylist([row], schema())
+        return not row.keys() >= {'sensor', 'key', 'content', 'date', 'recording'}
+    except OSError as err:
+        if err.errno is not None:
+            raise
+        return True
+    except (ValueError, TypeError, AttributeError, pa.ArrowException):
+        return True
+
+
 def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
     """Return the rows in order of date, and the keys of old rows that new ones replace."""
     newest = {row['content']: row for row in new}
@@ -274,16 +316,33 @@ class Done:
     row: Row | None = None
 
 
-def calibrate_recording(found: Input, options: Options, store: Store) -> Done:
-    """Calibrate one recording, and add the result to the store; raise OSError if it fails."""
+_apart = threading.local()
+"""The process of each thread in which recordings are calibrated, so that it can be ended."""
+
+
+def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> Done:
+    """
+    Calibrate one recording, and add the result to the store; raise OSError if it fails.
+
+    A recording that takes longer than `limit_s` [s] counts as unread.
+
+    """
     begin = time.perf_counter()
+    if (shown := os.fsencode(found.path).decode(errors='backslashreplace')) != found.path:
+        return Done('unread', unread_row(Input(shown, ''), options, InputError(
+            f'the name {shown} is not UTF-8, expected UTF-8', 'rename it')))
     try:
         with on_disk(found.path) as path:
             content = content_hash(path)
             key = key_of(content, found, options)
             if store.has(key):
                 return Done('skipped')
-            row, calibration = _result(found, path, options)
+            row, calibration = _apart_from_here().call_within(limit_s, _result, found, path,
+                                                              options)
+    except TimeoutError:
+        return Done('unread', unread_row(found, options, InputError(
+            f'{found.path} takes longer than {limit_s:g} s, expected less',
+            'raise --time-limit, or leave it out')))
     except (OSError, EOFError) as err:
         error = system_error(err if isinstance(err, OSError) else OSError(str(err)))
         return Done('unread', unread_row(found, options, error))
@@ -298,6 +357,14 @@ def calibrate_recording(found: Input, options: Options, store: Store) -> Done:
         row['warnings'] += _exported(calibration, store.folder / name, options.exports)
     store.add(row)
     return Done(row['status'])
+
+
+def _apart_from_here() -> WorkerProcess:
+    """Return the process of this thread; it ends with this process."""
+    if not hasattr(_apart, 'process'):
+        _apart.process = WorkerProcess(idle=False)
+    process: WorkerProcess = _apart.process
+    return process
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

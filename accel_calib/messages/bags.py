@@ -13,9 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import contextmanager
+import errno
 import glob
+import os
 from pathlib import Path
 import shutil
+import sqlite3
 from tempfile import mkdtemp
 import time
 from typing import Any, TYPE_CHECKING
@@ -184,14 +187,14 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
     imu = {id(connection) for connection in bag.connections(correction.topic)}
     written = 0
     writer = _writer(bag, target, out.suffix)
-    with writer:
+    with _full_disk(out), writer:
         with damage_as_input_error(bag.path):
             outputs = _added(bag, writer)
         for block in bag.blocks():
             which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
             new = correction([block[k][2] for k in which]).each() if which else ()
             changed = dict(zip(which, new, strict=True))
-            with damage_as_input_error(bag.path):  # a stamp can be out of range
+            with damage_as_input_error(bag.path), _full_disk(out):  # a stamp can be out of range
                 for k, (connection, stamp, raw) in enumerate(block):
                     writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
             written += len(block)
@@ -199,6 +202,18 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
     _check_copy(bag, target, written)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
     return correction.done
+
+
+@contextmanager
+def _full_disk(out: Path) -> Iterator[None]:
+    """Raise OSError with the name of the copy; SQLite has an error of its own for a full disk."""
+    try:
+        yield
+    except sqlite3.OperationalError as err:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out)) from err
+    except OSError as err:
+        err.filename = str(out)
+        raise
 
 
 def _check_copy(bag: Bag, target: Path, written: int) -> None:

@@ -110,6 +110,25 @@ class WorkerProcess:
         with self._turn:
             return self._call(function, given)
 
+    def call_within(self, limit_s: float, function: Callable[..., Found], *given: Any) -> Found:
+        """
+        Return the result of a module-level function, called in the process alone.
+
+        After `limit_s` [s] the process is ended: TimeoutError. EOFError if it dies. The next call
+        starts another one.
+
+        """
+        with self._turn:
+            self.start()
+            try:
+                good, found = self._ask(function, given, limit_s)
+            except (OSError, EOFError, pickle.UnpicklingError) as err:
+                self._end()
+                raise err if isinstance(err, TimeoutError) else EOFError from err
+            if not good:
+                raise found
+            return cast('Found', found)
+
     def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
         """Call a function as `call` does, or at once in this process if the other one is busy."""
         if not self._turn.acquire(blocking=False):
@@ -135,7 +154,8 @@ class WorkerProcess:
             raise found
         return cast('Found', found)
 
-    def _ask(self, function: Callable[..., Any], given: tuple[Any, ...]) -> tuple[bool, Any]:
+    def _ask(self, function: Callable[..., Any], given: tuple[Any, ...],
+             limit_s: float | None = None) -> tuple[bool, Any]:
         process = self._process
         if self._closed:  # perhaps while another thread started the process
             self._end()
@@ -148,6 +168,8 @@ class WorkerProcess:
             self._end()
             self.start()
             return self._ask(function, given)
+        if not select([process.stdout], [], [], limit_s)[0]:
+            raise TimeoutError
         answer: tuple[bool, Any] = pickle.load(process.stdout)
         return answer
 

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from .plain_yaml import array_at, read_plain, value_at, values_at
-from ..calibrate import FleetPrior
+from ..calibrate import FleetPrior, LARGEST_OFFSET_G
 from ..disk import write_atomically
 from ..effects import MODELS, parameter_names
 from ..errors import InputError
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 _FORMAT = 1
 _NAMES = parameter_names(MODELS['10'].effects)
+_LARGEST = LARGEST_OFFSET_G
+"""Largest offset [g], deviation of a gain from 1, and variance of them."""
+
 
 _CONTEXT = {'temperature': ('temperature', 1.0), 'supply_voltage': ('supply_voltage', 1.0),
             'std': ('vibration', STANDARD_GRAVITY), 'time': ('wait', 1.0)}
@@ -92,12 +95,14 @@ def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
     size = len(_NAMES)
     if tuple(content['names']) != _NAMES:
         raise ValueError(f'names are {content["names"]}, expected {list(_NAMES)}')
-    covariance = array_at(content, 'covariance', (size, size))
+    covariance = array_at(content, 'covariance', (size, size), most=_LARGEST)
     if not np.allclose(covariance, covariance.T):
         raise ValueError('covariance is not symmetric')
-    prior = Prior(array_at(content, 'mean', (size,)), covariance)
+    prior = Prior(array_at(content, 'mean', (size,), most=_LARGEST), covariance)
     _ = prior.whitening  # raises LinAlgError unless it is positive definite
-    return FleetPrior(str(content['model']), value_at(content, 'sensors', int), prior)
+    if (sensors := value_at(content, 'sensors', int)) < 1:
+        raise ValueError(f'sensors is {sensors}, expected 1 or more')
+    return FleetPrior(str(content['model']), sensors, prior)
 
 
 def write_plan(path: Path, plan: PosePlan) -> None:
