@@ -20,7 +20,8 @@ thermometer. If the driver in the namespace publishes the temperature, add
 activates it once; later transitions are up to you, for example by `ros2 lifecycle set`.
 
 **Live page.** With ``web:=true`` the node serves the live page at `web_port` of this machine, and
-logs its link. For a phone, add ``web_host:=0.0.0.0``. A second node needs another port.
+logs the file with its link. For a phone, add ``web_host:=0.0.0.0``. A second node needs another
+port.
 
 """
 

@@ -102,7 +102,7 @@ from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
 from accel_calib.live.server import PageServer
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.live.viewer import qr_code, reachable
+from accel_calib.live.viewer import announce, qr_code, reachable
 from accel_calib.logs import (
     are_samples,
     bag_samples,
@@ -224,6 +224,8 @@ PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'
 CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
+PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'
+PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_base, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
 import re
 import socket
+import sys
 from threading import Event, Thread
 import time
 
@@ -24,10 +26,13 @@ from inside import (
     LIVE_COMMANDS,
     live_log,
     LIVE_PERIOD,
+    main,
     model_with,
     PAGE_FOLDER,
     PageServer,
     PATIENCE_FOR_A_HELLO,
+    PATIENCE_FOR_A_REQUEST,
+    PERIOD_OF_A_COMPLAINT,
     qr_code,
     reachable,
     simulate_recording,
@@ -262,6 +267,7 @@ def test_pages_have_the_headers_of_security(shared: Bench) -> None:
         assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'; ")
         assert "frame-ancestors 'none'" in policy
         assert 'unsafe' not in policy
+        assert headers['Server'] == 'accel_calib'
         assert (headers['X-Content-Type-Options'], headers['Referrer-Policy'],
                 headers['Cache-Control']) == ('nosniff', 'no-referrer', 'no-store')
 
@@ -412,10 +418,83 @@ def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) ->
 
 
 def test_a_missing_package_is_an_error_in_one_line(
-        shared: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__('sys').modules, 'aiohttp', None)
-    with pytest.raises(InputError, match='aiohttp is not installed.*run pip install'):
-        PageServer(shared.host.exchange, '127.0.0.1', 0)
+        capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('aiohttp', 'accel_calib.live.host'):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(['live', 'recording.csv']) == 2
+    found = capsys.readouterr().err
+    assert re.fullmatch('.*aiohttp is not installed.*run pip install.*\n', found)
+
+
+def send_slowly(client: socket.socket) -> None:
+    """Send a header that does not end."""
+    client.sendall(b'GET / HTTP/1.1\r\nX: ')
+    while True:
+        client.sendall(b'x')
+        time.sleep(PAUSE)
+
+
+def test_a_request_that_does_not_end_is_closed(
+        bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(*PATIENCE_FOR_A_REQUEST, 0.3)
+    viewer = bench.viewer()
+    with (socket.create_connection(('127.0.0.1', bench.port)) as slow,
+          pytest.raises(ConnectionError)):
+        send_slowly(slow)
+    count = len(viewer.of('progress'))
+    wait(lambda: len(viewer.of('progress')) > count)
+
+
+MALFORMED = [
+    b'\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n', b'GET\r\n\r\n',
+    b'\r\n' * 9 + b'\x00\r\n\r\n',
+    b'GET / HTTP/9.9.9\r\n\r\n', b'GET / HTTP/1.1\r\nno colon\r\n\r\n',
+    b'GET / HTTP/1.1\r\nHost : x\r\n\r\n', b'GET / HTTP/1.1\r\nX: ' + 20000 * b'x' + b'\r\n\r\n',
+    b'POST / HTTP/1.1\r\nContent-Length: -1\r\n\r\n',
+    b'GET / HTTP/1.1\r\nContent-Length: 1\r\nTransfer-Encoding: chunked\r\n\r\n']
+
+
+def test_requests_that_are_not_http_are_counted_in_one_line(
+        bench: Bench, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    def complaints() -> list[str]:
+        return [line.words for line in bench.logged if 'not HTTP' in line.words]
+
+    for request in MALFORMED:
+        head, _, body = sent(bench.port, request).partition(b'\r\n\r\n')
+        assert re.match(rb'HTTP/1\.[01] 400 ', head), request
+        assert (b'Server: accel_calib\r\n' in head, body.count(b'\n')) == (True, 1), request
+        assert b'Content-Security-Policy' in head
+    wait(complaints)
+    monkeypatch.setattr(*PERIOD_OF_A_COMPLAINT, 0.0)
+    sent(bench.port, MALFORMED[0])
+    wait(lambda: len(complaints()) > 1)
+    assert [words.partition('(')[2] for words in complaints()] == [
+        '1 so far)', f'{len(MALFORMED) + 1} so far)']
+    assert not caplog.records
+
+
+@pytest.mark.parametrize('headers', [
+    '', 'Upgrade: websocket\r\nConnection: Upgrade\r\n',
+    'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 7\r\n',
+    'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+    'Sec-WebSocket-Key: x\r\n'])
+def test_a_stream_that_is_no_websocket_is_refused(shared: Bench, headers: str) -> None:
+    found = sent(shared.port, f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{shared.port}\r\n{headers}'
+                 '\r\n'.encode())
+    head, _, body = found.partition(b'\r\n\r\n')
+    assert (head.split()[1], body.count(b'\n')) == (b'400', 1)
+    assert b'Server: accel_calib\r\n' in head
+
+
+def sent(port: int, request: bytes) -> bytes:
+    """Send a request, and return all that is answered until the connection ends."""
+    with socket.create_connection(('127.0.0.1', port)) as client:
+        client.sendall(request)
+        found = b''
+        with suppress(ConnectionError):
+            while part := client.recv(4096):
+                found += part
+        return found
 
 
 def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) -> None:

@@ -5,17 +5,25 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
+import os
 from pathlib import Path
+import re
+import resource
 import signal
+import socket
+import stat
 import subprocess
 import sys
+import tempfile
 import time
+from urllib.parse import urlsplit
 
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_log
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
+    announce,
     CLOCK_OF_A_SOURCE,
     COMMAND,
     HEAD_OF_A_PORT,
@@ -28,7 +36,7 @@ from live_bench import TurnedSensor
 import numpy as np
 import pytest
 from serial_board import board
-from viewer import Viewer, wait
+from viewer import link_of, Viewer, wait
 
 RATE_HZ = 200.0
 
@@ -225,9 +233,11 @@ def lines_of(sensor: TurnedSensor) -> Iterator[str]:
 
 @contextmanager
 def live(*arguments: str) -> Iterator[tuple[str, list[str], subprocess.Popen[str]]]:
-    """Run the command, and yield the link that it prints, its lines, and the process."""
+    """Run the command, and yield the link of its page, its lines, and the process."""
+    home = tempfile.TemporaryDirectory()
     process = subprocess.Popen([sys.executable, *COMMAND, 'live', '--port', '0', *arguments],
-                               stdout=subprocess.PIPE, text=True)
+                               stdout=subprocess.PIPE, text=True,
+                               env={**os.environ, 'ROS_HOME': home.name})
     assert process.stdout is not None
     lines: list[str] = []
     try:
@@ -236,11 +246,12 @@ def live(*arguments: str) -> Iterator[tuple[str, list[str], subprocess.Popen[str
             if line.startswith('live page: '):
                 break
         assert lines, 'the command has ended'
-        yield lines[-1].removeprefix('live page: '), lines, process
+        yield link_of(lines[-1]), lines, process
     finally:
         process.kill()
         process.wait()
         process.stdout.close()
+        home.cleanup()
 
 
 def follow(viewer: Viewer, sensor: TurnedSensor) -> None:
@@ -271,6 +282,84 @@ def test_a_board_on_a_serial_port_is_calibrated(tmp_path: Path) -> None:
     assert calibration.units.name == 'native'
     offset = calibration.units.to_g(calibration.offset)
     np.testing.assert_allclose(offset, (0.03, -0.02, 0.04), atol=0.002)
+
+
+def flat(folder: Path) -> Path:
+    """Write a recording of a sensor that lies flat."""
+    path = folder / 'recording.csv'
+    path.write_text('time,ax,ay,az\n' + ''.join(f'{k / 50},0,0,9.8\n' for k in range(100)),
+                    encoding='utf-8')
+    return path
+
+
+def test_idle_connections_do_not_keep_the_owner_out(tmp_path: Path) -> None:
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(2000, most[0]), most[1]))
+    with (live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, _, run),
+          ExitStack() as idle):
+        resource.prlimit(run.pid, resource.RLIMIT_NOFILE, (1024, 1024))
+        at = urlsplit(link)
+        for _ in range(1100):
+            idle.enter_context(socket.create_connection((at.hostname, at.port)))
+        viewer = Viewer(link)
+        assert viewer.got[0]['may']
+        for _ in range(200):
+            idle.enter_context(socket.create_connection((at.hostname, at.port)))
+        assert not viewer.ask('fit')['success']  # it is answered
+        assert viewer.code is None
+        assert len(os.listdir(f'/proc/{run.pid}/fd')) < 200
+        viewer.close()
+        run.send_signal(signal.SIGINT)
+        printed = run.communicate(timeout=PATIENCE)[0].splitlines()
+        assert run.returncode == 0
+    assert sum('ended a connection' in line for line in printed) == 1
+    assert len(printed) < 20
+    resource.setrlimit(resource.RLIMIT_NOFILE, most)
+
+
+def test_the_link_with_the_token_is_only_in_a_file_of_its_owner(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        with live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, lines, run):
+            file = Path(lines[-1].rpartition(' is in ')[2])
+            assert stat.S_IMODE(file.stat().st_mode) == 0o600
+            assert len(link.partition('#')[2]) == 22
+            assert link.partition('#')[2] not in '\n'.join(lines)
+            run.send_signal(signal.SIGINT)
+            assert run.wait(PATIENCE) == 0
+            assert not file.exists()
+    finally:
+        os.umask(before)
+
+
+def test_without_a_folder_for_the_link_the_page_only_shows(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+        ) -> None:
+    monkeypatch.setenv('ROS_HOME', str(flat(tmp_path)))
+    words, file = announce('http://127.0.0.1:1/#secret', 'live_page_1.txt')
+    assert ('secret' in words, file) == (False, None)
+    assert 'only shows' in words
+    assert 'set ROS_HOME' in words
+    assert capfd.readouterr().out == ''
+
+
+def test_a_terminal_shows_the_link_with_the_token(tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    run = subprocess.Popen(
+        [sys.executable, *COMMAND, 'live', '--port', '0', str(flat(tmp_path)), '-o',
+         str(tmp_path / 'c.yaml')], stdout=theirs, env={**os.environ, 'ROS_HOME': str(tmp_path)})
+    try:
+        shown = b''
+        while not re.search(rb'http://127.0.0.1:\d+/#[\w-]{22}\r\n', shown):
+            shown += os.read(ours, 4096)
+        assert not (tmp_path / 'accel_calib').exists()
+        run.send_signal(signal.SIGINT)
+        assert run.wait(PATIENCE) == 0
+    finally:
+        run.kill()
+        run.wait()
+        os.close(ours)
+        os.close(theirs)
 
 
 def test_a_missing_recording_or_port_is_one_line_and_status_2(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import math
+import os
 from pathlib import Path
 import select
 import signal
@@ -20,8 +21,9 @@ from inside import spread_directions
 from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
+import rcl_interfaces.msg
 from sensor_msgs.msg import Imu
-from viewer import fetch, Viewer, wait
+from viewer import fetch, link_of, Viewer, wait
 
 DIRECTIONS = spread_directions(12)
 
@@ -48,7 +50,7 @@ def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
     """Yield a viewer of a calibrator with a page."""
     node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=free_port(),
                             passthrough=True)
-    made = Viewer(printed_until(node, 'live page: ').split('live page: ')[1].strip())
+    made = Viewer(link_of(printed_until(node, 'live page: ')))
     made.node = node  # type: ignore[attr-defined]
     yield made
     made.close()
@@ -111,6 +113,22 @@ def test_a_node_with_viewers_ends_cleanly(viewer: Viewer, bench: Any) -> None:
     wait(lambda: viewer.code)
 
 
+def test_the_token_is_neither_in_the_log_of_the_node_nor_in_rosout(
+        bench: Any, viewer: Viewer) -> None:
+    node = viewer.node  # type: ignore[attr-defined]
+    heard = bench.listen(rcl_interfaces.msg.Log, '/rosout', latched=True)
+    bench.spin(lambda: any('live page: ' in line.msg for line in heard))
+    code, printed = bench.end(node, signal.SIGINT)
+    assert code == 0
+    folder = Path(os.environ.get('ROS_LOG_DIR') or bench.home / 'log')
+    file, = folder.glob(f'*_{node.pid}_*.log')
+    logged = file.read_text(encoding='utf-8')
+    assert 'live page: ' in logged
+    for text in (printed, logged, *(line.msg for line in heard)):
+        assert viewer.token not in text
+    assert not list((bench.home / 'accel_calib').glob('live_page_*'))
+
+
 def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
@@ -130,7 +148,7 @@ def test_the_managed_node_serves_the_page_while_it_is_configured(
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
     for _ in range(2):  # the second page is at the same port
         bench.go(Transition.TRANSITION_CONFIGURE)
-        viewer = Viewer(printed_until(node, 'live page: ').split('live page: ')[1].strip())
+        viewer = Viewer(link_of(printed_until(node, 'live page: ')))
         bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(

@@ -8,11 +8,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 import json
+from pathlib import Path
 from threading import Thread
 import time
 from typing import Any
 
 import aiohttp
+
+
+def link_of(line: str) -> str:
+    """Return the link with the token, from the file that a log line names."""
+    return Path(line.strip().rpartition(' is in ')[2]).read_text(encoding='utf-8').strip()
 
 
 class Viewer:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-import sys
 from typing import Any, TYPE_CHECKING
 
 from rich.table import Table
@@ -44,12 +43,12 @@ def run_simulator(args: argparse.Namespace) -> Done:
 
 def run_live(args: argparse.Namespace) -> Done:
     """Serve the live page without ROS until the user ends it."""
+    from ..live import check_installed
+    check_installed()
     from ..live.host import Host
     from ..live.sources import open_source
-    from ..live.viewer import check_installed, qr_code
     from ..session import CalibratorSettings
 
-    check_installed()
     output = Output()
     with (open_source(args.source, log_options(args), baud=args.baud,
                       speed=args.speed) as source, ended() as is_over):
@@ -60,10 +59,7 @@ def run_live(args: argparse.Namespace) -> Done:
             web_host=args.host, web_port=args.port, **settings(args)),
             lambda line: output.print(line.words))
         try:
-            output.print(f'live page: {host.server.link}')
-            if sys.stdout.isatty():
-                print(qr_code(host.server.link))
-            sys.stdout.flush()
+            print(host.server.announce(), flush=True)  # a file name is not wrapped
             host.run(is_over)
         finally:
             host.close()
@@ -79,7 +75,7 @@ def run_demo(args: argparse.Namespace) -> Done:
                          NEEDS_ROS) from err
     output = console(args)
     if args.web:
-        from ..live.viewer import check_installed
+        from ..live import check_installed
         from ..session import WEB_PORT
 
         check_installed()

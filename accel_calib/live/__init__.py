@@ -9,3 +9,14 @@ session: that of the node, or one of its own with the samples of `sources`. `pag
 files for the browser.
 
 """
+
+from ..errors import InputError
+
+
+def check_installed() -> None:
+    """Raise InputError if aiohttp, which the modules of this folder import, is not installed."""
+    try:
+        import aiohttp  # noqa: F401
+    except ImportError as error:
+        raise InputError('aiohttp is not installed, but the live page needs it',
+                         "run pip install 'accel_calib[live]'") from error

@@ -9,8 +9,8 @@ that changes the session: it takes samples, runs commands, and finishes jobs. Th
 therefore yield a block, which can be empty, after a short time. After its end, the page and its
 commands continue to work.
 
-An `Exchange` belongs to the thread of the session. Only `ask`, `page` and `export` are called by
-the server in its thread, and they pass the work on.
+An `Exchange` belongs to the thread of the session. The server calls only `ask`, `page`, `export`
+and `warn`, in its own thread, and they pass the work on.
 
 """
 
@@ -85,7 +85,7 @@ class Exchange:
     """
 
     def __init__(self, session: Session, worker: Worker, call_soon: CallSoon,
-                 log: Callable[[Log], object], flush: Callable[[], object]) -> None:
+                 log: Callable[[Log], None], flush: Callable[[], object]) -> None:
         self._session, self._worker, self._call_soon = session, worker, call_soon
         self._log, self._flush = log, flush
         self.show: Show = lambda message: None
@@ -134,6 +134,10 @@ class Exchange:
     def export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
         """Call `answer` with an export of the calibration in use, or why there is none."""
         self._call_soon(lambda: self._export(name, answer))
+
+    def warn(self, words: str) -> None:
+        """Log a warning of the server."""
+        self._call_soon(lambda: self._log(Log('warning', words)))
 
     def _ask(self, name: str, answer: Answer) -> None:
         if name in self._worker.running:
@@ -230,7 +234,7 @@ class Host:
     """
 
     def __init__(self, source: Source, settings: CalibratorSettings,
-                 log: Callable[[Log], object]) -> None:
+                 log: Callable[[Log], None]) -> None:
         self._source, self._print, self._filter = source, log, LogFilter()
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []

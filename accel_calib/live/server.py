@@ -15,7 +15,7 @@ come from a fixed list.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from concurrent.futures import Future
 import hmac
 from importlib.resources import files
@@ -23,23 +23,42 @@ from ipaddress import ip_address
 import secrets
 import socket
 from threading import Thread
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import Any, cast, Protocol, TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from aiohttp import web
+
 from . import messages
-from .viewer import check_installed, not_bound, reachable, STUCK_S, TooManyError, Viewer
+from .viewer import (
+    announce,
+    Connection,
+    not_bound,
+    reachable,
+    secured,
+    STUCK_S,
+    TooManyError,
+    Viewer,
+)
 from ..report.sheet import policy
-from ..session import Answer
+from ..session import Answer, Log, LogFilter
 from ..stored.exports import Exported, FORMATS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from importlib.resources.abc import Traversable
-
-    from aiohttp import web
+    from pathlib import Path
 
 _VIEWERS = 16
 """Largest number of viewers, and of connections that have not said hello yet."""
+
+_CONNECTIONS = 64
+"""Largest number of connections: of viewers, and of requests that arrive or are answered."""
+
+_QUIET_S = 60.0
+"""Shortest time between two log lines about the same misuse [s]."""
+
+_ENDING_S = 1.0
+"""Time in which answers are completed at the end [s]."""
 
 _LINES = 500
 """Number of log lines that are kept."""
@@ -51,19 +70,11 @@ _KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript',
           '.svg': 'image/svg+xml', '.png': 'image/png'}
 """Types of the files of the page, by the end of their name."""
 
-_HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
-            'Referrer-Policy': 'no-referrer', 'Cache-Control': 'no-store',
-            'Cross-Origin-Resource-Policy': 'same-origin',
-            'Content-Security-Policy': (
-                "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-                "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
-                "frame-ancestors 'none'")}
-
-
-_NO_TOKEN = 'this link has no token, so it only shows; open the link with the token, which the ' \
-            'program printed at its start'
+_ITS_LINK = 'open the link with the token, which the program showed on its terminal at its last ' \
+            'start, or wrote into the file that its log names'
+_NO_TOKEN = f'this link has no token, so it only shows; {_ITS_LINK}'
 _WRONG_TOKEN = 'the token of this link is of another start of the program, so it only shows; ' \
-               'open the link that it printed at its last start'
+               f'{_ITS_LINK}'
 
 
 class Desk(Protocol):
@@ -77,6 +88,9 @@ class Desk(Protocol):
 
     def export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
         """Call `answer` with an export, or why there is none."""
+
+    def warn(self, words: str) -> None:
+        """Log a warning."""
 
 
 class PageServer:
@@ -99,26 +113,23 @@ class PageServer:
     viewers : list of Viewer
         The viewers that have said hello, the oldest first.
 
-    Raises
-    ------
-    InputError
-        If a package that the page needs is not installed.
-
     """
 
     def __init__(self, desk: Desk, host: str, port: int) -> None:
-        check_installed()
         self._desk, self._host, self._port = desk, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._over: asyncio.Event | None = None
         self._thread: Thread | None = None
+        self._link_file: Path | None = None
         self._newest: dict[str, tuple[messages.Message, str]] = {}
         self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
         self._history: deque[messages.Message] = deque(
             maxlen=int(messages.HISTORY_S / messages.PERIOD))
         self.viewers: list[Viewer] = []
         self._new: list[Viewer] = []
+        self._connections: list[Connection] = []
+        self._reported, self._filter = Counter[str](), LogFilter()
         self._hosts: frozenset[str] = frozenset()
         self._versions: frozenset[int] = frozenset()
         page = files(__package__) / 'page'
@@ -147,6 +158,13 @@ class PageServer:
             self._call(self._over.set)
             self._thread.join()
             self._thread = None
+        if self._link_file is not None:
+            self._link_file.unlink(missing_ok=True)
+
+    def announce(self) -> str:
+        """Show the link to its owner alone, and return a log line; see `viewer.announce`."""
+        words, self._link_file = announce(self.link, f'live_page_{self._port}.txt')
+        return words
 
     def show(self, message: messages.Message) -> None:
         """Show a message to all viewers, and keep it for those who come later."""
@@ -174,27 +192,52 @@ class PageServer:
 
     async def _serve(self, started: Future[None]) -> None:
         """Serve until `close` is called."""
-        from aiohttp import web
-        app = web.Application(client_max_size=messages.LARGEST)
-        app.router.add_route('*', '/{path:.*}', self._answer)
-        app.on_response_prepare.append(_secure)
-        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        self._loop = loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._on_error)
+        http = web.Server(self._answer)
         try:
-            await runner.setup()
-            site = web.TCPSite(runner, self._host, self._port)
-            await site.start()
+            listener = await loop.create_server(
+                lambda: Connection(self, http), self._host, self._port)
         except Exception as error:  # `start` raises it, in its own thread
-            await runner.cleanup()
             started.set_exception(error)
             return
-        self._know_names(runner.addresses)
-        self._loop, self._over = asyncio.get_running_loop(), asyncio.Event()
+        self._know_names([each.getsockname() for each in listener.sockets])
+        self._over = asyncio.Event()
         started.set_result(None)
         self._look()
         await self._over.wait()
+        listener.close()
         for viewer in [*self.viewers, *self._new]:
             viewer.abort()
-        await runner.cleanup()
+        await http.shutdown(_ENDING_S)
+
+    def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Report that no file is left for a new connection; other errors are defects."""
+        error = context.get('exception')
+        if isinstance(error, OSError):
+            self.report(f'cannot accept a connection: {error.strerror}')
+        else:
+            loop.default_exception_handler(context)
+
+    def add(self, connection: Connection) -> None:
+        """Add a connection; at the limit, end the one of the lowest stage, the oldest of them."""
+        if len(self._connections) >= _CONNECTIONS:
+            self.report(f'ended a connection, because {_CONNECTIONS} were open')
+            ended = min(self._connections, key=lambda each: each.stage)
+            self.remove(ended)
+            ended.abort()
+        self._connections.append(connection)
+
+    def remove(self, connection: Connection) -> None:
+        """Remove a connection, unless it is removed already."""
+        if connection in self._connections:
+            self._connections.remove(connection)
+
+    def report(self, what: str) -> None:
+        """Count what the page had to do, and log it at most once in `_QUIET_S`."""
+        self._reported[what] += 1
+        if self._filter.passes(Log('warning', what, what, _QUIET_S)):
+            self._desk.warn(f'the live page {what} ({self._reported[what]} so far)')
 
     def _know_names(self, addresses: list[Any]) -> None:
         """Note the port, and the names by which a browser may call this server."""
@@ -250,15 +293,20 @@ class PageServer:
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())
 
-    async def _answer(self, request: web.Request) -> web.StreamResponse:
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer a request."""
-        from aiohttp import web
+        connection = cast('Connection', request.protocol)
+        connection.stage = 1
         refusal = self._refusal(request)
         if refusal:
-            return web.Response(status=403, text=f'{refusal}\n')
+            return secured(web.Response(status=403, text=f'{refusal}\n'))
         path = request.rel_url.raw_path if request.method == 'GET' else ''
         if path == '/stream':
-            return await self._stream(request)
+            return await self._stream(request, connection)
+        return secured(await self._file(request, path))
+
+    async def _file(self, request: web.BaseRequest, path: str) -> web.Response:
+        """Return a file of the page, the calibration page, or an export."""
         if path == '/calibration.html':
             return await self._page()
         if path.startswith('/export/') and path.removeprefix('/export/') in FORMATS:
@@ -269,13 +317,13 @@ class PageServer:
         return web.Response(body=file.read_bytes(), content_type=_kind_of(file.name),
                             charset=None if file.name.endswith('.png') else 'utf-8')
 
-    def _refusal(self, request: web.Request) -> str:
+    def _refusal(self, request: web.BaseRequest) -> str:
         """Return why a request is refused by its Host or Origin; empty if it is not."""
         hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
         if len(hosts) != 1 or not self._is_own(hosts[0]):
-            return 'the header Host is not an address of this server; open the link it printed'
+            return 'the header Host is not an address of this server; open its own link'
         if origins and [each.lower() for each in origins] != [f'http://{hosts[0].lower()}']:
-            return 'the header Origin is of another site; open the link that the server printed'
+            return 'the header Origin is of another site; open the link of this server'
         return ''
 
     def _is_own(self, host: str) -> bool:
@@ -294,20 +342,18 @@ class PageServer:
 
     async def _page(self) -> web.Response:
         """Return the calibration page."""
-        from aiohttp import web
         success, text = await self._asked(self._desk.page)
         if not success:
             return web.Response(status=404, text=f'{text}\n')
         allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
         return web.Response(text=text, content_type='text/html', headers=allowed)
 
-    async def _export(self, request: web.Request, name: str) -> web.Response:
+    async def _export(self, request: web.BaseRequest, name: str) -> web.Response:
         """Return an export as a download."""
-        from aiohttp import web
         kind, _, token = request.headers.get('Authorization', '').partition(' ')
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(
-                'the token is missing or wrong; open the link that the program printed\n'))
+                f'the token is missing or wrong; {_ITS_LINK}\n'))
         found, = await self._asked(lambda answer: self._desk.export(name, answer))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
@@ -327,13 +373,16 @@ class PageServer:
         ask(lambda *found: self._call(lambda: take(*found)))
         return await answered
 
-    async def _stream(self, request: web.Request) -> web.StreamResponse:
+    async def _stream(self, request: web.BaseRequest, connection: Connection
+                      ) -> web.StreamResponse:
         """Serve a viewer until it ends."""
-        from aiohttp import web
-        socket_ = web.WebSocketResponse(
-            heartbeat=STUCK_S / 1.5, max_msg_size=messages.LARGEST, compress=False)
+        socket_ = secured(web.WebSocketResponse(
+            heartbeat=STUCK_S / 1.5, max_msg_size=messages.LARGEST, compress=False))
+        if not socket_.can_prepare(request).ok:
+            return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
-        viewer = Viewer(self, socket_, request)
+        connection.stage = 2
+        viewer = Viewer(self, socket_, connection)
         if len(self._new) >= _VIEWERS:
             self._close(self._new[0])
         self._new.append(viewer)
@@ -375,12 +424,6 @@ class PageServer:
         """Ask the desk, and call `answer` in this thread."""
         self._desk.ask(command, lambda success, words: self._call(
             lambda: answer(success, words)))
-
-
-async def _secure(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the headers of security; a response can have its own policy."""
-    for name, value in _HEADERS.items():
-        response.headers.setdefault(name, value)
 
 
 def _kind_of(name: str) -> str:

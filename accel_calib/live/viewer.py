@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The link of the live page, and a viewer that has opened it: a WebSocket connection.
+The link of the live page, its connections, and its viewers.
+
+A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
+viewer is a connection that has become a WebSocket.
 
 A task of the viewer sends what is new for it: the newest progress, poses and state, the log lines
 that it does not have, and the answers to its commands. Nothing else is queued. A viewer that takes
@@ -15,22 +18,30 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 import errno
+from http import HTTPStatus
 import io
 from ipaddress import ip_address
 import math
+import os
+from pathlib import Path
 import socket
-from typing import Any, TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, TypeVar
+
+from aiohttp import web, WSCloseCode, WSMsgType
 
 from . import messages
 from ..errors import InputError
+from ..session import ros_home
 
 if TYPE_CHECKING:
-    from aiohttp import web
-
     from .server import PageServer
 
 STUCK_S = 10.0
 """Time after which a viewer that takes no data, or does not answer, is closed [s]."""
+
+_REQUEST_S = 10.0
+"""Time within which a connection must send its request [s]."""
 
 _HELLO_S = 5.0
 """Time within which a new viewer must say hello [s]."""
@@ -38,17 +49,18 @@ _HELLO_S = 5.0
 _COMMANDS = 16
 """Largest number of commands of a viewer that wait for their answers."""
 
+_HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
+            'Referrer-Policy': 'no-referrer', 'Cache-Control': 'no-store',
+            'Cross-Origin-Resource-Policy': 'same-origin',
+            'Content-Security-Policy': (
+                "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+                "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
+                "frame-ancestors 'none'")}
+
+Answered = TypeVar('Answered', bound=web.StreamResponse)
+
 _BUFFER = 65536
 """Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
-
-
-def check_installed() -> None:
-    """Raise InputError if aiohttp is not installed."""
-    try:
-        import aiohttp  # noqa: F401
-    except ImportError as error:
-        raise InputError('aiohttp is not installed, but the live page needs it',
-                         "run pip install 'accel_calib[live]'") from error
 
 
 def qr_code(link: str) -> str:
@@ -60,6 +72,32 @@ def qr_code(link: str) -> str:
     drawn = io.StringIO()
     segno.make(link, micro=False).terminal(out=drawn, compact=True)
     return drawn.getvalue()
+
+
+def announce(link: str, name: str) -> tuple[str, Path | None]:
+    """
+    Show a link with its token to its owner alone; return a log line, and the file with the link.
+
+    A terminal shows the link. Other output may be a log that others can read, so that the link is
+    then written into the file `name` of mode 600 in ``accel_calib`` in `ros_home`.
+
+    """
+    words = f'live page: {link.partition("#")[0]}'
+    if sys.stdout.isatty():
+        sys.stdout.write(f'live page: {link}\n{qr_code(link)}\n')
+        sys.stdout.flush()
+        return f'{words}; its link with the token is on the terminal', None
+    try:
+        file = ros_home() / 'accel_calib' / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        with open(file, 'x', encoding='utf-8',
+                  opener=lambda name, flags: os.open(name, flags, 0o600)) as opened:
+            opened.write(f'{link}\n')
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
+        return (f'{words}, which only shows, because the link with its token cannot be kept in a '
+                f'file: {error}; set ROS_HOME to a folder that can be written'), None
+    return f'{words}; its link with the token is in {file}', file
 
 
 def not_bound(error: OSError, host: str, port: int) -> InputError:
@@ -90,6 +128,63 @@ def reachable(host: str) -> str:
         return str(probe.getsockname()[0])
 
 
+def secured(response: Answered) -> Answered:
+    """Add the headers of security, and let the connection end; a response can have its policy."""
+    for name, value in _HEADERS.items():
+        response.headers.setdefault(name, value)
+    response.force_close()
+    return response
+
+
+class Connection(web.RequestHandler):
+    """
+    A connection.
+
+    Attributes
+    ----------
+    stage : int
+        0: its request has not arrived; 1: it is being answered; 2: it is a viewer.
+
+    """
+
+    def __init__(self, server: PageServer, http: web.Server) -> None:
+        super().__init__(http, loop=asyncio.get_running_loop(),
+                         access_log=None)  # type: ignore[arg-type]
+        self._owner, self.stage = server, 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Close the connection later, unless its request arrives."""
+        super().connection_made(transport)
+        self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self._abort_if_silent)
+        self._owner.add(self)
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        """Forget the connection."""
+        self._limit.cancel()
+        self._owner.remove(self)
+        super().connection_lost(exc)
+
+    def _abort_if_silent(self) -> None:
+        if not self.stage:
+            self.abort()
+
+    def abort(self) -> None:
+        """End the connection without waiting."""
+        if self.transport is not None:
+            self.transport.abort()
+
+    def handle_error(self, request: web.BaseRequest, status: int = 500,
+                     exc: BaseException | None = None, message: str | None = None
+                     ) -> web.StreamResponse:
+        """Return the answer to a request that is not HTTP, or to an unexpected error."""
+        if status != HTTPStatus.BAD_REQUEST:
+            return secured(super().handle_error(request, status, exc, message))
+        self.stage = 1
+        self._owner.report('refused a request that is not HTTP')
+        return secured(web.Response(
+            status=status, text='the request is not HTTP; open the link in a browser\n'))
+
+
 class TooManyError(InputError):
     """There are too many viewers."""
 
@@ -102,18 +197,21 @@ class Viewer:
     ----------
     why : str
         Why it only looks; empty: its commands are accepted. Set when it is admitted.
+    abort : callable
+        Function that ends the connection without waiting.
 
     """
 
-    def __init__(self, server: PageServer, websocket: Any, request: web.Request) -> None:
-        self._server, self._socket, self._transport = server, websocket, request.transport
+    def __init__(self, server: PageServer, websocket: web.WebSocketResponse,
+                 connection: Connection) -> None:
+        self._server, self._socket, self.abort = server, websocket, connection.abort
         self._sent: dict[str, messages.Message] = {}
         self._answers: deque[str] = deque()
         self._seen = 0
         self.why, self._asking = '', 0
         self._news = asyncio.Event()
         self._sending_since = math.inf
-        raw = None if self._transport is None else self._transport.get_extra_info('socket')
+        raw = websocket.get_extra_info('socket')
         if raw is not None:
             raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
 
@@ -126,14 +224,8 @@ class Viewer:
         if now - self._sending_since > STUCK_S:
             self.abort()
 
-    def abort(self) -> None:
-        """End the connection without waiting."""
-        if self._transport is not None:
-            self._transport.abort()
-
     async def run(self) -> None:
         """Serve the viewer until it ends."""
-        from aiohttp import WSCloseCode
         sending: asyncio.Task[None] | None = None
         try:
             hello = await self._next(_HELLO_S)
@@ -158,7 +250,6 @@ class Viewer:
 
     async def _next(self, timeout: float | None) -> messages.Hello | messages.Ask | None:
         """Return the next message of the viewer; None: it has ended."""
-        from aiohttp import WSMsgType
         message = await self._socket.receive(timeout=timeout)
         return messages.request_of(message.data) if message.type is WSMsgType.TEXT else None
 

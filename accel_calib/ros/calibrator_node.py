@@ -36,6 +36,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from .declare import (
+    CALLS,
     declared,
     follow,
     LATCHED,
@@ -125,8 +126,10 @@ class Calibrator:
     def _serve(self) -> None:
         for name in _TRIGGERS:
             serve(self._node, name, self._command(name), self._worker, self._log)
-        self._node.create_service(SetBool, '~/enable', self._on_enable)
-        self._node.create_service(SelfTest, '~/self_test', self._on_self_test)
+        self._node.create_service(SetBool, '~/enable', self._on_enable,
+                                  qos_profile=CALLS)
+        self._node.create_service(SelfTest, '~/self_test', self._on_self_test,
+                                  qos_profile=CALLS)
 
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
@@ -273,7 +276,8 @@ def in_executor(node: Node) -> CallSoon:
 def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker,
           log: Callable[[Log], object]) -> None:
     """Create the service ``~/name``, which logs and responds the result of a command."""
-    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response)
+    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response,
+                                  qos_profile=CALLS)
     send = service.send_response
 
     def send_response(response: Any, header: Any) -> None:

@@ -97,6 +97,15 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """For latched topics; late subscribers receive the last message."""
 
+CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""
+For services.
+
+The default depth is 10. If more calls than these wait for the node, the oldest ones are never
+answered. The depth of the answers that wait for a client is set by the client.
+
+"""
+
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node of which DDS knows only the topic so far."""
 

@@ -12,7 +12,6 @@ runs the commands of the page as those of the services.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-import sys
 from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -24,7 +23,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ..calibrate import NextPose
 from ..errors import AccelCalibError
+from ..live import check_installed
 from ..session import (
+    CalibratorSettings,
     CallSoon,
     Check,
     checks,
@@ -157,22 +158,23 @@ class Page:
         settings = self._session.settings
         if not settings.web_port:
             return
+        try:
+            self._serve(settings)
+        except AccelCalibError as error:
+            self._log(Log('error', str(error)))
+
+    def _serve(self, settings: CalibratorSettings) -> None:
+        """Serve the page."""
+        check_installed()
         from ..live.host import Exchange
         from ..live.messages import PERIOD
         from ..live.server import PageServer
-        from ..live.viewer import qr_code
         exchange = Exchange(self._session, self._worker, self._call_soon, self._log,
                             self._stream.flush)
-        try:
-            self._server = PageServer(exchange, settings.web_host, settings.web_port)
-            self._server.start()
-        except AccelCalibError as error:
-            self._log(Log('error', str(error)))
-            return
-        exchange.show, self._exchange = self._server.show, exchange
-        self._node.get_logger().info(f'live page: {self._server.link}')  # not for all viewers
-        if sys.stdout.isatty():
-            print(qr_code(self._server.link), flush=True)
+        server = PageServer(exchange, settings.web_host, settings.web_port)
+        server.start()
+        exchange.show, self._exchange, self._server = server.show, exchange, server
+        self._log(Log('info', server.announce()))
         self._node.create_timer(PERIOD, self._show_progress,
                                 clock=Clock(clock_type=ClockType.STEADY_TIME))
 

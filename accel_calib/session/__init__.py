@@ -26,6 +26,7 @@ from .settings import (
     WEB_PORT,
 )
 from .state import Check, checks, figures, Level, words_of_state, worst
+from .store import ros_home
 from .worker import (
     Answer,
     CallSoon,
@@ -49,4 +50,4 @@ __all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Che
            'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',
            'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
            'WorkerProcess', 'changed', 'checks', 'default_of', 'expected', 'figures', 'parameter',
-           'state', 'title', 'words_of_state', 'worst']
+           'ros_home', 'state', 'title', 'words_of_state', 'worst']

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import json
-import os
 from pathlib import Path
 import re
 import signal
@@ -18,6 +17,7 @@ from accel_calib.stored import read_calibration
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import Call, explained, State
+from faults.sample import FACTOR
 from inside import spread_directions
 import numpy as np
 import pytest
@@ -26,7 +26,8 @@ pytest.importorskip('rclpy')
 
 CALLER = Path(__file__).with_name('caller.py')
 CLIENTS = 4
-CALLS = 50 * int(os.environ.get('ACCEL_CALIB_TRIALS', '1'))
+CALLS = 50 * FACTOR
+ENABLES, AT_ONCE = 10_000 if FACTOR > 1 else 200, 100
 READING = np.array([1.0, 2.0, 9.0])
 _POSES = 12
 _SLOW = ('fit', 'refine')
@@ -93,3 +94,21 @@ def test_each_call_is_answered_and_all_agree_with_some_order(
         expected = (read_calibration(stored).apply(READING[np.newaxis])[0] if stored.exists()
                     else READING)
         np.testing.assert_allclose([force.x, force.y, force.z], expected, atol=1e-9)
+
+
+def test_each_call_of_enable_is_answered_while_messages_arrive(
+        bench: Any, readings: Callable[..., Any]) -> None:
+    from rclpy.qos import QoSProfile
+    from std_srvs.srv import SetBool
+    bench.calibrator(passthrough=True)
+    client = bench.node.create_client(SetBool, 'calibrator/enable',
+                                      qos_profile=QoSProfile(depth=AT_ONCE))
+    bench.spin(client.service_is_ready)
+    turned = readings(spread_directions(14), dwell=4.0)
+    for _ in range(ENABLES // AT_ONCE):
+        bench.send(bench.imu(turned[0]))
+        sent = [client.call_async(SetBool.Request(data=bool(k % 2))) for k in range(AT_ONCE)]
+        bench.spin(lambda sent=sent: all(each.done() for each in sent))
+        words = [each.result().message for each in sent]
+        assert all(each.startswith(f'the correction is {("off", "on")[k % 2]}')
+                   for k, each in enumerate(words))
