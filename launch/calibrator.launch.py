@@ -60,6 +60,10 @@ TOPICS = {
 """Topics by argument: name in the node, default and description."""
 
 PARAMETERS = {
+    'gravity': (float, 'Local gravity [m/s²].'),
+    'passthrough': (bool, 'Whether to publish raw messages until there is a calibration.'),
+    'auto_fit': (bool, 'Whether to fit automatically after enough poses.'),
+    'drift_warn': (float, 'Smallest lasting change of |a| at rest for a warning [m/s²].'),
     'units': (str, 'Unit of the incoming linear_acceleration: m/s2, g or native.'),
     'model': (str, 'Model for ~/fit: auto, 4, 7, 9 or 10.'),
     'frame': (str, 'Levelled frame of the messages: ros, ned or android.'),

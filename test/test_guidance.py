@@ -243,3 +243,9 @@ def test_an_effect_of_time_does_not_warn_for_ever() -> None:
     driver.handle()
     assert driver.finding('calibration').level == 0
     assert 'has left the range' not in driver.logged('warning')
+
+
+def test_a_wrong_topic_names_those_that_exist() -> None:
+    driver = Driver()
+    driver.session.imus = ('/camera/imu',)
+    assert next_action(driver.session).words.endswith('its topic, such as /camera/imu')

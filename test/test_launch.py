@@ -264,6 +264,8 @@ def test_namespace_moves_all_topics_but_the_temperature(started: Any) -> None:
 
 
 GIVEN = {
+    'gravity': ('9.81', 9.81), 'passthrough': ('true', True), 'auto_fit': ('true', True),
+    'drift_warn': ('0.02', 0.02),
     'units': ('g', 'g'), 'model': ('10', '10'), 'frame': ('ned', 'ned'),
     'output_frame_id': ('base', 'base'), 'rotate': ('false', False),
     'mounting_rpy': ('[0, 0.5, -1]', [0.0, 0.5, -1.0]), 'base_frame': ('base', 'base'),

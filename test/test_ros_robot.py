@@ -261,6 +261,13 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
 # Start and end
 
 
+def test_a_parameter_that_does_not_exist_is_named(bench: Any) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    process = bench.start('calibrator', unit='g')
+    bench.spin(lambda: diagnostics)
+    assert 'there is no parameter unit, ' in bench.end(process, signal.SIGINT)[1]
+
+
 def test_a_signal_at_any_time_of_the_start_ends_the_node_without_a_traceback(bench: Any) -> None:
     for wait in sample((0.05, 0.2, 0.4, 0.6, 0.8, 1.0, 1.3), 3):
         process = bench.start('calibrator')
@@ -274,8 +281,19 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         bench: Any, stored: Stored) -> None:
     from lifecycle_msgs.msg import Transition
     from lifecycle_msgs.srv import GetState
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
     heard = bench.listen(Imu, 'imu/data_calibrated')
     process = bench.start('calibrator_lifecycle', calibration_file=stored())
+    tried = {'model': '77', 'frame': 'ned', 'gravity': 9.81, 'mounting_rpy': [0.0, 0.0, 0.5]}
+
+    def set_all() -> list[bool]:
+        return [each.successful for each in bench.ask(
+            SetParameters, 'calibrator/set_parameters', parameters=[
+                Parameter(name, value=value).to_parameter_msg()
+                for name, value in tried.items()]).results]
+
+    assert set_all() == [False, True, True, True]
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
 
     def pushes(seconds: float = 0.6) -> int:
@@ -292,6 +310,7 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
     for _ in range(2):
         bench.go(Transition.TRANSITION_CONFIGURE)
         bench.spin(lambda: publisher.get_subscription_count() > 0)
+        assert set_all() == [False] * 4
         assert pushes() == 0
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda: pushes() > 0)

@@ -313,6 +313,16 @@ class ManagedCalibrator(LifecycleNode):
         super().__init__('calibrator')
         self._calibrator: Calibrator | None = None
         self._own = [*self.publishers, *self.subscriptions, *self.services, *self.timers]
+        self._settings = CalibratorSettings()
+        try:
+            self._set_settings(declared(self, CalibratorSettings, fixed=False))
+        except AccelCalibError as error:
+            self.get_logger().error(f'{error}; set it before configuring')
+        follow(self, lambda: self._settings, self._set_settings, runs=False)
+
+    def _set_settings(self, settings: CalibratorSettings) -> None:
+        """Keep the parameters of the next configuration, which are checked now."""
+        self._settings = settings
 
     def start(self) -> None:
         """Do nothing: transitions start the calibrator."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import Field, fields
+from difflib import get_close_matches
 from typing import Any, TYPE_CHECKING
 
 from rcl_interfaces.msg import (
@@ -32,32 +33,56 @@ if TYPE_CHECKING:
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
-def declared(node: Node, kind: type[Settings]) -> Settings:
-    """Declare the parameters of these settings and return them; InputError for invalid values."""
+def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Settings:
+    """
+    Declare the parameters of these settings and return them; InputError for invalid values.
+
+    `fixed`: those that cannot change while the node runs are read-only.
+
+    """
     try:
-        values = {parameter.name: _declared(node, parameter).value for parameter in fields(kind)}
+        values = {parameter.name: _declared(node, parameter, fixed).value
+                  for parameter in fields(kind)}
     except InvalidParameterValueException as error:
         raise InputError(str(error), 'correct the value') from error
     return changed(kind(), values)
 
 
-def _declared(node: Node, parameter: Field[Any]) -> Parameter:
+def misspelt(node: Node) -> list[str]:
+    """Return one line for each parameter that was given to a node and that it does not have."""
+    names = [name for name in node._parameter_overrides if not node.has_parameter(name)
+             and not name.startswith('qos_overrides.')]
+    known = list(node._parameters)
+    near = {name: ' or '.join(get_close_matches(name, known)) for name in names}
+    return [f'there is no parameter {name}, expected {words or "one of ros2 param list"}: correct '
+            'the name' for name, words in near.items()]
+
+
+def _declared(node: Node, parameter: Field[Any], fixed: bool) -> Parameter:
     """Return a parameter; a managed node that is configured again has declared it before."""
     if node.has_parameter(parameter.name):
         return node.get_parameter(parameter.name)
-    return node.declare_parameter(parameter.name, default_of(parameter), _descriptor(parameter))
+    return node.declare_parameter(parameter.name, default_of(parameter),
+                                  _descriptor(parameter, fixed))
 
 
 def follow(node: Node, settings: Callable[[], Settings],
-           adopt: Callable[[Settings], None]) -> Callable[..., Any]:
+           adopt: Callable[[Settings], None], *, runs: bool = True) -> Callable[..., Any]:
     """
     Pass new settings to `adopt` when parameters are set; refuse invalid values.
+
+    `runs`: refuse those that cannot change while the node runs, too.
 
     Returns the callback, which ``node.remove_on_set_parameters_callback`` removes.
 
     """
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         values = {parameter.name: parameter.value for parameter in parameters}
+        fixed = [each.name for each in fields(settings()) if not each.metadata['live']
+                 and runs and each.name in values]
+        if fixed:
+            return SetParametersResult(successful=False, reason=f'{fixed[0]} cannot change while '
+                                       'the node is configured: clean up, set it and configure')
         try:
             adopt(changed(settings(), values))
         except InputError as error:
@@ -68,14 +93,14 @@ def follow(node: Node, settings: Callable[[], Settings],
     return on_set
 
 
-def _descriptor(parameter: Field[Any]) -> ParameterDescriptor:
+def _descriptor(parameter: Field[Any], fixed: bool) -> ParameterDescriptor:
     """Return the description of a parameter, for `ros2 param describe` and rqt."""
     default, limits = default_of(parameter), parameter.metadata['limits']
     descriptor = ParameterDescriptor(
         name=parameter.name, description=parameter.metadata['words'],
         type=Parameter.Type.from_parameter_value(default).value,
-        additional_constraints=expected(parameter), read_only=not parameter.metadata['live'],
-        dynamic_typing=True)
+        additional_constraints=expected(parameter),
+        read_only=fixed and not parameter.metadata['live'], dynamic_typing=True)
     if limits is None:
         return descriptor
     if isinstance(default, float):

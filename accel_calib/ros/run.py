@@ -131,6 +131,8 @@ def _spin(node: str, came: int) -> None:
     """Create the node and spin it."""
     from rclpy.executors import ExternalShutdownException
     from rclpy.task import Future
+
+    from .declare import misspelt
     module, name = node.split(':')
     instance = getattr(import_module(module, __package__), name)()
     executor = _executor()
@@ -138,6 +140,8 @@ def _spin(node: str, came: int) -> None:
     sys.setswitchinterval(_SWITCH)
     try:
         instance.start()
+        for line in misspelt(instance):
+            instance.get_logger().error(line)
         gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
         ended = Future()
         Thread(target=_end, args=(came, ended), daemon=True).start()

@@ -21,7 +21,7 @@ import numpy as np
 
 from .guidance import is_partial, next_action, Progress
 from .sensor import title
-from .stream import SILENT, stream_faults
+from .stream import SILENT, stream_faults, thermometer_words
 from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
 from ..finding import has
@@ -200,7 +200,8 @@ def figures(session: Session) -> Iterator[tuple[str, str]]:
     yield from _drift_figures(sensor.drift)
     yield 'since last rest [s]', _number(sensor.rest_ago(counts.stamp))
     yield from _pose_figures(session)
-    yield 'temperature [°C]', _number(counts.temperature)
+    yield 'temperature [°C]', (_number(counts.temperature) if math.isfinite(counts.temperature)
+                               else f'not known: {thermometer_words(session)}')
     yield 'still below [m/s² or native]', f'{sensor.live.detector.threshold:.4g}'
     yield from _sensor_figures(session)
 
