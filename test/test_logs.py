@@ -780,3 +780,21 @@ def test_numbers_of_which_nothing_says_what_they_are_are_noted(header: str, tmp_
     for named in (text_of(rows_of(made['time'], made['reading']), 'time,accX,accY,accZ'),
                   text_of(rows_of(made['time'], made['reading'] / 48.0), header)):
         assert not any('magnetometer' in note for note in read_log(write(tmp_path, named)).notes)
+
+
+@pytest.mark.parametrize('header', ['Time (s),W,X,Y,Z', 't,w,x,y,z'])
+def test_a_quaternion_is_not_taken_for_an_accelerometer(header: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    turns = rng.normal(size=(400, 4))
+    turns /= np.linalg.norm(turns, axis=1)[:, np.newaxis]
+    text = text_of(rows_of(np.arange(400) / 50.0, turns), header)
+    with pytest.raises(InputError, match='expected three of an accelerometer'):
+        read_log(write(tmp_path, text))
+
+
+def test_rows_of_a_moving_sensor_without_times_are_not_taken_for_poses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    moving = 1000.0 * (spread_directions(900) + rng.normal(size=(900, 3)))
+    path = write(tmp_path, text_of(rows_of(np.round(moving)), 'acc_x[mg],acc_y[mg],acc_z[mg]'))
+    with pytest.raises(InputError, match='look like samples'):
+        read_log(path)

@@ -370,7 +370,9 @@ def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list
 
 
 def _bare(header: Sequence[str]) -> list[list[int]]:
-    """Return the columns x, y, z of each sensor of a file without other names."""
+    """Return the columns x, y, z of each sensor of a file without other names; no quaternions."""
+    if 'w' in map(str.casefold, header):
+        return []
     axes: dict[int, list[int]] = {}
     for k, name in enumerate(header[:MOST]):
         known = meaning(name)

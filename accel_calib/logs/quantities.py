@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .accelerometer import compact, unit_of_reading
+from .accelerometer import compact, rests_of, unit_of_reading
 from .columns import Chosen, FRACTION, LogOptions, rates_beside, unused
 from .dialect import has_date, seconds_of
 from .names import bare_name, COUNTERS, meaning, RATE, READING, TICKS, unit_of, ZEROS
@@ -193,7 +193,7 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
     Return whether rows without times are samples.
 
     They are if a person does not take as many poses, or if they are many and have angular rates,
-    are mostly like the row before, or all have about the same direction.
+    are mostly like the row before, all have about the same direction, or are on no sphere.
 
     """
     readings = columns['reading']
@@ -204,7 +204,8 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
     spread = np.median(np.linalg.norm(readings - middle, axis=1))
     return bool(len(readings) > _MOST_POSES or 'rate' in columns
                 or np.median(step) < _SAME * spread
-                or spread < _ONE_SIDE * np.linalg.norm(middle))
+                or spread < _ONE_SIDE * np.linalg.norm(middle)
+                or math.isnan(rests_of(readings, samples=False).radius))
 
 
 @dataclass
