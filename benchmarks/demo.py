@@ -113,7 +113,8 @@ def main() -> None:
              Line('error of imu/data_calibrated, median [mg]', f'{np.median(errors):.2f}', '',
                   sets, None),
              Line('largest [mg]', f'{np.max(errors):.2f}', '', sets, None)]
-    about = ABOUT.format(command=' '.join(sys.argv[1:]), loops=args.loops, stop=args.stop,
+    command = f'--turns {args.turns} --loops {args.loops} --stop {args.stop:g}'
+    about = ABOUT.format(command=command, loops=args.loops, stop=args.stop,
                          machine=f'{processor()}, Python {platform.python_version()}')
     publish(f'{about}\n\n{table(lines)}\n', args.markdown)
     sys.exit(len(good) != len(rows))
