@@ -174,7 +174,8 @@ def test_a_calibration_is_offered_to_all_viewers_and_stored_when_it_is_accepted(
     assert viewer.state['rating']['rating'] == 'GOOD'
     result = viewer.state['result']
     np.testing.assert_allclose(np.array(result['offset']) / GRAVITY, OFFSET, atol=3e-4)
-    assert result['after_mg'] < 1.0 < result['before_mg']
+    residuals = {label: value for label, value, unit in result['residuals']}
+    assert residuals['residual after'] < 1.0 < residuals['residual before']
     wait(lambda: viewer.of('progress')[-1]['corrected'] is None
          or abs(viewer.of('progress')[-1]['corrected'] - 1.0) < 0.01)
     wait(lambda: other.state == viewer.state)

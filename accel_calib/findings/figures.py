@@ -76,11 +76,11 @@ def residual_figures(found: Quality | Verification) -> Iterator[Figure]:
     """Yield the residuals and the noise floor [mg], as far as they are known."""
     held_out = found.held_out_rms_mg if isinstance(found, Quality) else None
     for key, label, value in (
-            ('rms_before_mg', 'before', found.rms_before_mg),
-            ('max_before_mg', 'largest before', found.max_before_percent * MG / 100.0),
-            ('rms_after_mg', 'after', found.rms_after_mg),
-            ('max_after_mg', 'largest after', found.max_after_percent * MG / 100.0),
-            ('held_out_rms_mg', 'of new poses', held_out),
+            ('rms_before_mg', 'residual before', found.rms_before_mg),
+            ('max_before_mg', 'largest residual before', found.max_before_percent * MG / 100.0),
+            ('rms_after_mg', 'residual after', found.rms_after_mg),
+            ('max_after_mg', 'largest residual after', found.max_after_percent * MG / 100.0),
+            ('held_out_rms_mg', 'residual of new poses', held_out),
             ('noise_floor_mg', 'noise floor', found.noise_floor_mg)):
         if value is not None:
             yield Figure(key, label, 'mg', value)

@@ -23,6 +23,7 @@ import numpy as np
 from .. import __version__
 from ..calibrate import Calibration, words_of
 from ..errors import InputError
+from ..findings import residual_figures
 from ..session import checks, Level, Progress, Session, Severity, title, words_of_state
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats
@@ -191,10 +192,8 @@ def _result(calibration: Calibration) -> Message:
         'model': calibration.name, 'date': calibration.date, 'unit': calibration.units.name,
         'poses': used, 'left_out': len(calibration.poses) - used,
         'coverage': _number(quality.coverage),
-        'before_mg': _number(quality.rms_before_mg), 'after_mg': _number(quality.rms_after_mg),
-        'largest_mg': _number(quality.max_after_percent * MG / 100.0),
-        'new_poses_mg': _number(quality.held_out_rms_mg),
-        'noise_mg': _number(quality.noise_floor_mg),
+        'residuals': [[figure.label, _number(figure.value), figure.unit]
+                      for figure in residual_figures(quality)],
         'effects': list(calibration.model.effects), 'warnings': list(calibration.warnings),
         'offset': _rounded(calibration.offset), 'offset_sd': _rounded(calibration.offset_sd),
         'gain': _rounded(calibration.gain), 'gain_sd': _rounded(calibration.gain_sd)}

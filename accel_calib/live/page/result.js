@@ -8,17 +8,11 @@ import { figure, fixed, withButtons } from './words.js';
 
 const element = (id) => document.getElementById(id);
 
-const mg = (value) => (value === null ? '–' : `${figure(value)} mg`);
 const diagonal = (rows) => rows.map((row, k) => row[k]);
 const joined = (values, decimals) => values.map((value) => fixed(value, decimals)).join('  ');
 
 /** Name, key in the message, and text of each number. */
 const FIGURES = [
-  ['residual before', 'before_mg', mg],
-  ['residual after', 'after_mg', mg],
-  ['residual of new poses', 'new_poses_mg', mg],
-  ['largest residual', 'largest_mg', mg],
-  ['noise floor', 'noise_mg', mg],
   ['poses used', 'poses', (count, { left_out: out }) => (out ? `${count} of ${count + out}` : count)],
   ['coverage', 'coverage', (share) => (share === null ? '–' : `${Math.round(100 * share)} %`)],
   ['offset x, y, z', 'offset', (offset, { unit }) => `${joined(offset, 4)} ${unit}`],
@@ -67,12 +61,15 @@ export class Result {
 }
 
 function showFigures(result) {
-  element('figures').replaceChildren(...FIGURES.filter(([, key]) => result[key] !== undefined)
-    .map(([name, key, write]) => {
-      const row = document.createElement('div');
-      row.append(made('dt', name), made('dd', write(result[key], result)));
-      return row;
-    }));
+  const residuals = (result.residuals ?? []).map(([label, value, unit]) => (
+    [label, value === null ? '–' : `${figure(value)} ${unit}`]));
+  const others = FIGURES.filter(([, key]) => result[key] !== undefined)
+    .map(([name, key, write]) => [name, write(result[key], result)]);
+  element('figures').replaceChildren(...[...residuals, ...others].map(([name, words]) => {
+    const row = document.createElement('div');
+    row.append(made('dt', name), made('dd', words));
+    return row;
+  }));
 }
 
 function made(tag, words) {
