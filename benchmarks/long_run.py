@@ -102,7 +102,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a service, and the time that it took [s]."""
+    """The answer of a service, and the time that it took [s]; without words none came."""
 
     name: str
     seconds: float
@@ -297,7 +297,7 @@ class Caller:
         began = time.monotonic()
         future = self._clients[name].call_async(Trigger.Request())
         self._executor.spin_until_future_complete(future, timeout_sec=120.0)
-        found = future.result() if future.done() else Trigger.Response(message='no answer')
+        found = future.result() if future.done() else Trigger.Response()
         self.answers.append(Answer(name, time.monotonic() - began, found.success, found.message))
 
     def _wait_for_rest(self) -> None:
@@ -405,7 +405,8 @@ def memory_line(run: LongRun, what: str, name: str, *, asked: bool = True) -> Li
     """Return the line of a memory."""
     slope, error = run.trend(run.column(name))
     met = None if np.isnan(slope) or not asked else slope < 1.0
-    return Line(f'memory of {what}', f'{run.column(name)[-1]:.1f} MB, '
+    warm, last = run.column(name)[[run.warm, -1]]
+    return Line(f'memory of {what}', f'{warm:.1f} MB after the warm-up, {last:.1f} MB at the end, '
                 f'{words_of(slope, error, "MB per hour")}', '< 1 MB per hour' if asked else '',
                 len(run.samples) - run.warm, met)
 
@@ -423,14 +424,16 @@ def steady_line(run: LongRun, what: str, column: Floats, unit: str, *, asked: bo
 def lines_of(run: LongRun) -> list[Line]:
     """Return the lines of the table."""
     lost, bare = run.lost(run.ours).sum(), run.lost(run.bare).sum()
-    refused = [each for each in run.answers if not each.success]
+    answered = [each for each in run.answers if each.words]
+    refused = [each for each in answered if not each.success]
     p99, bare_p99 = (run.latency_us(each, 99) for each in (run.ours, run.bare))
     faults = run.log.count('Traceback') + run.log.count('unexpected error')
     count = run.count(run.sent).sum()
     return [
         Line('messages lost', f'{lost} of {count:,} (bare relay: {bare})', '0', 1, lost == 0),
-        Line('calls refused, or without an answer', f'{len(refused)} of {len(run.answers)}', '0',
-             1, not refused),
+        Line('calls answered', f'{len(answered)} of {len(run.answers)}', 'all', 1,
+             len(answered) == len(run.answers)),
+        Line('calls refused', f'{len(refused)} of {len(answered)}', '0', 1, not refused),
         Line('tracebacks', f'{faults}', '0', 1, faults == 0),
         memory_line(run, 'the node, resident', 'node'),
         memory_line(run, 'the node, its own part', 'own'),
@@ -446,7 +449,7 @@ def lines_of(run: LongRun) -> list[Line]:
 
 def calls_of(run: LongRun) -> str:
     """Return a table of the calls."""
-    rows = ['| service | calls | refused | longest answer, s |', '|---|---|---|---|']
+    rows = ['| service | calls | failed | longest answer, s |', '|---|---|---|---|']
     for name in (*CALLS, 'reset'):
         found = run.called(name)
         if found:
@@ -493,7 +496,7 @@ def main() -> int:
     run = long_run(rounds, seconds, interval, given.rate)
     for each in run.answers:
         if not each.success:
-            print(f'{each.name}: {each.words}', file=sys.stderr)
+            print(f'{each.name}: {each.words or "no answer"}', file=sys.stderr)
     about = _ABOUT.format(minutes=given.minutes, rate=given.rate, every=CALL_EVERY,
                           calls=', '.join(f'`~/{name}`' for name in CALLS), round=seconds,
                           warm=run.warm * interval / 60.0, machine=before)
