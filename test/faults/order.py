@@ -23,6 +23,7 @@ from inside import MOST_STEPS
 _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
 _FEWEST = 4
 _UNCHANGED = 'offset by (+0.00, +0.00, +0.00) mg, gain by up to 0.000 %, mounting by 0.00°'
+_OFF = 'correction switched off'  # this state hides that of the calibration
 _DATE_S = 1.0  # resolution of the date of a calibration
 
 
@@ -129,7 +130,7 @@ def _reset(state: State, call: Call, number: int) -> Iterator[State]:
 
 def _self_test(state: State, call: Call, number: int) -> Iterator[State]:
     levelled = ', levelled' in call.words
-    if levelled is (state.used is not None and state.used.levelled):
+    if _OFF in call.words or levelled is (state.used is not None and state.used.levelled):
         yield state
 
 
