@@ -52,6 +52,14 @@ import numpy as np  # noqa: E402
 RUN, SENSORS, TASK = (import_module(f'accel_calib.fleet.{name}')
                       for name in ('run', 'sensors', 'task'))
 
+MERGED, DIGESTED = 'merge and compare on the workers', 'digests on the workers'
+ALONE = {'rows of the sensors': 'write_sensors', 'typical values': 'priors_of',
+         'page': 'write_fleet_page'}
+"""What the program does alone at the end, and its functions; the first is a part of `MERGED`."""
+
+MOST_ALONE = 0.03
+"""Largest share of the time in which the program works alone."""
+
 POSES = 14
 DAMAGED = 0.03
 """Share of the files that are damaged: as many without a table, with four poses, and empty."""
@@ -308,12 +316,14 @@ def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, f
         spent['other'] = 2.0 * spent['all'] - sum(spent.values())
         with timed(spent, {'merge': (Store, 'merge'), 'compare': (SENSORS, '_compared'),
                            'read the calibrations': (SENSORS, 'read_calibration'),
-                           'typical values': (RUN, 'priors_of'),
-                           'page': (RUN, 'write_fleet_page')}, time.process_time):
-            rows = [SENSORS.merge_sensor(name, store) for name in store.waiting()]
-            rows = SENSORS.write_sensors(store, rows)
-            priors = RUN.priors_of(store.all_rows(RUN.PRIOR_COLUMNS))
-            RUN.write_fleet_page(store, rows, priors)
+                           'finish': (Store, 'finish'), 'digest': (RUN, 'digest_of')},
+                   time.process_time):
+            names = store.waiting()
+            for name in names:
+                SENSORS.merge_sensor(name, store)
+            for name in names:
+                store.finish(name)
+                RUN.digest_of(name, store)
     return {stage: 1e3 * seconds / len(found) for stage, seconds in spent.items()}
 
 
@@ -330,6 +340,8 @@ class Whole:
         Recordings per second.
     seconds, program_s : float
         Duration, and processor time of the program with the scheduler.
+    memory : float
+        Resident memory of the program at the end [MB].
     after : dict of str to float
         Seconds of the stages after the recordings.
 
@@ -339,6 +351,7 @@ class Whole:
     per_s: float
     seconds: float
     program_s: float
+    memory: float
     after: dict[str, float]
 
 
@@ -349,12 +362,11 @@ def whole(found: Sequence[Input], options: Options, workers: int, folder: Path) 
         client.wait_for_workers(workers)
         begin, program_s = time.perf_counter(), time.process_time()
         watch = Watch(client, folder / 'memory.jsonl')
-        with timed(spent, {'merge and compare': (RUN, '_merge'),
-                           'typical values': (RUN, 'priors_of'),
-                           'page': (RUN, 'write_fleet_page')}):
+        with timed(spent, {MERGED: (RUN, '_merge'), DIGESTED: (RUN, 'overview'),
+                           **{stage: (RUN, name) for stage, name in ALONE.items()}}):
             summary = fleet.run(client, found, options, Store(folder / 'results'), watch)
         return Whole(summary, watch.per_s(), time.perf_counter() - begin,
-                     time.process_time() - program_s, spent)
+                     time.process_time() - program_s, memory_mb(), spent)
 
 
 def memory_lines(log: Path, workers: int) -> Iterator[Line]:
@@ -416,8 +428,13 @@ def run_lines(done: Whole, given: argparse.Namespace) -> Iterator[Line]:
                '', total, None)
     yield Line('program with the scheduler, ms of processor per recording',
                f'{1e3 * done.program_s / total:.2f}', '', total, None)
+    yield Line('program at the end, with the libraries of the page, MB', f'{done.memory:.0f}', '',
+               1, None)
     for stage, seconds in done.after.items():
         yield Line(f'after the recordings: {stage}, seconds', f'{seconds:.1f}', '', total, None)
+    alone = sum(done.after.get(stage, 0.0) for stage in ALONE) / done.seconds
+    yield Line('what the program does alone, of the whole run', f'{alone:.1%}',
+               f'<= {MOST_ALONE:.0%}', 1, alone <= MOST_ALONE)
     yield from found_lines(done.summary.sensors, given)
 
 
@@ -431,7 +448,7 @@ def cost_lines(spent: dict[str, float], done: Whole, given: argparse.Namespace
     each_s = given.workers / done.per_s
     yield Line('a recording of the whole run on a worker, ms', f'{1e3 * each_s:.1f}', '', 1, None)
     count = sum(done.summary.counts.values())
-    end_s = done.after.get('merge and compare', 0.0) * given.workers / count
+    end_s = sum(done.after.get(stage, 0.0) for stage in (MERGED, DIGESTED)) * given.workers / count
     for kind, each in (('the search', spent['refine']), ('no search', 0.0)):
         own = 0.0 if given.no_refine else spent['refine']
         hours = MILLION * given.calibrations * (each_s + end_s + (each - own) / 1e3) / HOUR_S

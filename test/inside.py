@@ -80,10 +80,25 @@ from accel_calib.estimate import believable, distinct, kinds, originals, unseen_
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
-from accel_calib.fleet.overview import Months, not_agreeing, odd_sensors, overview, shared_effects
+from accel_calib.fleet.overview import (
+    digest,
+    digest_of,
+    Months,
+    not_agreeing,
+    odd_sensors,
+    overview,
+    shared_effects,
+)
 from accel_calib.fleet.page import write_fleet_page
 from accel_calib.fleet.run import mapped
-from accel_calib.fleet.sensors import alike, drift_of, estimated, merge_sensor, priors_of
+from accel_calib.fleet.sensors import (
+    alike,
+    drift_of,
+    estimated,
+    merge_sensor,
+    priors_of,
+    typical_of,
+)
 from accel_calib.fleet.task import schema, write_parquet
 from accel_calib.geometry import (
     OVER_THE_SPHERE,

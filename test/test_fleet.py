@@ -95,6 +95,32 @@ def test_each_recording_becomes_a_row_and_a_calibration(client: Any, tmp_path: P
         assert stored.date == row['date'] == f'{Path(row["recording"]).stem}T00:00:00+00:00'
 
 
+def test_workers_do_what_is_to_be_done_for_each_sensor(
+        client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_fleet(tmp_path / 'in', 6, 2)
+    (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
+    for name in ('merge', 'of_sensor', 'finish'):
+        monkeypatch.setattr(Store, name, None)  # in this process, which must not need them
+    summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
+    assert summary.counts == {'ok': 12, 'error': 1}
+    assert summary.priors[''].sensors == 6
+    assert len(summary.sensors) == 7
+    page = (tmp_path / 'out' / 'fleet.html').read_text(encoding='utf-8')
+    assert 'no table of numbers' in page
+    assert '6 sensors' in page
+    assert not list((tmp_path / 'out' / 'pending').iterdir())
+
+
+def test_the_page_does_not_depend_on_the_order_of_the_tasks(client: Any, tmp_path: Path) -> None:
+    found = found_in(write_fleet(tmp_path / 'in', 6, 2))
+    for name, order in (('one', 1), ('other', -1)):
+        run(client, found[::order], QUICK, Store(tmp_path / name))
+    one, other = ((tmp_path / name / 'fleet.html').read_text(encoding='utf-8')
+                  for name in ('one', 'other'))
+    assert one == other
+    assert state_of(tmp_path / 'one')['prior'] == state_of(tmp_path / 'other')['prior']
+
+
 def test_a_bad_recording_is_a_row_with_its_error(client: Any, tmp_path: Path) -> None:
     good = write_poses(tmp_path / 'a.csv')
     bad = tmp_path / 'bad.csv'

@@ -19,6 +19,8 @@ from accel_calib.stored import write_calibration
 from accel_calib.units import Units
 from inside import (
     as_folder,
+    digest,
+    digest_of,
     drift_of,
     merge_sensor,
     Months,
@@ -77,13 +79,14 @@ def test_few_of_many_unchanged_sensors_are_named_as_changed() -> None:
 
 def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     def row(status: str, rating: str | None, offset: float) -> dict[str, object]:
-        return {'sensor': 's', 'sensor_model': None, 'status': status, 'rating': rating,
+        return {'prior_values': None, 'sensor_model': None, 'status': status, 'rating': rating,
                 'calibration': 'a.yaml' if rating in ('GOOD', 'USABLE') else None,
                 'determined': offset < 1.0, 'effects': [], 'parameters': [],
                 **dict.fromkeys(NAMES, offset)}
 
-    known = overview([row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
-                      row('ok', 'USABLE', 7.0), row('error', None, 9.0)])
+    known = overview([digest('s', [
+        row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
+        row('ok', 'USABLE', 7.0), row('error', None, 9.0)])])
     np.testing.assert_allclose(known.models[''].values['s'], 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 2, 'BAD': 1, 'error': 1}
     assert known.left_out == 1
@@ -199,7 +202,8 @@ def _write_rows(store: Store, sensor: str, rows: list[dict[str, Any]]) -> None:
 
 def page_of(store: Store, sensors: list[dict[str, Any]],
             priors: dict[str, FleetPrior] | None = None) -> str:
-    write_fleet_page(store, sensors, priors or {})
+    known = overview(digest_of(name, store) for name in store.sensors())
+    write_fleet_page(store, known, sensors, priors or {})
     return (store.folder / 'fleet.html').read_text(encoding='utf-8')
 
 

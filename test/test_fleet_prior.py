@@ -26,6 +26,7 @@ from inside import (
     sensor_force,
     simulate_poses,
     spread_directions,
+    typical_of,
     unit,
     with_vector,
 )
@@ -117,15 +118,24 @@ def test_the_calibration_states_the_fleet_and_is_stored(
 
 def test_typical_values_are_computed_by_model_of_sensor() -> None:
     rng = np.random.default_rng(6)
-    rows = [{'sensor': f'{model}_{k}', 'sensor_model': model,
-             'prior_values': (mean + 0.01 * rng.normal(size=9)).tolist(),
-             'prior_covariance': (1e-8 * np.eye(9)).ravel().tolist()}
-            for model, mean, count in (('A', 0.0, 12), ('B', 0.1, 12), ('C', 0.0, 4))
-            for k in range(count) for _ in range(2)]
-    found = priors_of([*rows, {'sensor': 'x', 'sensor_model': 'A', 'prior_values': None,
-                               'prior_covariance': None}])
+    without = {'sensor_model': 'A', 'prior_values': None, 'prior_covariance': None}
+    sensors = [[{'sensor_model': model,
+                 'prior_values': (mean + 0.01 * rng.normal(size=9)).tolist(),
+                 'prior_covariance': (1e-8 * np.eye(9)).ravel().tolist()} for _ in range(2)]
+               for model, mean, count in (('A', 0.0, 12), ('B', 0.1, 12), ('C', 0.0, 4))
+               for _ in range(count)]
+    found = priors_of(each for rows in [*sensors, [without]] for each in typical_of(rows))
     assert {name: each.sensors for name, each in found.items()} == {'A': 12, 'B': 12}
     assert np.mean(found['B'].prior.mean) == pytest.approx(0.1, abs=0.005)
+
+
+def test_the_values_of_a_sensor_are_the_mean_of_its_recordings_with_its_covariance() -> None:
+    rows = [{'sensor_model': None, 'prior_values': [value] * 9,
+             'prior_covariance': (value * np.eye(9)).ravel().tolist()} for value in (1.0, 3.0)]
+    (model, mean, covariance), = typical_of(rows)
+    assert model == ''
+    np.testing.assert_allclose(mean, 2.0)
+    np.testing.assert_allclose(covariance, np.eye(9))
 
 
 def test_the_file_keeps_the_values_and_asks_for_the_model(

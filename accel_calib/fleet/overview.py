@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Statistics over a fleet, collected in one pass over the rows of the recordings.
+Statistics over a fleet, collected from a digest of each sensor.
 
-The memory grows with the number of sensors (18 numbers each), not with that of recordings.
+The workers make the digests: `digest_of`. The memory of the program grows with the number of
+sensors (about 130 numbers each), not with that of recordings.
 
 **Odd sensors.** A sensor is odd in a value if it is so far from the median of its model that one
 sensor in a hundred fleets of this size is as far by chance. The spread is computed from the median
@@ -22,15 +23,15 @@ A month keeps a random sample of `_SAMPLE` differences, from which its quantiles
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from urllib.parse import unquote
 
 import numpy as np
 
-from .sensors import alike, FEWEST
-from .task import Row
+from .sensors import alike, FEWEST, Typical, typical_of
+from .task import Row, Store
 from ..compare import NAMES
 from ..effects import LADDER
 from ..findings import scale_of
@@ -50,6 +51,11 @@ _SAMPLE = 400
 """Differences of a month that are kept."""
 
 _SEED = 1
+
+COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
+           'calibration', 'determined', 'effects', 'parameters', 'prior_values',
+           'prior_covariance', *(column for name in NAMES for column in (name, f'{name}.sd')))
+"""Columns of the rows of recordings from which a digest is made."""
 
 
 class Months:
@@ -78,6 +84,92 @@ class Months:
 
 
 @dataclass(frozen=True)
+class Values:
+    """
+    The calibrations of a sensor that can be compared.
+
+    Parameters
+    ----------
+    mean, deviation : (9,) array
+        Mean of `NAMES` over the calibrations, and its standard deviation.
+    effects : dict
+        Values of the newest calibration beyond V and W.
+    months : list of str
+        Months of the calibrations, for those with a date; none of a single calibration.
+    differences : (n, 9) array
+        Their differences from the median of the sensor.
+
+    """
+
+    mean: Floats
+    deviation: Floats
+    effects: dict[str, float]
+    months: list[str]
+    differences: Floats
+
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> Values:
+        """Return the values of rows."""
+        values, deviations = table_of(rows)
+        dated = [k for k, row in enumerate(rows) if row.get('date') and len(rows) > 1]
+        return cls(np.mean(values, axis=0),
+                   np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows),
+                   {each['name']: each['value'] for each in rows[-1]['parameters']
+                    if each['name'].partition('.')[0] not in LADDER},
+                   [rows[k]['date'][:7] for k in dated],
+                   (values - np.median(values, axis=0))[dated])
+
+
+@dataclass(frozen=True)
+class Digest:
+    """
+    What the statistics need of a sensor.
+
+    Parameters
+    ----------
+    sensor : str
+        Its name.
+    counts : mapping of str to int
+        Recordings by rating, or by status without a rating.
+    errors : list of dict
+        The first `MOST_ERRORS` rows with an error.
+    left_out : int
+        Recordings with a calibration whose values are not compared.
+    values : mapping of str to Values
+        The calibrations that are compared, by model of sensor.
+    typical : list of Typical
+        What the typical values need.
+
+    """
+
+    sensor: str
+    counts: Counter[str]
+    errors: list[Row]
+    left_out: int
+    values: dict[str, Values]
+    typical: list[Typical]
+
+
+def digest_of(name: str, store: Store) -> Digest:
+    """Return the digest of a sensor by the name of its folder; it runs on a worker."""
+    return digest(unquote(name), store.of_sensor(name, COLUMNS))
+
+
+def digest(sensor: str, rows: Sequence[Row]) -> Digest:
+    """Return the digest of the rows of a sensor, in order of date."""
+    by_model: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        if row['status'] == 'ok' and row['calibration']:
+            by_model[row['sensor_model'] or ''].append(row)
+    compared = {model: alike(of_model) for model, of_model in by_model.items()}
+    return Digest(
+        sensor, Counter(row['rating'] or row['status'] for row in rows),
+        [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
+        sum(map(len, by_model.values())) - sum(map(len, compared.values())),
+        {model: Values.of(good) for model, good in compared.items() if good}, typical_of(rows))
+
+
+@dataclass(frozen=True)
 class OfModel:
     """
     What is known of the sensors of one model.
@@ -98,6 +190,13 @@ class OfModel:
     effects: dict[str, dict[str, float]]
     months: Months
 
+    def add(self, sensor: str, values: Values) -> None:
+        """Add a sensor."""
+        self.values[sensor], self.deviations[sensor] = values.mean, values.deviation
+        self.effects[sensor] = values.effects
+        for month, differences in zip(values.months, values.differences, strict=True):
+            self.months.add(month, differences)
+
 
 @dataclass
 class Overview:
@@ -114,48 +213,30 @@ class Overview:
         Recordings by rating, or by status without a rating.
     left_out : int
         Recordings with a calibration whose values are not compared.
+    typical : list of Typical
+        What the typical values need.
 
     """
 
     models: dict[str, OfModel] = field(default_factory=dict)
     errors: list[Row] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    counts: Counter[str] = field(default_factory=Counter)
     left_out: int = 0
+    typical: list[Typical] = field(default_factory=list)
 
 
-def overview(rows: Iterable[Row]) -> Overview:
-    """Return the statistics of the rows of recordings, in order of sensor and date."""
+def overview(digests: Iterable[Digest]) -> Overview:
+    """Return the statistics of the sensors, which are in order of their names."""
     found, rng = Overview(), np.random.default_rng(_SEED)
-    for sensor, of_sensor in groupby(rows, key=lambda row: row['sensor']):
-        by_model: dict[str, list[Row]] = defaultdict(list)
-        for row in of_sensor:
-            found.counts[row['rating'] or row['status']] += 1
-            if row['status'] != 'ok':
-                found.errors.extend([row] if len(found.errors) < MOST_ERRORS else [])
-            elif row['calibration']:
-                by_model[row['sensor_model'] or ''].append(row)
-        for model, all_rows in by_model.items():
-            good = alike(all_rows)
-            found.left_out += len(all_rows) - len(good)
-            if not good:
-                continue
+    for each in digests:
+        found.counts.update(each.counts)
+        found.errors += each.errors[:MOST_ERRORS - len(found.errors)]
+        found.left_out += each.left_out
+        found.typical += each.typical
+        for model, values in each.values.items():
             known = found.models.setdefault(model, OfModel({}, {}, {}, Months(rng)))
-            _add_sensor(known, sensor, good)
+            known.add(each.sensor, values)
     return found
-
-
-def _add_sensor(known: OfModel, sensor: str, rows: Sequence[Row]) -> None:
-    """Add the calibrations of a sensor to the statistics of its model."""
-    values, deviations = table_of(rows)
-    known.values[sensor] = np.mean(values, axis=0)
-    known.deviations[sensor] = np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows)
-    known.effects[sensor] = {each['name']: each['value'] for each in rows[-1]['parameters']
-                             if each['name'].partition('.')[0] not in LADDER}
-    if len(rows) < 2:
-        return
-    for row, differences in zip(rows, values - np.median(values, axis=0), strict=True):
-        if row.get('date'):
-            known.months.add(row['date'][:7], differences)
 
 
 def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:

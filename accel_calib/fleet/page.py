@@ -28,7 +28,7 @@ from .charts import (
     of_sensor,
     of_values,
 )
-from .overview import not_agreeing, odd_sensors, OfModel, Overview, overview, shared_effects
+from .overview import not_agreeing, odd_sensors, OfModel, Overview, shared_effects
 from .sensors import alike
 from .task import Row, Store
 from .. import __version__
@@ -67,15 +67,10 @@ _MOST_CHANGED, _MOST_ODD, _NEWEST = 6, 4, 2
 _DRIFTS = 0.05
 """Probability below which a drift is stated."""
 
-_COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
-            'calibration', 'determined', 'effects', 'parameters',
-            *(column for name in NAMES for column in (name, f'{name}.sd')))
 
-
-def write_fleet_page(store: Store, sensors: Sequence[Row],
+def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    known = overview(store.all_rows(_COLUMNS))
     write_sheet(store.folder / PAGE, sheet('Fleet', _body(store, known, sensors, priors),
                                            script=False))
 

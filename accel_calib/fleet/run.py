@@ -5,13 +5,15 @@
 A run over the recordings of a fleet, on Dask.
 
 The program submits a limited number of tasks, and submits the next one when one is done. Its
-memory and that of the scheduler therefore do not grow with the number of recordings.
+memory and that of the scheduler therefore do not grow with the number of recordings. The tasks
+after the recordings are by sensor: merge and compare, remove the pending rows, digest for the
+statistics. The program alone writes what concerns all sensors.
 
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,15 +22,9 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
+from .overview import digest_of, Overview, overview
 from .page import write_fleet_page
-from .sensors import (
-    merge_sensor,
-    PRIOR_COLUMNS,
-    PRIOR_FILE,
-    priors_of,
-    read_sensors,
-    write_sensors,
-)
+from .sensors import merge_sensor, PRIOR_FILE, priors_of, read_sensors, write_sensors
 from .task import (
     calibrate_recording,
     Done,
@@ -37,6 +33,7 @@ from .task import (
     Row,
     SENSORS_FILE,
     Store,
+    UNREAD,
     unread_row,
 )
 from ..calibrate import FleetPrior
@@ -48,6 +45,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _Item = TypeVar('_Item')
+_Result = TypeVar('_Result')
 
 _AHEAD = 4
 """Tasks in the queue per worker thread: enough that none waits for the program."""
@@ -191,14 +189,15 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
-        priors = _stored_priors(store)
-        write_fleet_page(store, sensors, priors)
+        known = overview(_by_sensor(client, digest_of, [*store.sensors(), UNREAD], store))
+        priors = _stored_priors(store, known)
+        write_fleet_page(store, known, sensors, priors)
         return Summary(counts, sensors, priors, damaged)
 
 
-def _stored_priors(store: Store) -> dict[str, FleetPrior]:
+def _stored_priors(store: Store, known: Overview) -> dict[str, FleetPrior]:
     """Write the typical values by model of sensor, and return them."""
-    priors, path = priors_of(store.all_rows(PRIOR_COLUMNS)), store.folder / PRIOR_FILE
+    priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
     if priors:
         write_priors(path, priors)
     else:
@@ -217,19 +216,32 @@ def _set_aside(client: Client, store: Store) -> Iterator[str]:
 
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
-    rows, names = [], store.waiting()
+    names = store.waiting()
     if not (store.folder / SENSORS_FILE).exists():
         names = sorted({*names, *store.sensors()})
     if not names:
         return read_sensors(store)
-    for _, result in mapped(client, merge_sensor, names, store):
+    found = write_sensors(store, list(_by_sensor(client, merge_sensor, names, store)))
+    for _ in _by_sensor(client, _finish, names, store):
+        pass
+    return found
+
+
+def _finish(name: str, store: Store) -> None:
+    """Remove the pending rows of a sensor; it runs on a worker."""
+    store.finish(name)
+
+
+def _by_sensor(client: Client, function: Callable[[str, Store], _Result], names: Sequence[str],
+               store: Store) -> Iterator[_Result]:
+    """Yield the result of a function for each sensor, in order of `names`; raise its exception."""
+    due, early = deque(names), dict[str, _Result]()
+    for name, result in mapped(client, function, names, store):
         if isinstance(result, Exception):
             raise result
-        rows.append(result)
-    found = write_sensors(store, rows)
-    for name in names:
-        store.finish(name)
-    return found
+        early[name] = result
+        while due and due[0] in early:
+            yield early.pop(due.popleft())
 
 
 def _of_dead(item: Input, options: Options, error: Exception) -> Done:

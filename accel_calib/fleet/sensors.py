@@ -65,8 +65,8 @@ FEWEST = 5
 
 PRIOR_FILE = 'fleet.yaml'
 
-PRIOR_COLUMNS = ('sensor_model', 'prior_values', 'prior_covariance')
-"""Columns of the rows of recordings that `priors_of` needs, beside the sensor."""
+Typical = tuple[str, Floats, Floats]
+"""Model of a sensor, the mean of its values over its recordings, and its covariance."""
 
 _CHANCE = 50.0
 
@@ -295,28 +295,26 @@ def read_sensors(store: Store) -> list[Row]:
 
 # ----------------------------------------------------------------------------- typical values
 
-def priors_of(rows: Iterable[Row]) -> dict[str, FleetPrior]:
-    """
-    Return the typical values of the models with at least `FEWEST` sensors.
-
-    The rows of recordings have ``sensor`` and `PRIOR_COLUMNS`; rows without values are left out.
-
-    """
-    size, sums = len(_NAMES), dict[tuple[str, str], list[Any]]()
+def typical_of(rows: Iterable[Row]) -> list[Typical]:
+    """Return what `priors_of` needs of a sensor, by model; rows without values are left out."""
+    size, by_model = len(_NAMES), dict[str, list[Row]]()
     for row in rows:
         if row['prior_values']:
-            known = sums.setdefault((row['sensor_model'] or '', row['sensor']), [0, 0.0, 0.0])
-            known[0] += 1
-            known[1] = known[1] + np.array(row['prior_values'])
-            known[2] = known[2] + np.array(row['prior_covariance']).reshape(size, size)
-    found = {}
-    for model in sorted({model for model, _ in sums}):
-        chosen = [each for (name, _), each in sums.items() if name == model]
-        if len(chosen) >= FEWEST:
-            values = np.array([total / count for count, total, _ in chosen])
-            covariances = np.array([total / count ** 2 for count, _, total in chosen])
-            found[model] = FleetPrior(model, len(chosen), estimated(values, covariances))
-    return found
+            by_model.setdefault(row['sensor_model'] or '', []).append(row)
+    return [(model, np.mean([row['prior_values'] for row in good], axis=0),
+             np.sum([row['prior_covariance'] for row in good], axis=0).reshape(size, size)
+             / len(good) ** 2) for model, good in by_model.items()]
+
+
+def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
+    """Return the typical values of the models with at least `FEWEST` sensors."""
+    by_model: dict[str, list[Typical]] = {}
+    for each in sensors:
+        by_model.setdefault(each[0], []).append(each)
+    return {model: FleetPrior(model, len(chosen), estimated(
+        np.array([values for _, values, _ in chosen]),
+        np.array([covariance for _, _, covariance in chosen])))
+        for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:

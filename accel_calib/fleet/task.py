@@ -17,7 +17,7 @@ merged by content. So a run can stop anywhere, and the next run merges the same 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 import errno
@@ -29,7 +29,6 @@ from pathlib import Path
 import threading
 import time
 from typing import Any, TYPE_CHECKING
-from urllib.parse import unquote
 
 import numpy as np
 
@@ -201,12 +200,12 @@ class Store:
                                  'wait for it, or choose another folder') from err
             yield
 
-    def of_sensor(self, name: str) -> list[Row]:
-        """Return the rows of a sensor by the name of its folder."""
+    def of_sensor(self, name: str, columns: Sequence[str] | None = None) -> list[Row]:
+        """Return the rows of a sensor by the name of its folder, with all columns or these."""
         import pyarrow.parquet as pq
 
         path = self.rows / f'sensor={name}' / _DATA
-        return pq.ParquetFile(path).read().to_pylist() if path.exists() else []
+        return pq.ParquetFile(path).read(columns).to_pylist() if path.exists() else []
 
     def sensors(self) -> list[str]:
         """Return the folders of all sensors in the data set, in order."""
@@ -215,18 +214,6 @@ class Store:
         names = (each.name.partition('=')[2] for each in self.rows.iterdir()
                  if each.name.startswith('sensor='))
         return sorted(name for name in names if name != UNREAD)
-
-    def all_rows(self, columns: Iterable[str] | None = None) -> Iterator[Row]:
-        """Yield all rows with their sensor, one sensor at a time."""
-        import pyarrow.parquet as pq
-
-        chosen = None if columns is None else list(columns)
-        for name in (*self.sensors(), UNREAD):
-            path = self.rows / f'sensor={name}' / _DATA
-            if not path.exists():
-                continue
-            for row in pq.ParquetFile(path).read(chosen).to_pylist():
-                yield {**row, 'sensor': unquote(name)}
 
     def _write(self, name: str, rows: list[Row]) -> None:
         """Replace the Parquet file of a sensor, completely or not at all."""
