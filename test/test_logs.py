@@ -798,3 +798,13 @@ def test_rows_of_a_moving_sensor_without_times_are_not_taken_for_poses(tmp_path:
     path = write(tmp_path, text_of(rows_of(np.round(moving)), 'acc_x[mg],acc_y[mg],acc_z[mg]'))
     with pytest.raises(InputError, match='look like samples'):
         read_log(path)
+
+
+def test_a_recording_with_two_rows_per_second_holds_samples(tmp_path: Path) -> None:
+    made = samples(per_g=G, rest=10, turn=4)
+    half_seconds = np.arange(len(made['time'])) * 500.0
+    log = read_log(write(tmp_path, text_of(rows_of(made['reading'], half_seconds),
+                                           'ACCELEROMETER X (m/s²);ACCELEROMETER Y (m/s²);'
+                                           'ACCELEROMETER Z (m/s²);Time since start in ms '
+                                           .replace(';', ','))))
+    assert isinstance(log.table, Recording)

@@ -159,7 +159,8 @@ def add_log(made: Parser) -> None:
                     'log, such as time=t_ms,ax=accX,ay=accY,az=accZ'},
         'skip_bad': {'help': 'skip lines that cannot be read'},
         'rate': {'metavar': 'HZ', 'help': 'samples per second of a log without times'},
-        'topic': {'help': 'Imu topic of a bag, or message of a flight log, if there are several'},
+        'topic': {'help': 'Imu topic of a bag, message of a flight log, or table of an '
+                  'archive or Excel file, if there are several'},
         'sensor': {'help': 'name of the sensor: frame_id of its messages, or its number in a '
                    'flight log (default: the name in the log)'},
         'temperature_topic': {'metavar': 'TOPIC[:FIELD]', 'help': 'topic of the temperature, for '

@@ -78,7 +78,7 @@ class LogOptions:
     gravity : float
         Local gravity [m/s²].
     topic : str
-        Imu topic of a bag, or message of a flight log.
+        Imu topic of a bag, message of a flight log, or table of an archive or Excel file.
     sensor : str
         frame_id of the messages of a bag, or number of the sensor of a flight log.
     temperature_topic, supply_topic : str

@@ -202,23 +202,24 @@ def sound(message: Message, columns: Mapping[str, Floats], why: str,
 
 
 @contextmanager
-def sound_log(path: Path, expected: str) -> Iterator[None]:
+def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
+              ) -> Iterator[None]:
     """
     Turn what a library raises for a damaged log into one InputError, and drop what it prints.
 
-    Libraries of flight logs raise errors of any class, and print. Errors of the system pass.
+    Libraries of logs raise errors of any class, and print. Errors of the system pass.
 
     """
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
             yield
     except Exception as err:
-        # A seek to before the start of a file, by a damaged length.
-        if isinstance(err, OSError) and err.errno != errno.EINVAL:
+        # Of a library, or a seek to before the start of a file, by a damaged length.
+        if isinstance(err, OSError) and err.errno not in (None, errno.EINVAL):
             raise
         why = ' '.join(str(err).split()) or type(err).__name__
         raise InputError(f'{path} is damaged ({why}), expected {expected}',
-                         'copy it from the vehicle again') from err
+                         advice) from err
 
 
 @contextmanager

@@ -316,4 +316,7 @@ def record_instead(header: Sequence[str], path: Path) -> str:
 
 
 def _is_named(path: Path, names: Sequence[str]) -> bool:
-    return folded(path.name).replace(' ', '') in {folded(each).replace(' ', '') for each in names}
+    def stem(name: str) -> str:
+        return folded(name).replace(' ', '').removesuffix('.csv')
+
+    return stem(path.name) in map(stem, names)

@@ -34,7 +34,8 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     'rate': ('g', 'gy', 'gyr', 'gyro', 'gyroscope', 'gyroadc', 'omega', 'w', 'angvel',
              'angularvelocity', 'angularrate', 'rotationrate', 'rotrate'),
     'time': ('time', 'timestamp', 'timestamps', 't', 'ts', 'stamp', 'clock', 'date', 'datetime',
-             'epoch', 'elapsed', 'millis', 'micros', 'uptime', 'zeit', 'temps', 'tiempo', 'tempo'),
+             'epoch', 'gpst', 'elapsed', 'millis', 'micros', 'uptime', 'zeit', 'temps', 'tiempo',
+             'tempo'),
     'temperature': ('temperature', 'temp', 'tmp', 'temperatur', 'temperatura'),
     'supply_voltage': ('vdd', 'vcc', 'supply'),
 }

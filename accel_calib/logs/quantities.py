@@ -161,7 +161,7 @@ def counter_of(unit: str, *, of_day: bool = False) -> Counter:
     return Counter(ranges.get(unit, ()))
 
 
-_SAMPLES_APART_S = 0.5
+_SAMPLES_APART_S = 0.9
 """Rows that are nearer in time are samples."""
 
 _MOST_POSES = 1000

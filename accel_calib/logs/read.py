@@ -19,6 +19,7 @@ from .ardupilot import is_dataflash, read_dataflash
 from .bag import Bag, is_bag, open_bag
 from .bag_samples import context_of, imu_samples, together
 from .columns import chosen, is_log_header, LogOptions
+from .containers import member_of, members_of
 from .dialect import layout_of
 from .flight import FlightLog, is_ulg, read_ulg
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
@@ -147,8 +148,15 @@ def _opened(path: Path, options: LogOptions) -> Iterator[OpenLog]:
     elif is_dataflash(path):
         yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
     else:
-        with open_text(path, lambda cells: is_log_header(cells, options)) as text:
-            yield _text(path, text, options)
+        with members_of(path) as members:
+            if members:
+                member = member_of(path, members, options)
+                with member.text(path, options) as text:
+                    log = _text(path / member.name, text, options)
+                    yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))))
+            else:
+                with open_text(path, lambda cells: is_log_header(cells, options)) as text:
+                    yield _text(path, text, options)
 
 
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
@@ -204,7 +212,7 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
     samples: Iterator[Recording]
     if are_samples(head[0]):
         samples = (Recording(*block, units.name, sensor) for block in chain((head,), blocks))
-        count = _estimated(path, text, head)
+        count = _estimated(text, head)
     else:
         poses = Poses(*whole(joined([head, *blocks]), quantities.notes), units.name, sensor)
         if are_untimed_samples(poses.columns):
@@ -251,13 +259,13 @@ def whole(block: Block, notes: list[str]) -> Block:
     return {key: values for key, values in columns.items() if key not in lacking}, row
 
 
-def _estimated(path: Path, text: TextTable, head: Block) -> int:
+def _estimated(text: TextTable, head: Block) -> int:
     """Return the number of rows, from the size of the file and of the first block."""
     count = len(head[1])
     if not text.more:
         return count
     width = 2 if text.layout.encoding.startswith('utf-16') else 1
-    return max(count, int(path.stat().st_size / width / max(text.characters, 1) * count))
+    return max(count, int(text.size / width / max(text.characters, 1) * count))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:

@@ -20,6 +20,7 @@ import io
 from itertools import chain, islice
 from operator import methodcaller
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,15 +68,23 @@ class Cells:
 
 @contextmanager
 def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
-              expected: str = 'time,ax,ay,az') -> Iterator[TextTable]:
-    """Open a text table, and find its dialect; parameters and errors as in `layout_of`."""
-    with io.BufferedReader(io.FileIO(path), _PEEKED) as raw:
+              expected: str = 'time,ax,ay,az',
+              stream: tuple[IO[bytes] | io.RawIOBase, int] | None = None
+              ) -> Iterator[TextTable]:
+    """
+    Open a text table, and find its dialect; parameters and errors as in `layout_of`.
+
+    The bytes are those of the `stream`, with their number, or else of the file.
+
+    """
+    file, size = stream or (io.FileIO(path), path.stat().st_size)
+    with io.BufferedReader(file, _PEEKED) as raw:
         encoding = _encoding(raw.peek())
-        with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as file:
-            head, whole = _head(path, file)
+        with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
+            head, whole = _head(path, text)
             layout = layout_of(path, head, is_header, encoding, strict=strict, expected=expected)
-            lines = chain(head[layout.start:], () if whole else file)
-            yield TextTable(layout, lines, strict=strict)
+            lines = chain(head[layout.start:], () if whole else text)
+            yield TextTable(layout, lines, strict=strict, size=size)
 
 
 def _encoding(head: bytes) -> str:
@@ -124,11 +133,13 @@ class TextTable:
     An open text table, read once, block by block; `open_text` makes it.
 
     `lines` are those from the first row on. If `strict`, a last row that is cut is an error.
+    `size` is the number of bytes.
 
     """
 
-    def __init__(self, layout: Layout, lines: Iterator[str], *, strict: bool) -> None:
-        self.layout, self.strict = layout, strict
+    def __init__(self, layout: Layout, lines: Iterator[str], *, strict: bool, size: int = 0
+                 ) -> None:
+        self.layout, self.strict, self.size = layout, strict, size
         self._lines = lines
         self._line, self._row = layout.start, 0
         self._bad = ''

@@ -1,0 +1,350 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Files that hold several tables: ZIP archives, sheets of Excel, and arrays of MATLAB.
+
+phyphox and Sensor Logger export a ZIP archive with one CSV file for each sensor, and phyphox an
+Excel file with one sheet for each. `members_of` recognises such a file by its first bytes and
+returns its tables, and `member_of` returns that of the accelerometer. Each table is handed over as
+the bytes of a CSV file, piece by piece, so that it is read as any other text log is.
+
+ZIP is read with the standard library, ``.xlsx`` with `openpyxl`, ``.xls`` with `xlrd`, and
+``.mat`` up to version 7 with `scipy`. Structs and timetables of MATLAB are refused: only MATLAB
+can convert all of them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+import csv
+from dataclasses import dataclass
+from datetime import date, datetime, time
+from functools import partial
+import io
+from itertools import islice
+from pathlib import Path
+from typing import Any, IO
+import zipfile
+import zlib
+
+import numpy as np
+
+from .columns import Chosen, chosen, is_log_header, LogOptions
+from .dialect import shown
+from .flight import missing, sound_log
+from .formats import record_instead
+from .names import meaning, READING
+from .text import open_text, TextTable
+from ..errors import InputError
+
+_ZIP, _OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
+_MATLAB, _MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
+_BLACKBOX = b'H Product:Blackbox flight data recorder'
+_WORKBOOK = 'xl/workbook.xml'
+
+_ENCRYPTED = 1
+_MOST_MEMBERS = 500
+_MOST_BYTES = 1 << 29
+"""Largest size of the parts of an Excel file [bytes]."""
+
+_MOST_CELLS = 50_000_000
+_SMALL, _LARGEST_RATIO = 2_000_000, 100
+"""Numbers that any file may hold, and largest ratio of unpacked to packed data."""
+
+_ROWS = 500
+"""Number of rows of a sheet that are read at once."""
+
+_BY_ORDER = (3, 4, 5, 7, 8)
+"""Widths of arrays that are read by the order of their columns."""
+
+_AGAIN = 'export the log as CSV'
+_EXPORT_MATLAB = ('write a CSV file in MATLAB: writetimetable(Acceleration, "log.csv"), or '
+                  'writematrix for an array')
+_NUMBERS = {'double', 'single', *(f'{sign}int{bits}' for sign in ('', 'u')
+                                  for bits in (8, 16, 32, 64))}
+
+
+@dataclass(frozen=True)
+class Member:
+    """A table in a container: its name, its size [bytes, estimated], its bytes from the start."""
+
+    name: str
+    size: int
+    opened: Callable[[], IO[bytes] | io.RawIOBase]
+
+    @contextmanager
+    def text(self, path: Path, options: LogOptions) -> Iterator[TextTable]:
+        """Open the table; errors as in `open_text`."""
+        with self.opened() as file, open_text(
+                path / self.name, lambda cells: is_log_header(cells, options),
+                stream=(file, self.size)) as text:
+            yield text
+
+
+class _Stream(io.RawIOBase):
+    """The bytes of an iterator as a file."""
+
+    def __init__(self, parts: Iterator[bytes]) -> None:
+        self._parts, self._left = parts, b''
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        while not self._left:
+            part = next(self._parts, None)
+            if part is None:
+                return 0
+            self._left = part
+        taken, self._left = self._left[:len(buffer)], self._left[len(buffer):]
+        buffer[:len(taken)] = taken
+        return len(taken)
+
+
+@contextmanager
+def members_of(path: Path) -> Iterator[Sequence[Member]]:
+    """Open a container, and yield its tables; none if the file is not a container."""
+    with path.open('rb') as file:
+        head = file.read(len(_BLACKBOX))
+    if head.startswith(_BLACKBOX):
+        raise InputError(f'{path} is a log of the blackbox as the flight controller wrote it, '
+                         'expected its CSV file', f'decode it with blackbox_decode {path.name}')
+    if head.startswith(_OLE):
+        yield _old_sheets(path)
+    elif head.startswith((_MATLAB, _MATLAB_HDF5)) or (path.suffix == '.mat' and b'\0' in head):
+        yield _arrays(path)
+    elif head.startswith(_ZIP):
+        with _sound_archive(path), zipfile.ZipFile(path) as archive:
+            excel = _WORKBOOK in archive.namelist()
+            yield from (_sheets(path, archive) if excel else [_files(path, archive)])
+    else:
+        yield ()
+
+
+def member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
+    """
+    Return the table with the accelerometer; raise InputError if there is none, or several.
+
+    `options.topic` names a table. Tables of linear acceleration come last, and tables whose names
+    say that they are of an accelerometer first.
+
+    """
+    names = [member.name for member in members]
+    wanted = [member for member in members if options.topic in ('', member.name)]
+    if not wanted:
+        raise InputError(f'{path} has no table {options.topic}, expected one of {shown(names)}',
+                         f'name one of these with --topic "{names[0]}"' if names else
+                         'check that this is the intended file')
+    tables, refused = _tables(path, wanted, options)
+    if not tables:
+        if len(wanted) == 1:
+            raise refused[0]
+        raise InputError(f'{path} has the tables {shown(names)}, expected one of an accelerometer',
+                         'export the table of the accelerometer, with gravity, or name one with '
+                         f'--topic "{names[0]}" to see why it is not read')
+    left = _preferred(tables)
+    if len(left) > 1:
+        raise InputError(f'{path} has {len(left)} tables of accelerometers, '
+                         f'{shown([member.name for member in left])}, expected one',
+                         f'choose one with --topic "{left[0].name}"')
+    return left[0]
+
+
+def _tables(path: Path, members: Sequence[Member], options: LogOptions
+            ) -> tuple[dict[Member, Chosen], list[InputError]]:
+    """Return the tables that have the columns of an accelerometer, and why others have not."""
+    tables, refused = {}, []
+    for member in members:
+        try:
+            with member.text(path, options) as text:
+                tables[member] = chosen(text.layout, options)
+        except InputError as err:
+            refused.append(err)
+    return tables, refused
+
+
+def _preferred(tables: Mapping[Member, Chosen]) -> list[Member]:
+    """Return the tables of accelerometers by their names, as far as the names tell."""
+    left = list(tables)
+    for is_better in (_has_gravity, _is_named):
+        left = [member for member in left if is_better(member, tables[member])] or left
+    return left
+
+
+def _has_gravity(_: Member, columns: Chosen) -> bool:
+    return not record_instead(columns.layout.header, columns.layout.path)
+
+
+def _is_named(member: Member, columns: Chosen) -> bool:
+    """Return whether a table or its columns have the name of an acceleration."""
+    names = [Path(member.name).stem, *columns.names(READING[:1])]
+    return any(meaning(name).quantity == 'reading' or 'accel' in name.casefold()
+               for name in names)
+
+
+# ----------------------------------------------------------------------------- ZIP archives
+
+@contextmanager
+def _sound_archive(path: Path) -> Iterator[None]:
+    """Turn the errors of a damaged or encrypted archive into InputError."""
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as err:
+        raise InputError(f'{path} cannot be unpacked ({err}), expected a ZIP archive',
+                         'unpack it, and use the log in it') from err
+
+
+def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
+    """Return the files of an archive that can be logs."""
+    infos = [info for info in archive.infolist() if not info.is_dir() and not any(
+        part.startswith(('.', '__MACOSX')) or part == 'meta'  # phyphox: about the phone
+        for part in Path(info.filename).parts)]
+    if not 0 < len(infos) <= _MOST_MEMBERS:
+        raise InputError(f'{path} holds {len(infos)} files, expected 1 to {_MOST_MEMBERS}',
+                         'unpack it, and use the log in it')
+    if any(info.flag_bits & _ENCRYPTED for info in infos):
+        raise InputError(f'{path} needs a password, expected a ZIP archive without one',
+                         'unpack it, and use the log in it')
+    return [Member(info.filename, info.file_size, partial(archive.open, info)) for info in infos]
+
+
+# ------------------------------------------------------------------------------------ Excel
+
+def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
+    """Yield the sheets of an ``.xlsx`` file, while it is open."""
+    size = sum(info.file_size for info in archive.infolist())
+    if size > _MOST_BYTES:
+        raise InputError(f'{path} unpacks to more than {_MOST_BYTES} bytes, expected a smaller '
+                         'Excel file', 'export the log as CSV')
+    try:
+        import openpyxl
+    except ImportError as err:
+        raise missing('openpyxl', 'Excel files (.xlsx)', err) from err
+    with sound_log(path, 'an Excel file (.xlsx)', _AGAIN):
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            sheet.reset_dimensions()  # those that the file states can be wrong
+    try:
+        yield [Member(sheet.title, size, partial(
+            _rows, path, partial(sheet.iter_rows, values_only=True))) for sheet in book.worksheets]
+    finally:
+        book.close()
+
+
+def _old_sheets(path: Path) -> list[Member]:
+    """Return the sheets of an ``.xls`` file."""
+    try:
+        import xlrd
+    except ImportError as err:
+        raise missing('xlrd', 'Excel files (.xls)', err) from err
+    with sound_log(path, 'an Excel file (.xls)', _AGAIN):
+        book = xlrd.open_workbook(path, ragged_rows=True)
+
+    def rows(sheet: Any) -> Iterator[Sequence[Any]]:
+        for k in range(sheet.nrows):
+            yield [xlrd.xldate_as_datetime(cell.value, book.datemode)
+                   if cell.ctype == xlrd.XL_CELL_DATE else cell.value for cell in sheet.row(k)]
+
+    return [Member(sheet.name, path.stat().st_size, partial(_rows, path, partial(rows, sheet)))
+            for sheet in book.sheets()]
+
+
+def _rows(path: Path, rows: Callable[[], Iterator[Sequence[Any]]]) -> _Stream:
+    """Open the rows of a sheet as a CSV file."""
+    return _Stream(_csv(path, rows()))
+
+
+def _csv(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
+    """Yield the rows of a sheet as lines of a CSV file; all rows have the same number of cells."""
+    width = cells = 0
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    while True:
+        with sound_log(path, 'an Excel file', _AGAIN):
+            block = [[_cell(value) for value in row] for row in islice(rows, _ROWS)]
+        if not block:
+            return
+        width = max(width, *map(len, block))
+        cells += (width + 1) * len(block)
+        if cells > _MOST_CELLS:
+            raise InputError(f'{path} has more than {_MOST_CELLS} cells, expected a smaller Excel '
+                             'file', 'export the log as CSV')
+        writer.writerows([*row, *[''] * (width - len(row))] for row in block)
+        yield text.getvalue().encode()
+        text.seek(0)
+        text.truncate()
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, (datetime, date, time)):
+        return value.isoformat()
+    return '' if value is None else str(value)
+
+
+# ----------------------------------------------------------------------------------- MATLAB
+
+def _arrays(path: Path) -> list[Member]:
+    """Return the arrays of a ``.mat`` file as tables; those of one length are columns of one."""
+    import scipy.io  # here, because few runs need it
+
+    with path.open('rb') as file:
+        is_hdf5 = file.read(len(_MATLAB_HDF5)) == _MATLAB_HDF5
+    if is_hdf5:
+        raise InputError(f'{path} is a MATLAB file of version 7.3, expected version 7 or older',
+                         f'save it with save(file, "-v7"), or {_EXPORT_MATLAB}')
+    with sound_log(path, 'a MATLAB file (.mat)', _AGAIN):
+        try:
+            held = scipy.io.whosmat(path)
+        except TypeError:  # of scipy, for tables, timetables and other objects
+            held = []
+        plain = [name for name, shape, kind in held
+                 if kind in _NUMBERS and len(shape) == 2 and max(shape) > 1]
+        size = sum(int(np.prod(shape)) for name, shape, _ in held if name in plain)
+        most = max(_SMALL, _LARGEST_RATIO * path.stat().st_size // 8)
+        found = scipy.io.loadmat(path, variable_names=plain) if 0 < size <= most else {}
+    if not found:
+        kinds = shown([f'{kind} {name}' for name, _, kind in held])
+        raise InputError(f'{path} holds {kinds or "timetables or other objects"}, expected plain '
+                         f'arrays of at most {most} numbers', _EXPORT_MATLAB)
+    arrays = {name: values.T if values.shape[0] < values.shape[1] else values
+              for name in plain if (values := found[name]).dtype.kind in 'iuf'}
+    return [_array_table(name, group) for name, group in _groups(arrays).items()]
+
+
+def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return arrays of one length together, or each alone if their names tell no accelerometer."""
+    groups: dict[str, dict[str, Any]] = {}
+    by_length: dict[int, dict[str, Any]] = {}
+    for name, values in arrays.items():
+        by_length.setdefault(len(values), {})[name] = values
+    for group in by_length.values():
+        header = [cell for name, values in group.items() for cell in _names(name, values)]
+        if is_log_header(header, LogOptions()):
+            groups[', '.join(group)] = group
+        else:
+            groups |= {name: {'': values} for name, values in group.items()
+                       if values.shape[1] in _BY_ORDER}
+    return groups or {name: {name: values} for name, values in arrays.items()}
+
+
+def _names(name: str, values: Any) -> list[str]:
+    """Return the names of the columns of an array; none for a name that is empty."""
+    width = values.shape[1] if name else 0
+    ends = {1: [''], 3: ['_x', '_y', '_z']}.get(width, [f'_{k + 1}' for k in range(width)])
+    return [f'{name}{end}' for end in ends]
+
+
+def _array_table(name: str, group: Mapping[str, Any]) -> Member:
+    header = [cell for each, values in group.items() for cell in _names(each, values)]
+    table = np.hstack([values.astype(float) for values in group.values()])
+
+    def lines() -> Iterator[bytes]:
+        if header:
+            yield f'{",".join(header)}\n'.encode()
+        for row in table.tolist():
+            yield f'{",".join(map(repr, row))}\n'.encode()
+
+    return Member(name, table.size * 18, lambda: _Stream(lines()))

@@ -1,0 +1,317 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Logs in ZIP archives, Excel files and MATLAB files are read as their tables are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+import datetime
+from pathlib import Path
+import struct
+import tracemalloc
+from typing import Any
+import zipfile
+
+from accel_calib.errors import InputError
+from accel_calib.logs import LogOptions, open_log, read_log
+from accel_calib.table import Recording
+from faults.sample import sample
+import numpy as np
+import openpyxl
+import pytest
+import scipy.io
+from test_logs import G, rows_of, samples, text_of
+
+PHYPHOX = '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)","Acceleration z (m/s^2)"'
+LINEAR = PHYPHOX.replace('Acceleration', 'Linear Acceleration')
+GYRO = '"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)","Gyroscope z (rad/s)"'
+LOGGER = 'time,seconds_elapsed,z,y,x'
+
+Tables = Mapping[str, str]
+
+
+def tables_of(makers: str) -> tuple[dict[str, str], np.ndarray]:
+    """Return the tables of an app's export, and the readings with gravity."""
+    made = samples(per_g=G, rest=60, turn=20)
+    time, reading, rate = made['time'], made['reading'], made['rate']
+    rows = rows_of(time, reading)
+    free = 0.02 * rate  # as if of the hand that turns the phone
+    turns = rows_of(time, rate)
+    if makers == 'phyphox':
+        return {'Linear Accelerometer': text_of(rows_of(time, free), LINEAR),
+                'Gyroscope': text_of(turns, GYRO), 'Accelerometer': text_of(rows, PHYPHOX),
+                'meta/device': 'property,value\nversion,1.1\n'}, reading
+
+    def logger(values: np.ndarray) -> str:
+        return text_of(rows_of(1.7e18 + 1e9 * time, time, values[:, ::-1]), LOGGER)
+
+    return {'Accelerometer': logger(free),
+            'Gravity': logger(reading), 'Gyroscope': logger(rate),
+            'Magnetometer': logger(5.0 * reading), 'Metadata': 'version,device\n3,phone\n',
+            'TotalAcceleration': logger(reading)}, reading
+
+
+def zipped(path: Path, tables: Tables, method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, 'w', method) as archive:
+        for name, text in tables.items():
+            archive.writestr(f'{name}.csv', text)
+    return path
+
+
+def rows_in(text: str) -> list[list[Any]]:
+    cells = [[cell.strip('"') for cell in line.split(',')] for line in text.splitlines()]
+    return [cells[0], *([float(cell) for cell in row] for row in cells[1:])]
+
+
+def excel(path: Path, tables: Mapping[str, list[list[Any]]]) -> Path:
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for name, rows in tables.items():
+        sheet = book.create_sheet(name)
+        for row in rows:
+            sheet.append(row)
+    book.save(path)
+    return path
+
+
+def old_excel(path: Path, tables: Mapping[str, list[list[Any]]]) -> Path:
+    """Write an ``.xls`` file: BIFF8 records in the stream Workbook of a compound file."""
+    def record(kind: int, data: bytes) -> bytes:
+        return struct.pack('<HH', kind, len(data)) + data
+
+    def cell(row: int, column: int, value: Any) -> bytes:
+        at = struct.pack('<HHH', row, column, 0)
+        if isinstance(value, str):
+            return record(0x204, at + struct.pack('<HB', len(value), 0) + value.encode('latin-1'))
+        return record(0x203, at + struct.pack('<d', value))
+
+    begin = struct.pack('<HHHHII', 0x600, 5, 0, 1997, 0, 0x600)
+    sheets = [record(0x809, begin[:2] + b'\x10\0' + begin[4:]) + b''.join(
+        cell(i, j, value) for i, row in enumerate(rows) for j, value in enumerate(row))
+        + record(0x0A, b'') for rows in tables.values()]
+    head = record(0x809, begin)
+    names = [name.encode('latin-1') for name in tables]
+    starts = len(head) + sum(12 + len(name) for name in names) + 4
+    for name, sheet in zip(names, sheets, strict=True):
+        head += record(0x85, struct.pack('<IHBB', starts, 0, len(name), 0) + name)
+        starts += len(sheet)
+    stream = (head + record(0x0A, b'') + b''.join(sheets)).ljust(4096, b'\0')
+    count = -(-len(stream) // 512)
+    tables_needed = -(-(count + 1) // 127)  # of 128 sector numbers each, their own among them
+    chain = [*range(1, count), 0xFFFFFFFE, 0xFFFFFFFE, *[0xFFFFFFFD] * tables_needed]
+    chain += [0xFFFFFFFF] * (128 * tables_needed - len(chain))
+
+    def entry(name: str, kind: int, child: int, start: int, size: int) -> bytes:
+        spelled = f'{name}\0'.encode('utf-16-le')
+        return (spelled.ljust(64, b'\0') + struct.pack('<HBBIII', len(spelled), kind, 1,
+                                                       *[0xFFFFFFFF] * 2, child)
+                + bytes(36) + struct.pack('<III', start, size, 0))
+
+    folder = (entry('Root Entry', 5, 1, 0xFFFFFFFE, 0)
+              + entry('Workbook', 2, 0xFFFFFFFF, 0, len(stream)) + bytes(256))
+    numbers = [count + 1 + k for k in range(tables_needed)]
+    top = (b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1' + bytes(16) + struct.pack(
+        '<HHHHHHIIIIIIIII', 0x3E, 3, 0xFFFE, 9, 6, 0, 0, 0, tables_needed, count, 0, 4096,
+        0xFFFFFFFE, 0, 0xFFFFFFFE) + struct.pack('<I', 0)
+        + struct.pack('<109I', *numbers, *[0xFFFFFFFF] * (109 - tables_needed)))
+    path.write_bytes(top + stream.ljust(512 * count, b'\0') + folder
+                     + struct.pack(f'<{128 * tables_needed}I', *chain))
+    return path
+
+
+def written(kind: str, folder: Path, tables: Tables) -> Path:
+    if kind == 'zip':
+        return zipped(folder / 'log.zip', tables)
+    if kind == 'stored zip':
+        return zipped(folder / 'log.csv', tables, zipfile.ZIP_STORED)
+    sheets = {name.replace('/', ' '): rows_in(text) for name, text in tables.items()
+              if name not in ('meta/device', 'Metadata')}
+    return (excel(folder / 'log.xlsx', sheets) if kind == 'xlsx' else
+            old_excel(folder / 'log.xls', sheets))
+
+
+@pytest.mark.parametrize('kind', ['zip', 'stored zip', 'xlsx', 'xls'])
+@pytest.mark.parametrize('maker', ['phyphox', 'sensor-logger'])
+def test_the_table_of_the_accelerometer_in_an_export_is_read_and_named(
+        maker: str, kind: str, tmp_path: Path) -> None:
+    tables, reading = tables_of(maker)
+    log = read_log(written(kind, tmp_path, tables))
+    assert isinstance(log.table, Recording)
+    np.testing.assert_allclose(log.table.reading, reading, rtol=1e-8)
+    name = 'Accelerometer' if maker == 'phyphox' else 'TotalAcceleration'
+    assert log.read_as.startswith(f'{name}.csv, ' if 'zip' in kind else f'{name}, ')
+    assert log.units.name == 'm/s2'
+
+
+@pytest.mark.parametrize('kind', ['zip', 'xlsx'])
+def test_of_two_accelerometers_one_is_chosen_by_its_name(kind: str, tmp_path: Path) -> None:
+    made = samples(per_g=G, rest=60, turn=20)
+    header = 'time,accX,accY,accZ'
+    tables = {'left': text_of(rows_of(made['time'], made['reading']), header),
+              'right': text_of(rows_of(made['time'], -made['reading']), header)}
+    path = written(kind, tmp_path, tables)
+    end = '.csv' if kind == 'zip' else ''
+    with pytest.raises(InputError,
+                       match=f'left{end}, right{end}, expected one.*--topic "left{end}"'):
+        read_log(path)
+    log = read_log(path, LogOptions(topic=f'right{end}'))
+    np.testing.assert_allclose(log.table.reading, -made['reading'], rtol=1e-8)
+    with pytest.raises(InputError, match='no table up, expected one of left'):
+        read_log(path, LogOptions(topic='up'))
+
+
+def test_an_export_without_gravity_is_refused_with_what_to_record(tmp_path: Path) -> None:
+    tables, _ = tables_of('phyphox')
+    del tables['Accelerometer']
+    with pytest.raises(InputError, match=r'log\.zip.*linear acceleration, gravity removed'):
+        read_log(zipped(tmp_path / 'log.zip', tables))
+
+
+def test_dates_of_a_sheet_are_times(tmp_path: Path) -> None:
+    made = samples(per_g=G, rest=60, turn=20)
+    start = datetime.datetime(2026, 1, 31, 12)
+    rows = [[start + datetime.timedelta(seconds=round(at, 3)), *row] for at, row in
+            zip(made['time'].tolist(), made['reading'].tolist(), strict=True)]
+    log = read_log(excel(tmp_path / 'log.xlsx', {'S': [['time', 'ax', 'ay', 'az'], *rows]}))
+    np.testing.assert_allclose(np.diff(log.table['time']), np.diff(made['time']), atol=2e-3)
+
+
+@pytest.mark.parametrize('form', ['columns', 'rows', 'three', 'one', 'alone'])
+def test_plain_arrays_of_matlab_are_read(form: str, tmp_path: Path) -> None:
+    made = samples(per_g=G, rest=60, turn=20)
+    time, reading = made['time'], made['reading']
+    held = {'columns': {'t': time[:, np.newaxis], 'acc': reading, 'gyr': made['rate'],
+                        'mag': 5.0 * reading, 'rate_hz': 100.0, 'name': 'a phone'},
+            'rows': {'t': time, 'acc': reading.T},
+            'three': {'t': time, **dict(zip(('ax', 'ay', 'az'), reading.T, strict=True))},
+            'one': {'data': np.column_stack([time, reading])},
+            'alone': {'t': time[:7], 'acc': reading}}[form]
+    scipy.io.savemat(tmp_path / 'log.mat', held, do_compression=True)
+    options = LogOptions(rate=100.0) if form == 'alone' else LogOptions()
+    log = read_log(tmp_path / 'log.mat', options)
+    np.testing.assert_allclose(log.table.reading, reading, rtol=1e-12)
+    np.testing.assert_allclose(np.diff(log.table['time']), np.diff(time), atol=1e-9)
+    assert ('rate' in log.table) == (form == 'columns')
+
+
+@pytest.mark.parametrize(('held', 'words'), [
+    ({'log': {'acc': np.ones((9, 3))}}, 'holds struct log, expected plain arrays.*writetimetable'),
+    ({'name': 'phone'}, 'holds char name, expected plain arrays'),
+    ({'gyr': np.ones((9, 2))}, 'ax, ay, az')])
+def test_other_contents_of_matlab_say_how_to_export(held: dict[str, Any], words: str,
+                                                    tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / 'log.mat', held)
+    with pytest.raises(InputError, match=words):
+        read_log(tmp_path / 'log.mat')
+
+
+def test_a_matlab_file_of_version_7_3_says_how_to_save_it(tmp_path: Path) -> None:
+    path = tmp_path / 'log.mat'
+    path.write_bytes(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(512) + b'\x89HDF\r\n\x1a\n')
+    with pytest.raises(InputError, match=r'version 7\.3.*save\(file, "-v7"\)'):
+        read_log(path)
+
+
+@pytest.mark.parametrize('name', ['LOG00001.BFL', 'btfl.bbl', 'LOG.TXT'])
+def test_a_log_of_the_blackbox_says_how_to_decode_it(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(b'H Product:Blackbox flight data recorder by Nicholas Sherlock\n'
+                     b'H Data version:2\nH Field I name:loopIteration,time,accSmooth[0]\n\0\1\2')
+    with pytest.raises(InputError, match=f'decode it with blackbox_decode {name}'):
+        read_log(path)
+
+
+@pytest.mark.parametrize('blank', [',,,', ';;;', '""', '  ', ',,,\n,,,\n,,,'])
+def test_blank_rows_at_the_end_are_left_out(blank: str, tmp_path: Path) -> None:
+    made = samples(per_g=G, rest=60, turn=20)
+    text = text_of(rows_of(made['time'], made['reading']), 'time,ax,ay,az')
+    path = tmp_path / 'log.csv'
+    path.write_text(text + f'{blank}\n' * 3)
+    np.testing.assert_allclose(read_log(path).table.reading, made['reading'], rtol=1e-8)
+    sheet = rows_in(text) + [[None] * 4] * 3
+    log = read_log(excel(tmp_path / 'log.xlsx', {'S': sheet}))
+    np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-8)
+
+
+def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path / 'log.zip', {'acc': 'time,ax,ay,az\n0,0,0,9.8\n'})
+    data = bytearray(path.read_bytes())
+    for mark, at in ((b'PK\x03\x04', 6), (b'PK\x01\x02', 8)):
+        data[data.index(mark) + at] |= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match='needs a password'):
+        read_log(path)
+
+
+def test_an_archive_without_a_log_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='gyro.csv, baro.csv, expected one of an acc'):
+        read_log(zipped(tmp_path / 'log.zip', {'gyro': f'{GYRO}\n0,0,0,0\n',
+                                               'baro': 't,p\n0,1\n'}))
+    zipped(tmp_path / 'empty.zip', {'meta/time': 'a,b\n'})
+    with pytest.raises(InputError, match='holds 0 files'):
+        read_log(tmp_path / 'empty.zip')
+
+
+@pytest.mark.parametrize('kind', ['zip', 'xlsx', 'far', 'mat'])
+def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / 'bomb.mat'
+    if kind == 'zip':
+        with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive, archive.open(
+                'acc.csv', 'w') as file:
+            for _ in range(4):
+                file.write(b'1' * (1 << 24))
+    elif kind == 'xlsx':
+        excel(path, {'S': [['a']]})
+        data = bytearray(path.read_bytes())
+        data[(at := data.rindex(b'PK\x01\x02') + 24):at + 4] = struct.pack('<I', 1 << 30)
+        path.write_bytes(data)
+    elif kind == 'far':
+        book = openpyxl.Workbook()
+        book.active.cell(1, 1, 1.0)
+        book.active.cell(1 << 20, 1 << 14, 1.0)
+        book.save(path)
+    else:
+        scipy.io.savemat(path, {'acc': np.zeros((4_000_000, 3))}, do_compression=True)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            read_log(path)
+        # scipy unpacks 128 KiB at once, to at most 1030 times as much.
+        assert tracemalloc.get_traced_memory()[1] < (250e6 if kind == 'mat' else 150e6)
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize('kind', ['zip', 'xlsx', 'xls', 'mat'])
+def test_a_damaged_container_ends_in_a_result_or_a_refusal(kind: str, tmp_path: Path) -> None:
+    tables, reading = tables_of('phyphox')
+    short = {name: '\n'.join(text.splitlines()[:300]) for name, text in tables.items()}
+    if kind == 'mat':
+        path = tmp_path / 'log.mat'
+        scipy.io.savemat(path, {'acc': reading[:300], 'gyr': reading[:300]}, do_compression=True)
+    else:
+        path = written(kind, tmp_path, short)
+    sound = path.read_bytes()
+    for seed in sample(range(1000), 12):
+        rng = np.random.default_rng(seed)
+        data = bytearray(sound)
+        for at in rng.integers(20, len(data), size=rng.integers(1, 8)):
+            data[at] = rng.integers(256)
+        path.write_bytes(data[:int(rng.integers(1, len(data)))] if seed % 3 == 0 else data)
+        with suppress(InputError), open_log(path) as log:
+            list(log.blocks)
+
+
+def test_a_matlab_file_of_timetables_says_how_to_export_them(tmp_path: Path) -> None:
+    # A file of level 5: the array flag 17 (opaque), as MATLAB Mobile saves its timetables.
+    names = struct.pack('<II', 1, 12) + b'Acceleration'.ljust(16, b'\0')
+    kinds = (struct.pack('<II', 1, 4) + b'MCOS'.ljust(8, b'\0')
+             + struct.pack('<II', 1, 9) + b'timetable'.ljust(16, b'\0'))
+    body = struct.pack('<IIII', 6, 8, 17, 0) + names + kinds
+    path = tmp_path / 'sensorlog.mat'
+    path.write_bytes(b'MATLAB 5.0 MAT-file'.ljust(124) + struct.pack('<H2s', 0x100, b'IM')
+                     + struct.pack('<II', 14, len(body)) + body)
+    with pytest.raises(InputError, match='expected plain arrays.*writetimetable'):
+        read_log(path)
