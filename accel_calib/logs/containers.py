@@ -26,7 +26,7 @@ from functools import partial
 import io
 from itertools import islice
 from pathlib import Path
-from typing import Any, IO
+from typing import Any
 import zipfile
 import zlib
 
@@ -73,7 +73,7 @@ class Member:
 
     name: str
     size: int
-    opened: Callable[[], IO[bytes] | io.RawIOBase]
+    opened: Callable[[], Any]
 
     @contextmanager
     def text(self, path: Path, options: LogOptions) -> Iterator[TextTable]:

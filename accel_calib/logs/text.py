@@ -20,7 +20,6 @@ import io
 from itertools import chain, islice
 from operator import methodcaller
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +68,7 @@ class Cells:
 @contextmanager
 def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
               expected: str = 'time,ax,ay,az',
-              stream: tuple[IO[bytes] | io.RawIOBase, int] | None = None
+              stream: tuple[io.RawIOBase, int] | None = None
               ) -> Iterator[TextTable]:
     """
     Open a text table, and find its dialect; parameters and errors as in `layout_of`.
