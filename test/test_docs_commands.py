@@ -10,6 +10,7 @@ run, in the order of the page and in one temporary folder. A file that a command
 
     <!-- files: log.csv=esp32/counts.log -->
 
+A snippet whose first line is ``# NAME.py`` is written to this file first.
 ``<!-- status: 1 -->`` above a block states the exit status of its last command. The commands
 `OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py, test_watch.py and
 test_live_command.py run them.
@@ -125,6 +126,9 @@ def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
         if Path(log).suffix in LIBRARIES:
             pytest.importorskip(LIBRARIES[Path(log).suffix])
         shutil.copy(LOGS / log, name)
+    for name, code in re.findall(r'^```python\n# (\w+\.py)\n(.*?)^```', text_of(page),
+                                 re.MULTILINE | re.DOTALL):
+        Path(name).write_text(code)
     if any(words[0] == 'fleet' for block in blocks for words in block.commands):
         pytest.importorskip('distributed')
     for block in blocks:

@@ -78,6 +78,14 @@ def test_an_absurd_deviation_is_left_out_and_named(value):
     assert 'not at rest' in found.rejected[0].reason
 
 
+def test_a_row_with_an_absurd_reading_and_an_absurd_deviation_is_left_out_and_named():
+    poses = simulate_poses(sensor(np.random.default_rng(1)), spread_directions(14),
+                           np.random.default_rng(2))
+    reading, std = poses.reading.copy(), poses['std'].copy()
+    reading[5], std[5] = 1e6, 1e6
+    assert left_out(fit_poses(poses.with_columns(reading=reading, std=std), G)) == [6]
+
+
 def test_poses_that_are_not_on_a_sphere_are_refused_with_a_message():
     rng = np.random.default_rng(3)
     for _ in range(20):
