@@ -65,7 +65,8 @@ def test_a_whole_calibration_through_the_commands_of_the_page(
     offered = viewer.ask('fit', bench.spin)
     assert offered['success'], offered['words']
     assert viewer.state['preview']
-    assert viewer.state['result']['after_mg'] < 1.0 < viewer.state['result']['before_mg']
+    residuals = {label: value for label, value, unit in viewer.state['result']['residuals']}
+    assert residuals['residual after'] < 1.0 < residuals['residual before']
     assert not path.exists()
     bench.spin(lambda: viewer.state['rating'])
     assert fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')[0] == 409
