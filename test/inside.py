@@ -13,6 +13,7 @@ name that is not clear without its file has another one here.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from accel_calib.calibrate import (
@@ -108,16 +109,13 @@ from accel_calib.geometry import (
     unit,
 )
 from accel_calib.intake import poses_of
-from accel_calib.live import server, sources, viewer
-from accel_calib.live.host import Host
+from accel_calib.live import sources
 from accel_calib.live.messages import CALIBRATION_ALONE
 from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
 from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
 from accel_calib.live.messages import log as live_log
 from accel_calib.live.messages import PERIOD as LIVE_PERIOD
-from accel_calib.live.server import PageServer
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.live.viewer import announce, qr_code, reachable
 from accel_calib.logs import (
     are_samples,
     bag_samples,
@@ -224,7 +222,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     return calibration_from(text.encode(), name)
 
 
-PAGE_FOLDER = Path(server.__file__).parent / 'page'
+PAGE_FOLDER = Path(sources.__file__).parent / 'page'
 """Files of the live page."""
 
 # Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
@@ -238,11 +236,18 @@ MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
 PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'
 CLOCK_OF_A_SOURCE = sources, 'time'
-PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
-PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'
-PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_base, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 DECOMPRESSED = bounded_bags, 'decompressed'
-STUCK = viewer, 'STUCK_S'
+
+if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
+    from accel_calib.live import server, viewer
+    from accel_calib.live.host import Host
+    from accel_calib.live.server import PageServer
+    from accel_calib.live.viewer import announce, qr_code, reachable
+
+    PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
+    PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'
+    PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
+    STUCK = viewer, 'STUCK_S'
