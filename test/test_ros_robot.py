@@ -18,11 +18,11 @@ from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults.sample import sample
 from geometry_msgs.msg import Vector3
-from inside import CALIBRATOR, rotation_from_rpy, spread_directions
+from inside import CALIBRATOR, NODES, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool, String
 
 GRAVITY = 9.80665
@@ -196,6 +196,27 @@ def test_the_log_says_what_the_node_waits_for_and_the_unit_that_is_likely(bench:
     assert 'waiting: no Imu messages on /imu/data_raw, although /bench publishes' in printed
     assert 'Imu messages arrive on /imu/data_raw' in printed
     assert 'start the node with units:=g' in printed
+
+
+def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> None:
+    from rcl_interfaces.msg import Log
+    lines = bench.listen(Log, '/rosout', latched=True)
+    bench.node.create_publisher(Imu, '/arm/imu', 10)
+    bench.node.create_publisher(Temperature, '/board/temperature', 10)
+    bench.run(*NODES['calibrator'], '--ros-args', '-r', 'imu/data_raw:=/elsewhere',
+              '-r', '__node:=astray')
+
+    def said(*words: str) -> bool:
+        return any(all(each in line.msg for each in words) for line in lines)
+
+    bench.spin(lambda: said('no Imu messages on /elsewhere', 'such as /arm/imu'))
+    bench.calibrator()
+
+    def named() -> bool:
+        bench.send(bench.imu([0.1, 0.2, 9.8]))
+        return said('no temperature arrives', 'temperature:=/board/temperature')
+
+    bench.spin(named)
 
 
 def test_one_rest_gives_gyro_bias_mounting_and_the_offset_along_gravity(bench: Any) -> None:

@@ -61,6 +61,7 @@ _BY_ORDER = (3, 4, 5, 7, 8)
 """Widths of arrays that are read by the order of their columns."""
 
 _AGAIN = 'export the log as CSV'
+_UNPACK = 'unpack it, and use the log in it'
 _EXPORT_MATLAB = ('write a CSV file in MATLAB: writetimetable(Acceleration, "log.csv"), or '
                   'writematrix for an array')
 _NUMBERS = {'double', 'single', *(f'{sign}int{bits}' for sign in ('', 'u')
@@ -194,7 +195,7 @@ def _sound_archive(path: Path) -> Iterator[None]:
         yield
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as err:
         raise InputError(f'{path} cannot be unpacked ({err}), expected a ZIP archive',
-                         'unpack it, and use the log in it') from err
+                         _UNPACK) from err
 
 
 def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
@@ -204,10 +205,10 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
         for part in Path(info.filename).parts)]
     if not 0 < len(infos) <= _MOST_MEMBERS:
         raise InputError(f'{path} holds {len(infos)} files, expected 1 to {_MOST_MEMBERS}',
-                         'unpack it, and use the log in it')
+                         _UNPACK)
     if any(info.flag_bits & _ENCRYPTED for info in infos):
         raise InputError(f'{path} needs a password, expected a ZIP archive without one',
-                         'unpack it, and use the log in it')
+                         _UNPACK)
     return [Member(info.filename, info.file_size, partial(archive.open, info)) for info in infos]
 
 
@@ -218,7 +219,7 @@ def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
     size = sum(info.file_size for info in archive.infolist())
     if size > _MOST_BYTES:
         raise InputError(f'{path} unpacks to more than {_MOST_BYTES} bytes, expected a smaller '
-                         'Excel file', 'export the log as CSV')
+                         'Excel file', _AGAIN)
     try:
         import openpyxl
     except ImportError as err:
@@ -271,7 +272,7 @@ def _csv(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
         cells += (width + 1) * len(block)
         if cells > _MOST_CELLS:
             raise InputError(f'{path} has more than {_MOST_CELLS} cells, expected a smaller Excel '
-                             'file', 'export the log as CSV')
+                             'file', _AGAIN)
         writer.writerows([*row, *[''] * (width - len(row))] for row in block)
         yield text.getvalue().encode()
         text.seek(0)

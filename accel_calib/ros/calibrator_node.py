@@ -168,8 +168,8 @@ class Calibrator:
         """Publish the diagnostics."""
         self.session.publishers = tuple(
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
-        self.session.imus, self.session.thermometers = (
-            published_by_others(self._node, kind) for kind in (Imu, Temperature))
+        self.session.imus, self.session.thermometers = published_by_others(
+            self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
         self.session.mismatches = mismatches(self._node, self._heard, self._said)
         self.stream.flush()
         self.session.tick()

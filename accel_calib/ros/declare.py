@@ -52,7 +52,7 @@ def misspelt(node: Node) -> list[str]:
     """Return one line for each parameter that was given to a node and that it does not have."""
     names = [name for name in node._parameter_overrides if not node.has_parameter(name)
              and not name.startswith('qos_overrides.')]
-    known = list(node._parameters)
+    known = list(node.get_parameters_by_prefix(''))
     near = {name: ' or '.join(get_close_matches(name, known)) for name in names}
     return [f'there is no parameter {name}, expected {words or "one of ros2 param list"}: correct '
             'the name' for name, words in near.items()]
@@ -142,13 +142,14 @@ def name_of(endpoint: TopicEndpointInfo) -> str:
     return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
 
 
-def published_by_others(node: Node, kind: Any) -> tuple[str, ...]:
-    """Return the topics with messages of a type that other nodes publish."""
-    name, own = f'sensor_msgs/msg/{kind.__name__}', (node.get_namespace(), node.get_name())
-    topics = [topic for topic, kinds in node.get_topic_names_and_types() if name in kinds]
-    return tuple(topic for topic in topics
-                 if any((each.node_namespace, each.node_name) != own
-                        for each in node.get_publishers_info_by_topic(topic)))
+def published_by_others(node: Node, types: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return for each type, such as ``sensor_msgs/msg/Imu``, the topics of other nodes."""
+    own = node.get_namespace(), node.get_name()
+    graph = node.get_topic_names_and_types()
+    return [tuple(topic for topic, of_topic in graph if wanted in of_topic
+                  and any((each.node_namespace, each.node_name) != own
+                          for each in node.get_publishers_info_by_topic(topic)))
+            for wanted in types]
 
 
 def mismatches(node: Node, subscriptions: Iterable[Any], publishers: Iterable[Any]
