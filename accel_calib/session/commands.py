@@ -168,7 +168,7 @@ class Commands:
                 raise RefusedFitError(f'{fitted.words[0]}; not used: {fitted.rating.reason}',
                                       fitted.rating.next.text)
         except RefusedFitError as error:
-            sensor.refuse(error.advice)
+            sensor.guide.refuse(len(poses), error.advice)
             raise
         sensor.fitted_poses = len(poses)
         return fitted

@@ -39,6 +39,9 @@ _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
 
+_WITHOUT_NEW = 60.0
+"""Time without a new pose after which the robot probably cannot be turned further [s]."""
+
 FEWEST_IN_CONE = 4
 """Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
 
@@ -201,6 +204,8 @@ class Guide:
         self._all_taken = False
         self._begun = 0
         self._count = 0
+        self._new_at = math.inf
+        self._refused = 0, ''
         self._rest = -math.inf
 
     @property
@@ -248,10 +253,26 @@ class Guide:
         """Return the number of poses for which the next pose was chosen."""
         return 0 if self._plan is None else self._plan.poses
 
-    def added(self, count: int) -> int:
-        """Note this number of poses, and return by how many it has changed."""
+    def added(self, count: int, stamp: float) -> int:
+        """Note the number of poses at a header stamp [s]; return by how many it has changed."""
         change, self._count = count - self._count, count
+        if change:
+            self._new_at = stamp
         return change
+
+    def refuse(self, poses: int, advice: str) -> None:
+        """Note that a fit to this number of poses is refused, and what to do."""
+        self._refused = poses, advice
+
+    @property
+    def refused_advice(self) -> str:
+        """Return what to do after a refused fit to the present poses; empty otherwise."""
+        poses, advice = self._refused
+        return advice if poses == self.poses else ''
+
+    def is_stuck(self, stamp: float) -> bool:
+        """Return whether a fit is refused, or no pose has been new for a minute."""
+        return bool(self.refused_advice) or stamp - self._new_at >= _WITHOUT_NEW
 
     def is_new_rest(self, start: float) -> bool:
         """Return whether a captured rest with this start has no line yet, and note it."""
@@ -342,10 +363,11 @@ def next_action(session: Session) -> Action | None:
 def _within_reach(session: Session, action: Action) -> Action:
     """Return a step that a robot which cannot be turned further can do, too."""
     sensor = session.sensor
-    if not sensor.is_stuck(session.statistics.stamp) or sensor.has_changed:
+    if not sensor.guide.is_stuck(session.statistics.stamp) or sensor.has_changed:
         return action
     present = sensor.present
-    if present is None and not sensor.refused_advice and sensor.guide.poses >= FEWEST_IN_CONE:
+    guide = sensor.guide
+    if present is None and not guide.refused_advice and guide.poses >= FEWEST_IN_CONE:
         return Action('poses', f'{action.words}; if it cannot be turned further, call ~/fit',
                       'fit')
     if present is None:
@@ -380,8 +402,8 @@ def _with_sensor(sensor: Sensor) -> Action | None:
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
         return Action('level', f'{rating.reason}; if it is mounted so, place it level again and '
                       'call ~/set_level once more', 'set_level')
-    if sensor.refused_advice:
-        return Action('poses', sensor.refused_advice)
+    if sensor.guide.refused_advice:
+        return Action('poses', sensor.guide.refused_advice)
     if rating is None or not sensor.all_fitted:
         return sensor.guide.action
     return _calling(rating.next.kind, rating.next.text)

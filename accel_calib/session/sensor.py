@@ -56,9 +56,6 @@ if TYPE_CHECKING:
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
 
-_WITHOUT_NEW = 60.0
-"""Time without a new pose after which the robot probably cannot be turned further [s]."""
-
 _NONE = np.zeros((1, 3))
 _AT_REST: Triple = (0.0, 0.0, 0.0)
 
@@ -127,8 +124,6 @@ class Sensor:
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
-        self._refused = 0, ''
-        self._new_pose = 0, math.inf
         self._prepared: tuple[Calibration, OneReading] | None = None
 
     @property
@@ -140,26 +135,6 @@ class Sensor:
     def all_fitted(self) -> bool:
         """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
         return 0 < self.guide.poses == self.fitted_poses and not self.guide.follows
-
-    def note_poses(self, stamp: float) -> None:
-        """Note the time of a new pose, by header stamps [s]."""
-        count = len(self.live.book.poses())
-        if count != self._new_pose[0]:
-            self._new_pose = count, stamp
-
-    def is_stuck(self, stamp: float) -> bool:
-        """Return whether a fit is refused, or no pose has been new for a minute."""
-        return bool(self.refused_advice) or stamp - self._new_pose[1] >= _WITHOUT_NEW
-
-    def refuse(self, advice: str) -> None:
-        """Note that a fit to the present poses is refused, and what to do."""
-        self._refused = len(self.live.book.poses()), advice
-
-    @property
-    def refused_advice(self) -> str:
-        """Return what to do after a refused fit to the present poses; empty otherwise."""
-        poses, advice = self._refused
-        return advice if poses == self.guide.poses else ''
 
     def stillness(self, statistics: StreamStatistics) -> float:
         """Return the spread of the last samples relative to the largest of a still sensor."""

@@ -422,7 +422,6 @@ class Session:
 
     def poses_changed(self, *, ended: bool, new_rest: bool = False) -> None:
         """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
-        self.sensor.note_poses(self.statistics.stamp)
         self._show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True
@@ -432,7 +431,8 @@ class Session:
         """Add a task that stores the poses, and draws them with the next pose."""
         sensor = self.sensor
         poses = sensor.live.book.poses()
-        self._events.append(self._shown(sensor, poses, sensor.guide.added(len(poses)), new_rest,
+        added = sensor.guide.added(len(poses), self.statistics.stamp)
+        self._events.append(self._shown(sensor, poses, added, new_rest,
                                         self.files.store if store else None))
 
     def _shown(self, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
