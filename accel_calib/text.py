@@ -16,6 +16,9 @@ from typing import Any
 _ZERO = 1e-12
 """Values below are zero but for rounding."""
 
+_LONGEST_ITEM = 100
+"""Characters of one item of a list that a message shows."""
+
 
 def short(value: float) -> str:
     """Return a number with three significant digits."""
@@ -78,9 +81,17 @@ def counted(count: int, noun: str) -> str:
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
 
 
+def some(items: Iterable[object], most: int = 12) -> str:
+    """Return the first items of a list, each shortened, and how many more there are."""
+    words = [word if len(word) <= _LONGEST_ITEM else f'{word[:_LONGEST_ITEM]}…'
+             for word in map(str, items)]
+    more = f' and {len(words) - most} more' if len(words) > most else ''
+    return ', '.join(words[:most]) + more
+
+
 def listed(noun: str, items: Sequence[object]) -> str:
-    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``."""
-    return f'{noun}{"" if len(items) == 1 else "s"} {", ".join(map(str, items))}'
+    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``, at most 50."""
+    return f'{noun}{"" if len(items) == 1 else "s"} {some(items, 50)}'
 
 
 def now() -> str:

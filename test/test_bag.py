@@ -83,6 +83,14 @@ def test_two_imu_topics_need_a_choice(recording, tmp_path):
         read_recording(path, '/c')
 
 
+def test_a_message_about_hundreds_of_topics_stays_short(recording, tmp_path):
+    names = [f'/robot_{number}/imu' for number in range(300)]
+    path = write_bag(tmp_path / 'many', 'mcap', recording.take(slice(0, 60)), names)
+    with pytest.raises(InputError, match='300 Imu topics, expected one: .* and 288 more') as told:
+        read_recording(path)
+    assert len(str(told.value)) < 500 + len(str(path))
+
+
 def test_a_bag_without_imu_is_refused(recording, tmp_path):
     path = write_bag(tmp_path / 'none', 'mcap', recording.take(slice(0, 60)), ())
     with pytest.raises(InputError, match='expected a topic of type sensor_msgs/msg/Imu'):

@@ -27,6 +27,7 @@ from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
+from ..text import some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -164,16 +165,15 @@ class Bag:
         """Return the Imu topic, or check the given one; it must be one that the bag has."""
         topics = self.topics(IMU)
         if not topics:
-            others = ', '.join(sorted(f'{c.topic} ({c.msgtype})'
-                                      for c in self.reader.connections))
-            raise InputError(f'{self.path} has {others or "no topics"}, expected a topic of type '
-                             f'{IMU}', 'record the Imu topic')
+            others = sorted(f'{c.topic} ({c.msgtype})' for c in self.reader.connections)
+            raise InputError(f'{self.path} has {some(others) or "no topics"}, expected a topic of '
+                             f'type {IMU}', 'record the Imu topic')
         if topic and topic not in topics:
-            raise InputError(f'{self.path} has the Imu topics {", ".join(topics)}, expected '
+            raise InputError(f'{self.path} has the Imu topics {some(topics)}, expected '
                              f'{topic}', 'choose one of them with --topic')
         if not topic and len(topics) > 1:
             raise InputError(f'{self.path} has {len(topics)} Imu topics, expected one: '
-                             f'{", ".join(topics)}', 'choose one of them with --topic')
+                             f'{some(topics)}', 'choose one of them with --topic')
         return topic or topics[0]
 
     def first_frame_id(self, topic: str) -> str:

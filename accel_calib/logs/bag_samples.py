@@ -33,7 +33,7 @@ from .bag import Bag, BLOCK, NUMBERS, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
 from ..table import Floats, Recording
-from ..text import counted, listed
+from ..text import counted, listed, some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -247,7 +247,7 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
     known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
         others = sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections})
-        raise InputError(f'{bag.path} has the topics {", ".join(others)}, expected {topic}',
+        raise InputError(f'{bag.path} has the topics {some(others)}, expected {topic}',
                          f'choose one of them with {quantity.option}')
     return ContextTopic(bag, quantity, topic, known[0].msgtype,
                         _field(bag, quantity, known[0], field))
@@ -264,7 +264,7 @@ def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> 
     if len(fields) == 1:
         return fields[0]
     what = f'{connection.topic} ({connection.msgtype})'
-    have = f'the numbers {", ".join(numbers)}' if numbers else 'no single number'
+    have = f'the numbers {some(numbers)}' if numbers else 'no single number'
     raise InputError(
         f'{bag.path}: topic {what} has {have}, expected {asked or f"one {quantity.words}"}',
         f'name another topic, or the field with {quantity.option} {connection.topic}:FIELD')
@@ -346,7 +346,7 @@ def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[s
         return [f'topic {named[0]} looks like a {quantity.words} and is not used: name it with '
                 f'{quantity.option} {next(iter(topics))}']
     if named:
-        return [f'topics {", ".join(named)} look like a {quantity.words} and are not used: name '
+        return [f'topics {some(named)} look like a {quantity.words} and are not used: name '
                 f'one with {quantity.option} TOPIC']
     pressures = bag.topics(_PRESSURE)
     if used is None and pressures and quantity.key == 'temperature':

@@ -34,7 +34,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..table import Floats
-from ..text import counted
+from ..text import counted, some
 from ..units import UNIT_NAMES
 
 DELIMITERS = (';', '\t', '|', ',', '')
@@ -64,7 +64,6 @@ _LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan
 _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _UNREADABLE_SHARE = 0.3
-_SHOWN_NAMES = 12
 _SHOWN_CHARACTERS = 40
 ABOUT = ('units', 'sensor')
 
@@ -229,8 +228,7 @@ def short(text: str) -> str:
 
 def shown(names: Sequence[str]) -> str:
     """Return the names of columns for a message."""
-    more = [f'… ({len(names)} columns)'] if len(names) > _SHOWN_NAMES else []
-    return ', '.join([*map(short, names[:_SHOWN_NAMES]), *more])
+    return some(map(short, names))
 
 
 def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str, *,

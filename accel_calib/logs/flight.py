@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from .formats import PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import COLUMNS, columns_from, Floats, numbered, Recording
-from ..text import counted
+from ..text import counted, some
 
 AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
 MICRO = 1e-6
@@ -126,7 +126,7 @@ class Choice:
         other = [message for message in usable
                  if message.name in self.preferred and message.name != chosen.name]
         if rest:
-            notes.append(f'{chosen} is read; other sensors: {", ".join(map(str, rest))} '
+            notes.append(f'{chosen} is read; other sensors: {some(rest)} '
                          f'(--sensor {rest[0].instance})')
         if other:
             names = ', '.join(dict.fromkeys(f'{message.name} ({message.rate_hz:.3g} Hz)'
@@ -165,7 +165,7 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
     wanted = [message for message in usable if topic in ('', message.name)
               and number in ('', str(message.instance), str(message))]
     if not wanted:
-        raise InputError(f'{source} has {", ".join(map(str, usable))}, expected '
+        raise InputError(f'{source} has {some(usable)}, expected '
                          f'{" ".join(filter(None, (topic or "a message", number)))}',
                          'name one of these, for example --topic '
                          f'{usable[0].name} --sensor {usable[0].instance}')

@@ -27,6 +27,7 @@ from typing import Literal
 
 from .names import RATE, READING
 from ..errors import InputError
+from ..text import some
 from ..units import UnitName
 
 MICRO = 1e-6
@@ -277,7 +278,7 @@ def named(name: str, header: Sequence[str], source: str) -> LogFormat:
     given = {folded(column) for column in header}
     nearest = max(layouts, key=lambda each: len({*map(folded, each.needed)} & given))
     lacking = [column for column in nearest.needed if folded(column) not in given]
-    raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
+    raise InputError(f'{source} has the columns {some(header)}, and lacks '
                      f'{", ".join(lacking)} of a log of {name}',
                      'leave the format out, or name the columns with --columns')
 

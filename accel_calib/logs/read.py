@@ -27,6 +27,7 @@ from .text import Cells, open_text, TextTable
 from ..disk import check_regular
 from ..errors import InputError, saying
 from ..table import check_units, check_values, is_quantity, Poses, Recording
+from ..text import some
 from ..units import Units, units_of
 
 Progress = Callable[[int, int], object]
@@ -255,7 +256,7 @@ def whole(block: Block, notes: list[str]) -> Block:
     columns, row = block
     lacking = [key for key in columns if is_quantity(key) and not np.isfinite(columns[key]).all()]
     if lacking:
-        notes.append(f'not used, because cells are not numbers: {", ".join(lacking)}')
+        notes.append(f'not used, because cells are not numbers: {some(lacking)}')
     return {key: values for key, values in columns.items() if key not in lacking}, row
 
 
