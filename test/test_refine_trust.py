@@ -333,6 +333,20 @@ def test_a_slow_change_of_the_offset_is_described_and_not_explained():
     assert 'a slow change of the offset' in verdict_words(found)
 
 
+@pytest.mark.parametrize('seed', [0, 1, 8])
+def test_a_swing_of_what_is_not_recorded_is_not_explained_by_several_slow_effects(seed):
+    rng = np.random.default_rng([28, seed])
+    time = np.linspace(0.0, 3600.0, 60)
+    warm = 25.0 + 15.0 * np.sin(time / 1500.0 + rng.uniform(0.0, 6.0))
+    poses = poses_of(with_effects(rng), rng, random_directions(60, rng), time=time,
+                     temperature=warm)
+    swing = np.sin(time / 500.0 + rng.uniform(0.0, 6.0))
+    hidden = 0.004 * np.outer(swing, random_directions(1, rng)[0])
+    found = refine(poses.with_columns(reading=poses.reading + hidden), G)
+    assert found.verdict == 'described'
+    assert [step.effect for step in found.steps] == ['empirical']
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_mount_that_turned_is_named_where_the_orientation_is_known(seed):
     rng = np.random.default_rng([88, seed])

@@ -193,6 +193,11 @@ class Effect:
         return self.factor is None and self.output is None and not self.bends
 
     @cached_property
+    def is_slow_offset(self) -> bool:
+        """Whether the effect is an offset that changes with time, or with what changes slowly."""
+        return self.family == 'time' and all(term.monomial == ONE for term in self.terms)
+
+    @cached_property
     def is_offset(self) -> bool:
         """Whether the effect is a part of V in every context."""
         return self.linear and all(term.monomial == ONE for term in self.terms)

@@ -21,7 +21,7 @@ A set is kept only if its fit converged, the cost decreased and its values are p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,6 +68,10 @@ _TREND = 15.0
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
+
+_SEVERAL = 10.0
+"""Each further slow offset must raise the score by this: one unknown cause is more likely than
+several that act at once (Kass and Raftery 1995: very strong)."""
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
@@ -184,9 +188,9 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
 
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:
-    """Add an empirical curve if the names leave a gap, or if it is better than a walk."""
+    """Add an empirical curve if the names leave a gap, or if it is better than they or a walk."""
     if found.walk is None and found.final.is_noise:
-        return found
+        return _with_one_curve(found, start, poses_g)
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
     alone = None if curve is None else _alone(curve, found, poses_g)
     if alone is not None:
@@ -194,11 +198,36 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     walking = _walking(found)
     if curve is None or (walking is not None and not _is_better(curve, walking.near)):
         return found if curve is None or walking is None else walking
+    return _with_curve(found, curve, start, poses_g) or found
+
+
+def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found:
+    """
+    Replace several offsets that change slowly by one curve, if its score is better.
+
+    A smooth change whose cause is not recorded is imitated by a sum of such effects.
+
+    """
+    slow = [name for name in found.near.names if effect_named(name).is_slow_offset]
+    beside = _less(found, slow) if len(slow) > 1 else None
+    curve = None if beside is None else best_curve(beside.final, poses_g, beside.near.chosen.out)
+    if beside is None or curve is None:
+        return found
+    named, fewer = (found.near.plain.set_of(each.near.chosen.blocks, each.near.chosen.out)
+                    for each in (found, beside))
+    if curve.score < named.score - fewer.score - _SEVERAL * (len(slow) - 1):
+        return found
+    described = _with_curve(beside, curve, start, poses_g)
+    return found if described is None or not described.final.is_noise else described
+
+
+def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
+    """Return what was found, with a curve; None if its fit fails or does not explain enough."""
     kept = np.delete(np.arange(len(poses_g)), curve.out)
     after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
                          poses_g.take(kept))
     if after is None or after.fit.at_bound or not _explains(found.final, after):
-        return found
+        return None
     out = np.array(curve.out, np.intp)
     near = found.near
     near = replace(near, linear=near.plain, walk=None,
@@ -208,26 +237,28 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
                    added=(*(name for name in found.added if name != WANDER), curve.name))
 
 
-def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
-    """Return what was found without the effects of the variable of a curve that replaces them."""
-    variable = empirical_parts(curve.name)[1]
-    entries = {name: effect_named(name) for name in found.near.names}
-    shared = [name for name, entry in entries.items()
-              if (entry.over or entry.needs) == (variable,)]
-    fewer = {name: values for name, values in found.final.model.values.items()
-             if name not in shared}
-    state = fitted_state(Model(fewer), found.final.poses_g) if shared else None
+def _less(found: Found, names: Collection[str]) -> Found | None:
+    """Return what was found without some effects; None if the fit without them fails."""
+    values = {name: part for name, part in found.final.model.values.items() if name not in names}
+    state = fitted_state(Model(values), found.final.poses_g) if names else None
     if state is None:
         return None
     near = found.near
     blocks = [block for block in near.chosen.blocks
-              if near.linear.blocks[block].effect not in shared]
-    instead = best_curve(state, poses_g, near.chosen.out)
-    if instead is None or empirical_parts(instead.name)[1] != variable:
-        return None
+              if near.linear.blocks[block].effect not in names]
     return replace(found, final=state, near=replace(
         near, chosen=near.linear.set_of(blocks, near.chosen.out)),
-        added=tuple(name for name in found.added if name not in shared))
+        added=tuple(name for name in found.added if name not in names))
+
+
+def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
+    """Return what was found without the effects of the variable of a curve that replaces them."""
+    variable = empirical_parts(curve.name)[1]
+    entries = {name: effect_named(name) for name in found.near.names}
+    fewer = _less(found, [name for name, entry in entries.items()
+                          if (entry.over or entry.needs) == (variable,)])
+    instead = None if fewer is None else best_curve(fewer.final, poses_g, found.near.chosen.out)
+    return fewer if instead and empirical_parts(instead.name)[1] == variable else None
 
 
 def _walking(found: Found) -> Found | None:
