@@ -761,6 +761,28 @@ def test_columns_with_gravity_of_one_maker_go_before_those_without_it(tmp_path: 
     assert 'gFx/y/z' in log.read_as
 
 
+@pytest.mark.parametrize(('free', 'whole'), [
+    ('Accelerometer_{}', 'TotalAcceleration_{}'), ('accelerometer_{}', 'totalacceleration_{}'),
+    ('acceleration.{}', 'accelerationIncludingGravity.{}')])
+def test_an_acceleration_with_gravity_by_its_name_goes_before_one_without(
+        free: str, whole: str, tmp_path: Path) -> None:
+    made = samples(per_g=G)
+    names = [name.format(axis) for name in (free, whole) for axis in 'xyz']
+    text = text_of(rows_of(made['time'], 0.01 * made['reading'], made['reading']),
+                   ','.join(('time', *names)))
+    log = read_log(write(tmp_path, text))
+    np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-8)
+
+
+def test_the_start_and_the_rate_above_the_samples_of_a_wristband_are_read(tmp_path: Path) -> None:
+    made = samples(per_g=64.0)
+    begin = '1544027300.000000, 1544027300.000000, 1544027300.000000\n50.0, 50.0, 50.0\n'
+    log = read_log(write(tmp_path, begin + text_of(rows_of(np.round(made['reading'])), '')))
+    assert len(log.table) == len(made['time'])
+    np.testing.assert_allclose(np.diff(log.table['time']), 0.02, atol=1e-9)
+    np.testing.assert_array_equal(log.table.reading[0], np.round(made['reading'][0]))
+
+
 def test_an_acceleration_that_is_free_of_gravity_by_its_name_is_refused(tmp_path: Path) -> None:
     made = samples(per_g=G)
     path = write(tmp_path, text_of(rows_of(made['time'], made['reading']),

@@ -35,6 +35,7 @@ from .names import (
     RATE,
     READING,
     unit_of,
+    WHOLE_WORDS,
     WORDS,
 )
 from .text import Cells
@@ -322,15 +323,16 @@ def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
         return {}
     header = layout.header
     groups = list(_triples('reading', header).values())
+    words = {triple[0]: set(meaning(header[triple[0]]).group) for triple in groups}
     with_gravity = [triple for triple in groups if not meaning(header[triple[0]]).free]
-    plain = [triple for triple in with_gravity
-             if not LINEAR_WORDS.intersection(meaning(header[triple[0]]).group)]
+    plain = [triple for triple in with_gravity if not LINEAR_WORDS & words[triple[0]]]
+    whole = [triple for triple in plain if WHOLE_WORDS & words[triple[0]]]
     if groups and not with_gravity:
         raise InputError(f'{layout.path} has {_listed(layout, groups[0])} only, linear '
                          'acceleration, gravity removed, by its name; expected an accelerometer',
                          'record the acceleration with gravity, often called raw or total '
                          'acceleration')
-    groups = plain or with_gravity or _bare(header)
+    groups = whole or plain or with_gravity or _bare(header)
     if len(groups) == 1:
         return {name: _source(layout, k) for name, k in zip(READING, groups[0])}
     if groups:

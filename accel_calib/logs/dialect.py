@@ -67,6 +67,12 @@ _UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
 ABOUT = ('units', 'sensor')
 
+RATES_HZ = (1.0, 10_000.0)
+"""Plausible numbers of samples per second."""
+
+EPOCH_S = (1e9, 4e9)
+"""Unix times from 2001 to 2096 [s]."""
+
 _CLOCK = re.compile(
     r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}\.\d{1,2}\.\d{4})[T ])?'
     r'(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)? ?(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
@@ -251,13 +257,34 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
                          f'{expected} and one row for each pose or sample',
                          'check that this is the intended file')
     start = found.line if strict else finder.data_from(found)
+    numbers = [k for k in finder.plain if k >= start]
+    rate_hz = None if found.header else _rate_below_start(
+        [found.dialect.cells(head[k]) for k in numbers[:2]])
+    if rate_hz is not None and len(numbers) > 2:
+        start = numbers[2]
     passed = [k for k in finder.plain if k < start and k != found.at]
     rows = [found.dialect.cells(head[k]) for k in finder.plain if k >= start]
     return Layout(path, found.dialect, _decimal(rows[:_TRIED_LINES]), found.header,
                   finder.units_row(found, start), _width(found.header, rows), start, encoding,
                   _about(path, [line for line in head if line[0] == '#']),
                   _passed_over([head[k] for k in passed]), tuple(map(tuple, rows[:_SAMPLE_ROWS])),
-                  _stated_rate(head[:start]))
+                  rate_hz or _stated_rate(head[:start]))
+
+
+def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
+    """
+    Return the rate [Hz] of a table without names, or None if its first rows are samples.
+
+    Wristbands of Empatica write the start in seconds since 1970 into each column, and below it the
+    rate.
+
+    """
+    values = [{float(cell) for cell in row} if all(map(is_number, row)) else set()
+              for row in rows]
+    if len(values) < 2 or any(len(each) != 1 for each in values) or len(rows[0]) < len('xyz'):
+        return None
+    (begun,), (rate_hz,) = values
+    return rate_hz if begun > EPOCH_S[0] and RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else None
 
 
 def _check_text(path: Path, head: Sequence[str], expected: str) -> None:

@@ -43,7 +43,8 @@ WORDS: Mapping[str, tuple[str, ...]] = {
 
 PAIRS = {('angular', 'velocity'): 'angularvelocity', ('angular', 'rate'): 'angularrate',
          ('rotation', 'rate'): 'rotationrate', ('rot', 'rate'): 'rotationrate',
-         ('g', 'force'): 'gforce', ('g', 'f'): 'gf'}
+         ('g', 'force'): 'gforce', ('g', 'f'): 'gf', ('with', 'gravity'): 'withgravity',
+         ('including', 'gravity'): 'withgravity'}
 """Two words that are one."""
 
 OTHER_WORDS = frozenset((
@@ -60,6 +61,9 @@ CAUSES = frozenset((
 
 FREE_WORDS = frozenset(('user', 'free', 'nograv', 'nogravity', 'world'))
 """Words of an acceleration without gravity."""
+
+WHOLE_WORDS = frozenset(('total', 'withgravity'))
+"""Words of an acceleration with gravity, where its maker also has one without."""
 
 LINEAR_WORDS = frozenset(('lin', 'linear'))
 """Words of an acceleration that has gravity or not, as its maker understands them."""
@@ -120,6 +124,9 @@ _FUSED = {f'{word}{axis}': (word, axis) for key in ('reading', 'rate')
 _FUSED |= {f'{axis}{word}': (word, axis) for word, axis in _FUSED.values()}
 _FUSED |= {f'{axis}out': ('out', axis) for axis in _AXES}
 _FUSED |= {f'{letter}{axis}': (letter.upper(), axis) for letter in 'agw' for axis in _AXES}
+_FUSED_KINDS = {f'{kind}{word}': (kind, word) for kind in
+                (*FREE_WORDS, *LINEAR_WORDS, *WHOLE_WORDS)
+                for word in WORDS['reading'] if len(word) > 1}
 _LETTERS = {'A': 'reading', 'G': 'rate', 'W': 'rate'}
 """Quantities of the letters in ax, gx and wx."""
 
@@ -201,6 +208,7 @@ def _parted(words: list[str]) -> list[str]:
     """Return words with axes parted from them, and with pairs of words joined."""
     if words[:2] in (['g', 'fx'], ['g', 'fy'], ['g', 'fz']):
         words = ['gf', words[1][1], *words[2:]]
+    words = [part for word in words for part in _FUSED_KINDS.get(word, (word,))]
     if not _AXES.keys() & set(words):
         words = [part for word in words for part in _FUSED.get(word, (word,))]
     joined: list[str] = []

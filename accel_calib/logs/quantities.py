@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from .accelerometer import compact, rests_of, unit_of_reading
 from .columns import Chosen, FRACTION, LogOptions, rates_beside, unused
-from .dialect import has_date, seconds_of
+from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
 from .names import bare_name, COUNTERS, meaning, RATE, READING, TICKS, unit_of, ZEROS
 from .text import Cells
 from ..errors import InputError
@@ -53,11 +53,7 @@ _LARGEST_RATE = 40.0
 _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
 _DEGREE = np.pi / 180.0
 
-_RATES_HZ = (1.0, 10_000.0)
 _USUAL_HZ = 100.0
-_EPOCH_S = (1e9, 4e9)
-"""Unix times from 2001 to 2096 [s]."""
-
 _DAY_S = 86_400.0
 _COUNTER = 2.0**32
 _NEAR_END = 0.01
@@ -83,11 +79,11 @@ def unit_by_rate(stamps: Floats, beside: Sequence[float] = (),
     if not step > 0.0:
         return None
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
-    plausible = [name for name, rate in rates.items() if _RATES_HZ[0] * 0.9 <= rate
-                 <= _RATES_HZ[1] * 1.1]
+    plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
+                 <= RATES_HZ[1] * 1.1]
     stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
     since_1970 = [name for name in plausible
-                  if _EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= _EPOCH_S[1]]
+                  if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
     best = min(stated or since_1970 or plausible, default=None,
