@@ -63,7 +63,7 @@ def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(poses, tm
     store = get_typestore(Stores.ROS2_JAZZY)
     data = bytes(store.serialize_cdr(imu(store, header(store, 10 ** 9), poses.reading[7]), IMU))
     rewrite = Rewriter(layout_of(data), calibration, 1.0, 9.80665, '')
-    corrected = rewrite(data, float(poses['temperature'][7]))
+    corrected = rewrite(data, {'temperature': float(poses['temperature'][7])})
     force = store.deserialize_cdr(corrected, IMU).linear_acceleration
     np.testing.assert_allclose([force.x, force.y, force.z], forces[7], atol=1e-9)
 
@@ -224,3 +224,15 @@ def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
     assert main(['refine', 'poses.csv', '--also', str(tmp_path / 'own.py')]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_recording_gives_its_poses_any_other_column(tmp_path):
+    rng = np.random.default_rng(14)
+    current = np.repeat(rng.uniform(0.0, 12.0, 8), 80)
+    force = np.repeat(random_directions(8, rng), 80, axis=0) + 2e-3 * rng.normal(size=(640, 3))
+    named = {f'a{axis}': force[:, k] for k, axis in enumerate('xyz')}
+    pd.DataFrame({'time': np.arange(640) * 0.02, **named, 'motor_current': current}).to_csv(
+        tmp_path / 'recording.csv', index=False)
+    poses = ac.capture(tmp_path / 'recording.csv', units='g')
+    assert poses.quantities == ('motor_current',)
+    np.testing.assert_allclose(poses['motor_current'], current[40::80], atol=0.05)

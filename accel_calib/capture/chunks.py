@@ -134,21 +134,25 @@ Records = NDArray[Any]
 """One-dimensional structured array."""
 
 CONTEXT = ('temperature', 'supply_voltage')
-"""Columns of `accel_calib.table.COLUMNS` that are averaged together with reading and rate."""
+"""Columns of `accel_calib.table.COLUMNS` that are averaged together with reading and rate, as
+quantities are."""
 
-WIDTH = 7 + len(CONTEXT)
-"""Numbers of a sample: time, reading, rate (NaN: none), context (NaN: none)."""
+MOTION = 7
+"""Numbers of a sample before its context: time, reading, rate (NaN: none)."""
 
 CHUNKS_PER_WINDOW = 5
 
-SUMS = np.dtype([
-    ('count', float),             # samples
-    ('time', float),              # of the stamps, relative to the epoch [s]
-    ('first', float, 6),          # of reading and rate, relative to the origin
-    ('second', float, 6),         # of their squares
-    ('at_limit', float, 3),       # samples that repeat the extreme of the axis so far
-    ('context_count', float, 2),  # samples that have the context
-    ('context_sum', float, 2)])
+
+def sums_type(columns: int) -> np.dtype[Any]:
+    """Return the type of the sums of a chunk, with this number of columns of context."""
+    return np.dtype([
+        ('count', float),                   # samples
+        ('time', float),                    # of the stamps, relative to the epoch [s]
+        ('first', float, 6),                # of reading and rate, relative to the origin
+        ('second', float, 6),               # of their squares
+        ('at_limit', float, 3),             # samples that repeat the extreme of the axis so far
+        ('context_count', float, (columns,)),  # samples that have the context
+        ('context_sum', float, (columns,))])
 
 
 def blank(kind: np.dtype[Any], count: int) -> Records:
@@ -172,30 +176,32 @@ def summed(records: Records, size: int) -> Records:
     return numbers.sum(axis=1).view(records.dtype)[:, 0]
 
 
-def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats) -> Records:
+def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind: np.dtype[Any]
+            ) -> Records:
     """
-    Return the (m,) records of SUMS over the samples from each start to the next.
+    Return the (m,) records of a `sums_type` over the samples from each start to the next.
 
-    `samples` are (k, n): time and reading (k = 4), with rate (7), with context (WIDTH). `epoch`
-    and `origin` (6,) are subtracted from time, and from reading and rate. Sums of a missing rate
-    are NaN.
+    `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the context
+    (more). `epoch` and `origin` (6,) are subtracted from time, and from reading and rate. Sums of
+    a missing rate are NaN.
 
     """
-    sums = blank(SUMS, len(starts))
+    sums = blank(kind, len(starts))
     sums['context_count'] = sums['context_sum'] = sums['at_limit'] = 0.0
     if not len(starts):
         return sums
     sums['count'] = np.diff(starts, append=samples.shape[1])
     sums['time'] = np.add.reduceat(samples[0] - epoch, starts)
-    values = min(len(samples), 7) - 1
+    values = min(len(samples), MOTION) - 1
     centred = samples[1:1 + values] - origin[:values, np.newaxis]
     sums['first'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
     np.multiply(centred, centred, out=centred)
     sums['second'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
-    if len(samples) == WIDTH:
-        known = np.isfinite(samples[7:])
+    around = samples[MOTION:]
+    if len(around):
+        known = np.isfinite(around)
         sums['context_count'] = np.add.reduceat(known.astype(float), starts, axis=1).T
-        sums['context_sum'] = np.add.reduceat(np.where(known, samples[7:], 0.0), starts, axis=1).T
+        sums['context_sum'] = np.add.reduceat(np.where(known, around, 0.0), starts, axis=1).T
     return sums
 
 
@@ -274,7 +280,7 @@ class Chunks:
 
     Parameters
     ----------
-    sums : (m,) array of `SUMS`
+    sums : (m,) array of a `sums_type`
         Time relative to `epoch`, readings and rates relative to `origin`.
     begin, end : (m,) array
         First and last stamp [s].
@@ -314,9 +320,15 @@ def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
 
 
 class Chunker:
-    """Convert blocks of samples to chunks. The division into blocks does not affect the chunks."""
+    """
+    Convert blocks of samples, with this number of columns of context, to chunks.
 
-    def __init__(self, settings: CaptureSettings) -> None:
+    The division into blocks does not affect the chunks.
+
+    """
+
+    def __init__(self, settings: CaptureSettings, columns: int) -> None:
+        self._kind = sums_type(columns)
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
         self._pending: Floats = _NONE
         self._least = [np.inf, np.inf]
@@ -408,7 +420,7 @@ class Chunker:
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         assert self._origin is not None
         ends = np.append(starts[1:], samples.shape[1]) - 1 if len(starts) else starts
-        sums = sums_of(samples, starts, self._epoch, self._origin)
+        sums = sums_of(samples, starts, self._epoch, self._origin, self._kind)
         sums['at_limit'] = self._extremes.repeated(samples[1:4], starts)
         return Chunks(sums, samples[0, starts], samples[0, ends], self._steps(samples, starts),
                       self._epoch, self._origin, self._length, self._period, self.fresh)

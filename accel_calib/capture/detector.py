@@ -21,9 +21,10 @@ A dwell is therefore returned `KNOCK` chunks after its end.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import copy
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +34,14 @@ from .chunks import (
     chained,
     Chunker,
     CHUNKS_PER_WINDOW,
+    CONTEXT,
     Interruption,
+    MOTION,
     Records,
+    sums_type,
     together,
-    WIDTH,
 )
-from .dwell import DWELL, Dwell, FIGURES, figures, judged, OngoingDwell
+from .dwell import Dwell, dwell_type, figures, figures_type, judged, OngoingDwell
 from .rule import HORIZON, Judged, Rule
 from ..table import Floats
 from ..units import Units
@@ -52,12 +55,16 @@ KNOCK = CHUNKS_PER_WINDOW + 3
 _LEAD = CHUNKS_PER_WINDOW - 2
 """Chunks before the first still window that belong to the dwell."""
 
-_JUDGED = np.dtype([
-    ('sums', DWELL), ('begin', float), ('end', float), ('limit', float, 6), ('still', bool),
-    ('trending', np.intp)])
-"""A chunk with its verdict; see `rule.Judged`."""
 
-_NONE = np.empty(0, _JUDGED)
+def _judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a chunk with its verdict; see `rule.Judged`."""
+    return np.dtype([
+        ('sums', dwell_type(sums)), ('begin', float), ('end', float), ('limit', float, 6),
+        ('still', bool), ('trending', np.intp)])
+
+
+_NONE = np.empty(0, _judged_type(sums_type(0)))
+"""No chunks, of any type."""
 
 
 class Tracker:
@@ -171,7 +178,7 @@ class Tracker:
 
 def _records(judged: Judged) -> Records:
     chunks = judged.chunks
-    found = np.empty(len(judged.still), _JUDGED)
+    found = np.empty(len(judged.still), _judged_type(chunks.sums.dtype))
     for name in chunks.sums.dtype.names or ():
         found['sums'][name] = chunks.sums[name]
     found['sums']['level'], found['sums']['windows'] = judged.level.T, 1.0
@@ -216,17 +223,19 @@ class StillDetector:
     Find the dwells of one sensor, block by block.
 
     The dwells do not depend on the division into blocks; a stream and a recording have the same
-    dwells. `keep` is the number of finished dwells to keep; None: all.
+    dwells. `keep` is the number of finished dwells to keep; None: all. `context` are the keys of
+    the further columns of the samples: temperature, supply voltage, and quantities.
 
     """
 
-    def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000) -> None:
-        self._settings = settings
-        self._chunker = Chunker(settings)
+    def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000,
+                 context: Sequence[str] = CONTEXT) -> None:
+        self._settings, self._context = settings, context
+        self._chunker = Chunker(settings, len(context))
         self._rule = Rule(settings, units)
         self._tracker: Tracker | None = None
         self._most = keep
-        self._kept = np.empty(0, FIGURES)
+        self._kept = np.empty(0, figures_type(len(context)))
         self._still = False
         self._mean = np.full(6, np.nan)
         self._number = 0
@@ -237,9 +246,9 @@ class StillDetector:
 
         Parameters
         ----------
-        samples : (n, 9) array
-            Columns time, reading (3), rate (3), temperature and supply voltage. Times and readings
-            must be finite; NaN marks other missing values.
+        samples : (n, 7 + k) array
+            Columns time, reading (3), rate (3), and the k of the context. Times and readings must
+            be finite; NaN marks other missing values.
 
         """
         return self._last(self.add([_columns(samples)]))
@@ -248,8 +257,8 @@ class StillDetector:
         """
         Add samples as (k, n) arrays, and return how many dwells ended.
 
-        The rows are the columns of `push`. Rows without values can be omitted at the end: k is 4,
-        7 or 9. `dwells` returns the still ones.
+        The rows are the columns of `push`. Those of the context can be omitted, and those of the
+        rate before them. `dwells` returns the still ones.
 
         """
         return self._keep(self._feed(blocks, last=False))
@@ -339,7 +348,7 @@ class StillDetector:
         return len(found)
 
     def _judged(self) -> list[Dwell | None]:
-        return judged(self._kept, self._rule) if len(self._kept) else []
+        return judged(self._kept, self._rule, self._context) if len(self._kept) else []
 
     def _last(self, count: int) -> list[Dwell]:
         """Return the last dwells that are still, tested together with earlier dwells."""
@@ -351,11 +360,12 @@ class StillDetector:
     def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
         earlier = earlier[-_EARLIER:]
         table = chained(earlier, found)
-        return [each for each in judged(table, self._rule, len(earlier)) if each is not None]
+        return [each for each in judged(table, self._rule, self._context, len(earlier))
+                if each is not None]
 
 
 def _columns(samples: Floats) -> Floats:
-    """Return (n, 9) samples as rows, without missing columns at the end."""
+    """Return (n, 7 + k) samples as rows, without missing columns at the end."""
     known: NDArray[np.bool_] = np.any(~np.isnan(samples), axis=0)
-    rows = WIDTH if known[7:].any() else 7 if known[4:7].any() else 4
+    rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
     return np.ascontiguousarray(samples[:, :rows].T)

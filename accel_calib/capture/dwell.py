@@ -45,12 +45,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import chained, Chunks, CONTEXT, Records, summed, SUMS
+from .chunks import chained, Chunks, Records, summed
 from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
 from .trend import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
 
-FIGURES = np.dtype([
+_FIGURES = [
     ('lowest', float, 6),     # lower confidence limit of the mean variance of the windows
     ('average', float, 6),    # mean variance of the windows
     ('mean', float, 6),       # reading and rate
@@ -65,17 +65,19 @@ FIGURES = np.dtype([
     ('along', float),         # the same along the mean reading, if that is the vertical
     ('beside_slope', bool),   # the reading has a slope directly before or after
     ('orientation', np.intp),
-    ('around', float, 2),     # temperature and supply voltage
-    ('part_slope', float, 3), ('part_strength', float, 3)])  # first, middle and last half
+    ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
 """Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
+
+
+def figures_type(columns: int) -> np.dtype[Any]:
+    """Return the type of the figures of a dwell, with the means of its columns of context."""
+    return np.dtype([*_FIGURES, ('around', float, (columns,))])
 
 
 def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
     """Return one record of figures per dwell; with known units the mean is nearly vertical."""
-    found = np.empty(len(dwells), FIGURES)
-    if not dwells:
-        return found
     total = chained(*(dwell.total() for dwell in dwells))
+    found = np.empty(len(dwells), figures_type(total['context_sum'].shape[1]))
     count = total['count'][:, np.newaxis]
     shift = total['first'] / count
     square = np.maximum(total['second'] - total['first'] * shift, 0.0)
@@ -181,7 +183,7 @@ class Dwell:
     samples : int
         Number of samples averaged.
     context : mapping of str to float or (3,) array
-        Means of ``temperature``, ``supply_voltage`` and ``rate``, if known.
+        Means of ``temperature``, ``supply_voltage``, ``rate`` and quantities, if known.
     orientation : int
         Dwells with the same number are parts of one dwell (see ``max_dwell``).
     doubtful : bool
@@ -204,11 +206,13 @@ class Dwell:
     rate_std: Floats = field(default_factory=lambda: np.full(3, np.nan))
 
 
-def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
+def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0
+           ) -> list[Dwell | None]:
     """
     Return each dwell from `first` on, or None if it is not still according to the noise known now.
 
-    Excess and bias of the gyro are estimated from all dwells of the table of `FIGURES`.
+    Excess and bias of the gyro are estimated from all dwells of the table of `figures`. `context`
+    names its columns of context.
 
     """
     slopes = trend_of(table)
@@ -220,7 +224,7 @@ def judged(table: Records, rule: Rule, first: int = 0) -> list[Dwell | None]:
     level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
     std, count = _counts(table[first:], excess[first:], level, rule)
     rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
-    return [_dwell(*each) if fine else None for fine, *each in zip(
+    return [_dwell(context, *each) if fine else None for fine, *each in zip(
         good[first:], table[first:], std.T.copy(), count.tolist(), rate_std)]
 
 
@@ -273,24 +277,28 @@ def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[
     return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
 
 
-def _dwell(found: Any, std: Floats, count: float, rate_std: Floats) -> Dwell:
-    context: dict[str, float | Floats] = {
-        name: value for name, value in zip(CONTEXT, found['around'].tolist())
+def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats
+           ) -> Dwell:
+    known: dict[str, float | Floats] = {
+        name: value for name, value in zip(context, found['around'].tolist(), strict=True)
         if math.isfinite(value)}
     mean = found['mean'].copy()
     if np.isfinite(mean).all():
-        context['rate'] = mean[3:]
+        known['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 count, int(found['samples']), context, int(found['orientation']),
+                 count, int(found['samples']), known, int(found['orientation']),
                  rate_std=rate_std)
 
 
 CELLS = 256
 
-DWELL = np.dtype([*SUMS.descr,
-                  ('level', float, 6),     # variance of the window at each chunk
-                  ('windows', float)])     # number of windows in that sum
-"""Sums of a chunk in a dwell."""
+
+def dwell_type(sums: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the sums of a chunk in a dwell, from that of its sums alone."""
+    return np.dtype([*sums.descr,
+                     ('level', float, 6),  # variance of the window at each chunk
+                     ('windows', float)])  # number of windows in that sum
+
 
 _AGREE_G = 2e-3
 """Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
@@ -309,7 +317,7 @@ class OngoingDwell:
         self.epoch = chunks.epoch
         self.origin = chunks.origin
         self.length = chunks.length
-        self.cells = self._partial = np.empty(0, DWELL)
+        self.cells = self._partial = np.empty(0, dwell_type(chunks.sums.dtype))
         self.size = 1
         self.begin = self.end = 0.0
         self.chunks = 0

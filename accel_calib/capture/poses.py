@@ -20,12 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import CaptureSettings, CONTEXT, Interruption, WIDTH
+from .chunks import CaptureSettings, CONTEXT, Interruption, MOTION
 from .detector import StillDetector
 from .dwell import Dwell
 from ..errors import InputError
@@ -72,8 +73,8 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     Parameters
     ----------
     recording : Recording, or an iterable of them
-        The samples, as a whole or in blocks. ``rate``, ``temperature`` and ``supply_voltage`` are
-        used if present.
+        The samples, as a whole or in blocks. ``rate``, ``temperature``, ``supply_voltage`` and the
+        quantities of the first block are used if present.
     units : Units
         Unit of the readings.
     settings : CaptureSettings
@@ -85,15 +86,18 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         If a time or a reading is not finite.
 
     """
-    detector = StillDetector(settings, units, keep=None)
+    parts = iter([recording] if isinstance(recording, Recording) else recording)
+    first = next(parts, None)
+    context = context_of(first)
+    detector = StillDetector(settings, units, keep=None, context=context)
     spans: list[tuple[float, float]] = []
     recorded = 0
     about: tuple[Literal[UnitName, ''], str] = ('', '')
-    for part in [recording] if isinstance(recording, Recording) else recording:
+    for part in parts if first is None else chain((first,), parts):
         for start in range(0, len(part), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(part))
-            detector.add(samples_of(part, first, min(first + _BLOCK, stop))
-                         for first in range(start, stop, _BLOCK))
+            detector.add(samples_of(part, begin, min(begin + _BLOCK, stop), context)
+                         for begin in range(start, stop, _BLOCK))
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
             recorded, about = recorded + len(part), (part.units, part.sensor)
@@ -107,7 +111,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                     interruptions, recorded, detector.quietest)
 
 
-def samples_of(recording: Recording, start: int, stop: int) -> Floats:
+def context_of(recording: Recording | None) -> tuple[str, ...]:
+    """Return the keys of the context of a recording that poses have: `CONTEXT` and quantities."""
+    return CONTEXT if recording is None else (*CONTEXT, *recording.quantities)
+
+
+def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
+               ) -> Floats:
     """
     Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
 
@@ -116,13 +126,13 @@ def samples_of(recording: Recording, start: int, stop: int) -> Floats:
     """
     which = slice(start, stop)
     time = recording['time'][which]
-    samples = np.empty((_width(recording), len(time)))
+    samples = np.empty((_width(recording, context), len(time)))
     samples[0] = time
     samples[1:4] = recording.reading[which].T
     samples[4:] = np.nan
     if 'rate' in recording:
         samples[4:7] = recording['rate'][which].T
-    for row, name in enumerate(CONTEXT, start=7):
+    for row, name in enumerate(context, start=MOTION):
         if name in recording:
             samples[row] = recording[name][which]
     if not np.isfinite(samples[:4].sum()):
@@ -138,10 +148,10 @@ def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
         raise InputError(message, 'remove that row, or repair the recording')
 
 
-def _width(recording: Recording) -> int:
-    if any(name in recording for name in CONTEXT):
-        return WIDTH
-    return 7 if 'rate' in recording else 4
+def _width(recording: Recording, context: Sequence[str]) -> int:
+    if any(name in recording for name in context):
+        return MOTION + len(context)
+    return MOTION if 'rate' in recording else 4
 
 
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
@@ -157,8 +167,8 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
         'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
         'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
         'count': np.array([each.count for each in dwells], dtype=float)}
-    for name in (*CONTEXT, 'rate'):
-        if dwells and all(name in each.context for each in dwells):
+    for name in dwells[0].context if dwells else ():
+        if all(name in each.context for each in dwells):
             columns[name] = np.array([each.context[name] for each in dwells])
     rate_std = np.array([each.rate_std for each in dwells], dtype=float)
     if 'rate' in columns and np.isfinite(rate_std).all():

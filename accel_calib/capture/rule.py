@@ -56,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import blank, CaptureSettings, chained, Chunks, SUMS
+from .chunks import blank, CaptureSettings, chained, Chunks, Records
 from .trend import columns_of, oscillation, Stretch, stretch, Trend, windows
 from ..table import Floats
 from ..units import Units
@@ -163,7 +163,7 @@ class Rule:
         self._lowest = np.full(3, np.inf)
         self._highest = np.full(3, -np.inf)
         self._axes = 3
-        self._before = blank(SUMS, HORIZON - 1)
+        self._before: Records = np.empty(0)  # the first chunks are fresh
         self._floor = np.full(6, np.inf)
         self._step = np.full(2, np.inf)
         self.quietest = math.inf
@@ -219,7 +219,7 @@ class Rule:
     def feed(self, chunks: Chunks) -> Judged:
         """Apply the rule to consecutive chunks."""
         if chunks.fresh:
-            self._before = blank(SUMS, HORIZON - 1)
+            self._before = blank(chunks.sums.dtype, HORIZON - 1)
         sums = chained(self._before, chunks.sums)
         self._before = sums[len(sums) - HORIZON + 1:].copy()
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():

@@ -298,7 +298,7 @@ _DIGITS = 1e-14
 
 @dataclass(frozen=True)
 class Columns:
-    """Sums of n chunks as contiguous arrays, (axes, n) of reading and rate; see `chunks.SUMS`."""
+    """Sums of n chunks as contiguous arrays, (axes, n) of reading and rate."""
 
     count: Floats
     first: Floats
