@@ -73,6 +73,8 @@ PARAMETERS = {
                            "'0 0 1.57'."),
     'base_frame': (str, 'Frame of the robot, to take the mounting from /tf_static.'),
     'publish_tf': (bool, 'Whether to publish the levelled frame on /tf_static.'),
+    'context': (tuple, 'Further topics with a number that may act on the sensor, such as '
+                       "'supply_voltage:=battery rotor_temperature:=/motor/temp'."),
     'gyro_bias': (bool, 'Whether to subtract the bias of the gyro.'),
     'fill_covariance': (bool, 'Whether to state the measured noise as covariance.'),
     'confirm': (bool, 'Whether a new result waits for ~/save or ~/undo.'),
@@ -80,7 +82,9 @@ PARAMETERS = {
     'web_host': (str, 'Address of the live page; 0.0.0.0: for the whole network.'),
     'sensor': (str, 'Name of the sensor and of its files.'),
 }
-"""Parameters of the node by argument: type and description. A list has three numbers."""
+"""Parameters of the node by argument: type and description. A list is 3 numbers, a tuple texts."""
+
+_NO_QUOTES = str.maketrans('', '', '\'"')
 
 BOOLS = ['true', 'false', 'True', 'False']
 
@@ -135,16 +139,22 @@ def _overrides(context: LaunchContext) -> list[dict[str, Any]]:
         text = given.perform(context)
         if text:
             values[name] = (_numbers(name, text) if kind is list
+                            else _parts(text.translate(_NO_QUOTES)) if kind is tuple
                             else ParameterValue(given, value_type=kind))
     if IfCondition(LaunchConfiguration('web')).evaluate(context):
         values['web_port'] = ParameterValue(LaunchConfiguration('web_port'), value_type=int)
     return [values] if values else []
 
 
+def _parts(text: str) -> list[str]:
+    """Return the parts of a list, written with spaces or as in YAML."""
+    return re.split(r'[\s,]+', text.strip('[] '))
+
+
 def _numbers(name: str, text: str) -> list[float]:
     """Return three numbers, written as in YAML or as in a URDF; launch refuses '[0, 0, 1.57]'."""
     try:
-        roll, pitch, yaw = (float(part) for part in re.split(r'[\s,]+', text.strip('[] ')))
+        roll, pitch, yaw = map(float, _parts(text))
     except ValueError:
         raise ValueError(f"argument {name} is '{text}', expected 3 numbers; write for example "
                          f"{name}:='0 0 1.57'") from None

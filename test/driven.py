@@ -8,7 +8,16 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import Any
 
-from accel_calib.session import CalibratorSettings, checks, Log, Result, Session, state, Task
+from accel_calib.session import (
+    CalibratorSettings,
+    checks,
+    columns_of,
+    Log,
+    Result,
+    Session,
+    state,
+    Task,
+)
 from inside import next_action
 import numpy as np
 from shared import answer_of
@@ -44,15 +53,18 @@ class Driver:
         self.handle()
         return answer
 
-    def feed(self, readings: Any, frame_id: str = 'imu_link', temperature: float = np.nan) -> int:
-        """Push readings [m/s²], and return the number of accepted messages."""
-        accepted = 0
+    def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
+        """Push readings [m/s²] with their context, and return the number of accepted messages."""
+        accepted, columns = 0, columns_of(self.session.settings)
+        for column, value in context.items():
+            self.session.around.take(column, value)
         for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
             self.now += len(block) / RATE
             if self.session.accepts(frame_id):
-                rows = np.full((len(block), 9), np.nan)
+                rows = np.full((len(block), 7 + len(columns)), np.nan)
                 rows[:, 0] = self.stamp + np.arange(len(block)) / RATE
-                rows[:, 1:4], rows[:, 7] = block, temperature
+                rows[:, 1:4] = block
+                rows[:, 7:] = [context.get(column, np.nan) for column in columns]
                 self.session.push(rows, self.now)
                 accepted += len(block)
             self.stamp += len(block) / RATE

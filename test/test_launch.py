@@ -269,6 +269,8 @@ GIVEN = {
     'units': ('g', 'g'), 'model': ('10', '10'), 'frame': ('ned', 'ned'),
     'output_frame_id': ('base', 'base'), 'rotate': ('false', False),
     'mounting_rpy': ('[0, 0.5, -1]', [0.0, 0.5, -1.0]), 'base_frame': ('base', 'base'),
+    'context': ("['supply_voltage:=battery', motor:=/motor/temp]",
+                ['supply_voltage:=battery', 'motor:=/motor/temp']),
     'publish_tf': ('true', True), 'gyro_bias': ('True', True), 'fill_covariance': ('true', True),
     'confirm': ('true', True), 'calibration_file': ('/x.yaml', '/x.yaml'), 'sensor': ('7', '7'),
     'web_host': ('0.0.0.0', '0.0.0.0')}

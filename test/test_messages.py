@@ -105,7 +105,7 @@ def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(calibratio
         data = data[:-296] + fields.tobytes()
         rewriter = Rewriter(layout_of(data), used, 1.0, STANDARD_GRAVITY, 'imu')
         rewriter.bias = tuple(bias)
-        rate = every(rewriter(data, np.nan))[0, ANGULAR_VELOCITY]
+        rate = every(rewriter(data, {}))[0, ANGULAR_VELOCITY]
         expected = fields[0, ANGULAR_VELOCITY] - bias * known
         np.testing.assert_allclose(rate, used.rotation.T @ expected, rtol=1e-12)
 
@@ -205,7 +205,8 @@ def test_single_messages_and_arrays_have_the_same_lag(calibration):
     temperature = 25.0 + 3.0 * np.sin(np.arange(400) / 90.0)
     expected = corrected(calibration, doubles_at(together, slice(0, 37)),
                          {**samples_of(together), 'temperature': temperature})
-    found = [every(rewriter(*each))[0] for each in zip(datas, temperature.tolist(), strict=True)]
+    found = [every(rewriter(data, {'temperature': warm}))[0]
+             for data, warm in zip(datas, temperature.tolist(), strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert np.ptp(expected[:, ACCELERATION.start]) > 1e-3
 
@@ -236,7 +237,7 @@ def test_no_force_beyond_100_g_is_published(calibration):
         values[axis] = reading
         struct.pack_into('<3d', data, place, *values)
         with pytest.raises(InputError, match='expected less than 100 g; check the calibration'):
-            rewriter(bytes(data), 20.0)
+            rewriter(bytes(data), {'temperature': 20.0})
     for reading in (np.nan, np.inf):
         struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
-        assert rewriter(bytes(data), 20.0) is None
+        assert rewriter(bytes(data), {'temperature': 20.0}) is None

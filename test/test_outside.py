@@ -135,7 +135,7 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
     told = []
     for k, warm in enumerate([25.0, 35.0, 36.0, 37.0, 29.0, 29.0, 36.0]):
         rows[:, 0], rows[:, 7] = 1000.0 + 3000.0 * k, warm
-        session.statistics.temperature = warm
+        session.around.take('temperature', warm)
         session.push(rows, 0.0)
         session.events()
         session.tick()

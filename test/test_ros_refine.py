@@ -11,11 +11,13 @@ from typing import Any
 from accel_calib.calibrate import Calibration
 from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
+from diagnostic_msgs.msg import DiagnosticArray
 from inside import spread_directions
 import numpy as np
 import pytest
-from sensor_msgs.msg import Imu, Temperature
+from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
 from shared import with_effects
+from std_msgs.msg import Float32, Float64
 from visualization_msgs.msg import MarkerArray
 
 Readings = Callable[..., Any]
@@ -24,36 +26,42 @@ MOVES = np.array([0.002, -0.0015, 0.001])
 """Offset per °C [g]."""
 
 
-def warmed(bench: Any, readings: Readings, publisher: Any) -> None:
-    """Publish poses, each at another temperature."""
-    meet(bench, publisher, 25.0)
+def warmed(bench: Any, readings: Readings, publisher: Any, name: str = 'temperature [°C]') -> None:
+    """Publish poses, each at another temperature, or other quantity."""
+    meet(bench, publisher, 25.0, name)
     for k, direction in enumerate(spread_directions(POSES)):
-        temperature = 25.0 + 12.0 * np.sin(2.1 * k)
-        published(bench, publisher, temperature, 0.05)
-        shift = MOVES * (temperature - 25.0) * 9.80665
-        bench.feed(readings([direction], dwell=1.8) + shift)
+        value = 25.0 + 12.0 * np.sin(2.1 * k)
+        published(bench, publisher, value, 0.05)
+        bench.feed(readings([direction], dwell=1.8) + MOVES * (value - 25.0) * 9.80665)
 
 
-def published(bench: Any, publisher: Any, temperature: float, seconds: float) -> None:
-    """Publish a temperature repeatedly."""
+def message(publisher: Any, value: float) -> Any:
+    """Return a message with a number, of the type of a publisher."""
+    kind = publisher.msg_type
+    field = next(field for field in ('data', 'voltage', 'fluid_pressure', 'temperature')
+                 if field in kind.get_fields_and_field_types())
+    return kind(**{field: value})
+
+
+def published(bench: Any, publisher: Any, value: float, seconds: float) -> None:
+    """Publish a temperature, or other number, repeatedly."""
     ends = time.monotonic() + seconds
 
     def late() -> bool:
-        publisher.publish(Temperature(temperature=temperature))
+        publisher.publish(message(publisher, value))
         return time.monotonic() > ends
 
     bench.spin(late)
 
 
-def meet(bench: Any, publisher: Any, temperature: float) -> None:
-    """Publish a temperature until the node knows it; a publisher may see a node earlier."""
-    from diagnostic_msgs.msg import DiagnosticArray
+def meet(bench: Any, publisher: Any, value: float, name: str = 'temperature [°C]') -> None:
+    """Publish a number until the node knows it; a publisher may see a node earlier."""
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
 
     def known() -> bool:
-        publisher.publish(Temperature(temperature=temperature))
+        publisher.publish(message(publisher, value))
         shown = {value.key: value.value for each in diagnostics for value in each.status[0].values}
-        return shown.get('temperature [°C]') == f'{temperature:.3f}'
+        return shown.get(name) == f'{value:.3f}'
 
     bench.spin(known)
 
@@ -73,14 +81,61 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
     np.testing.assert_allclose(found.model.values['offset_temperature'], [*MOVES, 0.0, 0.0],
                                atol=2e-4)
 
-    for temperature in (15.0, 35.0):
-        published(bench, publisher, temperature, 0.2)
-        shift = MOVES * (temperature - 25.0) * 9.80665
+    check_corrected(bench, readings, publisher, corrected)
+
+
+def check_corrected(bench: Any, readings: Readings, publisher: Any, corrected: list[Any]) -> None:
+    """Check that messages at two temperatures, or other quantities, are corrected."""
+    for value in (15.0, 35.0):
+        published(bench, publisher, value, 0.2)
+        shift = MOVES * (value - 25.0) * 9.80665
         bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
                    corrected)
         up = np.mean([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
                       for m in corrected], axis=0)
         assert np.linalg.norm(up) == pytest.approx(9.80665, abs=0.02)
+
+
+def test_a_quantity_of_a_robot_is_named_stored_and_corrected(bench: Any, readings: Readings
+                                                             ) -> None:
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    publisher = bench.node.create_publisher(Float64, 'motor/current', 10)
+    bench.calibrator(sensor='arm', passthrough=True, context=['motor_current:=motor/current'])
+    warmed(bench, readings, publisher, 'motor_current')
+    answer = bench.call('refine')
+    assert answer.success, answer.message
+    found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
+    np.testing.assert_allclose(found.model.values['offset_covariate-motor_current'][:3], MOVES,
+                               atol=2e-4)
+    check_corrected(bench, readings, publisher, corrected)
+
+
+TOPICS = {'supply_voltage [V]': ('battery', BatteryState, 12.25),
+          'pressure': ('air', FluidPressure, 101325.5), 'rotor': ('rotor', Temperature, 55.5),
+          'load': ('load', Float32, 0.75), 'temperature [°C]': ('die', Float64, 31.5)}
+
+
+def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    publishers = {name: (bench.node.create_publisher(kind, topic, 10), value)
+                  for name, (topic, kind, value) in TOPICS.items()}
+    entries = [f'{name.split()[0]}:=/{topic}' for name, (topic, *_) in TOPICS.items()]
+    bench.calibrator(context=[*entries, 'text:=/imu/data_raw', 'none:=/nowhere'])
+    wanted = ('no text arrives: /imu/data_raw has the type sensor_msgs/Imu, expected '
+              'sensor_msgs/BatteryState, ', 'no none arrives: there is no topic /nowhere',
+              'topics with a number: /air, /battery, /die, /load, /rotor')
+
+    def said() -> bool:
+        for publisher, value in publishers.values():
+            publisher.publish(message(publisher, value))
+        said = diagnostics[-1].status if diagnostics else []
+        return any(all(words in each.message for words in wanted) for each in said)
+
+    bench.spin(said)
+    shown = {value.key: value.value for value in diagnostics[-1].status[0].values}
+    for name, (_, value) in publishers.items():
+        assert shown[name] == f'{value:.3f}'
+    assert shown['none'] == 'not known'
 
 
 def with_effect(path: Path, name: str, values: list[float]) -> Calibration:

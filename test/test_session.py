@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 import errno
 from pathlib import Path
+import re
 import shutil
 from typing import Any
 
@@ -347,7 +348,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         temperature=np.linspace(20.0, 30.0, 20)))
     driver = Driver(calibration_file=str(path))
     for temperature, severity in ((25.0, Level.OK), (40.0, Level.WARN)):
-        driver.session.statistics.temperature = temperature
+        driver.session.around.take('temperature', temperature)
         driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
         assert driver.finding('calibration').level == severity
     assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
@@ -549,7 +550,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     offered = replace(calibration, model=Model(
         {**calibration.model.values, 'offset_temperature': values * [1.0, 1.0, 1.0, 2.0, 1.0]}))
     driver.session.sensor.offered = offered
-    driver.session.statistics.temperature = warm[-1]
+    driver.session.around.take('temperature', warm[-1])
     corrected = offered.apply(np.tile(still, (900, 1)), time=time,
                               temperature=np.repeat(warm, 10))[-1]
     assert state.progress(driver.session).corrected == pytest.approx(
@@ -614,3 +615,98 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
 def test_a_frame_whose_readings_are_gravity_is_refused_for_messages() -> None:
     with pytest.raises(InputError, match="'win8', expected one of ros, ned, android"):
         changed(CalibratorSettings(), {'frame': 'win8'})
+
+
+# Further context
+
+MOTOR = np.array([2e-3, -1.5e-3, 1e-3])
+"""Offset per ampere of the motor [g]."""
+
+
+def with_motor(driver: Driver, readings: Readings, poses: int = 26) -> None:
+    """Feed poses, each at another current of the motor."""
+    for k, direction in enumerate(spread_directions(poses)):
+        current = 6.0 + 5.0 * np.sin(2.1 * k)
+        driver.feed(readings([direction]) + MOTOR * (current - 6.0) * GRAVITY,
+                    motor_current=current)
+    driver.feed(readings([UP])[:15], motor_current=6.0)
+
+
+def test_a_quantity_is_a_column_of_poses_is_named_and_corrected_live(readings: Readings) -> None:
+    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
+    with_motor(driver, readings)
+    poses = driver.session.sensor.live.book.poses()
+    assert np.ptp(poses['motor_current']) > 8.0
+    answer = driver.done(driver.session.commands.refine())
+    assert 'offset_covariate-motor_current' in driver.session.sensor.calibration.model.effects
+    assert 'motor_current' in answer
+    sizes = []
+    for current in (2.0, 10.0):
+        reading = np.array([0.0, 0.0, GRAVITY]) + MOTOR * (current - 6.0) * GRAVITY
+        force = driver.session.sensor.force_of(tuple(reading), {'motor_current': current})
+        sizes.append(np.array(force))
+    np.testing.assert_allclose(sizes[0], sizes[1], atol=1e-3)
+    driver.session.close()
+    again = Driver(sensor='arm', context=['motor_current:=/motor/current'])
+    np.testing.assert_allclose(again.session.sensor.live.book.poses()['motor_current'],
+                               poses['motor_current'], atol=1e-6)
+
+
+def test_a_quantity_that_stops_is_left_out_with_one_warning(readings: Readings) -> None:
+    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
+    with_motor(driver, readings)
+    driver.done(driver.session.commands.refine())
+    driver.session.missing['motor_current'] = 'nothing comes on /motor/current'
+    driver.session.around.take('motor_current', 10.0)
+    for seconds, known in ((29.0, True), (2.0, False), (100.0, False)):
+        driver.now += seconds
+        driver.session.around.expire()
+        driver.session.tick()
+        driver.handle()
+        assert ('motor_current' in driver.session.around.values) is known
+    line = ('no motor_current arrives: nothing comes on /motor/current; '
+            'offset_covariate-motor_current is left out')
+    assert driver.logged('warning').count(line) == 1
+    assert line in driver.finding('stream').words
+    neutral = driver.session.sensor.calibration.model.neutral['motor_current']
+    reading = (0.0, 0.0, GRAVITY)
+    assert driver.session.sensor.force_of(reading, driver.session.context) == pytest.approx(
+        driver.session.sensor.force_of(reading, {'motor_current': neutral}))
+    driver.session.around.take('motor_current', 3.0)
+    driver.session.tick()
+    driver.handle()
+    assert 'motor_current arrives' in driver.logged('info')
+    assert 'motor_current' not in driver.finding('stream').words
+
+
+def test_poses_in_one_direction_are_not_merged_over_a_quantity(readings: Readings) -> None:
+    driver = Driver(context=['motor_current:=/motor/current'])
+    for current in (0.0, 10.0, 0.1):
+        for direction in (LEFT, UP):
+            driver.feed(readings([direction]), motor_current=current)
+    driver.feed(readings([LEFT])[:15], motor_current=0.0)
+    poses = driver.session.sensor.live.book.poses()
+    assert len(poses) == 4
+    assert np.sum(poses['motor_current'] > 5.0) == 2
+
+
+def test_poses_that_lack_a_quantity_are_said(readings: Readings) -> None:
+    first = Driver(sensor='arm')
+    first.feed(readings([UP, LEFT, FORWARD]))
+    first.session.close()
+    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
+    driver.feed(readings([[0, 0, -1], [0, -1, 0]]), motor_current=1.0)
+    driver.session.tick()
+    driver.handle()
+    assert 'motor_current' not in driver.session.sensor.live.book.poses()
+    assert re.search(r'\d of \d poses have no motor_current, so that ~/refine cannot use it: call '
+                     '~/reset', driver.logged('warning'))
+
+
+@pytest.mark.parametrize('entry', [
+    'motor_current', ':=/motor/current', 'time:=/clock', 'ax:=/x', 'two words:=/x', 'a__b:=/x'])
+def test_an_entry_of_context_that_cannot_be_used_is_refused(entry: str) -> None:
+    with pytest.raises(InputError, match=f'entry {entry!r}, expected column:=topic'):
+        Driver(context=[entry])
+    with pytest.raises(InputError, match='each column once'):
+        Driver(context=['a:=/x', 'a:=/y'])

@@ -11,11 +11,12 @@ pose table.
 
 """
 
-from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
+from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from .detector import StillDetector
 from .dwell import Dwell
 from .poses import capture, Captured, poses_from, samples_of, select
 from .rule import rounding_left
 
-__all__ = ['REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated', 'StillDetector',
-           'capture', 'poses_from', 'rounding_left', 'samples_of', 'select', 'settings_from']
+__all__ = ['CONTEXT', 'REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated',
+           'StillDetector', 'capture', 'poses_from', 'rounding_left', 'samples_of', 'select',
+           'settings_from']

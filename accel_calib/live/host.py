@@ -347,7 +347,7 @@ class Host:
         """Pass the last known temperature to the session."""
         known = temperatures[np.isfinite(temperatures)]
         if len(known):
-            self.session.statistics.temperature = float(known[-1])
+            self.session.around.take('temperature', float(known[-1]))
 
     def _handle_events(self) -> None:
         """Show and log what the session reports."""

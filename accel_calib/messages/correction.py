@@ -33,6 +33,7 @@ covariance is transformed only once.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import math
 import struct
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -214,7 +215,8 @@ class Rewriter:
         self._thermal = thermal if thermal is not None else thermal_stream(calibration.model)
         self._per_message = bool(_PER_MESSAGE.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
-        self._warm = math.nan
+        self._context: Mapping[str, float] | None = None
+        self._around: list[float | None] = []
         self._largest = LARGEST_G * gravity
         self._given, self.layout = layout, layout_with(frame_id)
         self._force, self._force_spread, self._rate, self._rate_spread = map(layout.place, (
@@ -227,12 +229,13 @@ class Rewriter:
         self._own: list[float] | None = None
         self._seen_rate = self._seen_orientation = _Seen(b'', True, b'')
 
-    def __call__(self, data: bytes, temperature: float) -> bytes | None:
+    def __call__(self, data: bytes, context: Mapping[str, float]) -> bytes | None:
         """
         Return the corrected message with the layout ``self.layout``.
 
-        The temperature [°C] is NaN if there is none. A reading that is not finite gives None.
-        Missing context and a corrected force that is not plausible are an InputError.
+        `context` has the known columns; it is another mapping if it has changed. A reading that is
+        not finite gives None. Missing context and a corrected force that is not plausible are an
+        InputError.
 
         """
         given = _WHOLE.unpack_from(data, self._given.begin)
@@ -240,8 +243,8 @@ class Rewriter:
         if not math.isfinite(x + y + z):
             return None
         at = self._at
-        if at is None or (self._needs and (self._per_message or temperature != self._warm)):
-            at = self._at_context(data, temperature)
+        if at is None or (self._needs and (self._per_message or context is not self._context)):
+            at = self._at_context(data, context)
         force = at.correct(x, y, z)
         largest = self._largest
         a, b, c = force
@@ -284,21 +287,23 @@ class Rewriter:
             return data[:end]
         return LITTLE_ENDIAN + data[STAMP_AT:NAME_AT] + self._name + data[self._given.begin:end]
 
-    def _at_context(self, data: bytes, temperature: float) -> AtReading:
+    def _at_context(self, data: bytes, context: Mapping[str, float]) -> AtReading:
         """Return the calibration at the context of a message, and cache it."""
+        around = [context.get(key) for key in self._needs]
+        same, self._context, self._around = around == self._around, context, around
+        if self._at is not None and same and not self._per_message:
+            return self._at
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
         rate: Triple = THREE.unpack_from(data, self._rate)
         absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
         time = seconds + nanoseconds * 1e-9
         known: dict[str, Any] = {
-            **self._neutral, 'time': time, 'std': _NONE, 'previous': _NONE,
+            **self._neutral, **context, 'time': time, 'std': _NONE, 'previous': _NONE,
             'rate': _NONE if absent or not all(map(math.isfinite, rate)) else rate}
-        if not math.isnan(temperature):
-            known['temperature'] = temperature
-            if self._thermal is not None:
-                self._thermal.add(time, temperature)
-                known.update(self._thermal.value)
-        self._at, self._warm = self._calibration.at(known), temperature
+        if self._thermal is not None and 'temperature' in context:
+            self._thermal.add(time, context['temperature'])
+            known.update(self._thermal.value)
+        self._at = self._calibration.at(known)
         return self._at
 
     def _see_force(self, covariance: bytes) -> None:

@@ -47,13 +47,14 @@ from .declare import (
     STREAM,
 )
 from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
-from .stream import Stream
+from .stream import ContextTopics, Stream
 from .transforms import MountingBroadcaster, watch_static
 from ..errors import AccelCalibError
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings,
     CallSoon,
+    context_topics,
     Event,
     Log,
     LogFilter,
@@ -97,6 +98,7 @@ class Calibrator:
         self._broadcaster = MountingBroadcaster(node) if settings.publish_tf else None
         self._transforms = (watch_static(node, self._on_transforms) if settings.base_frame
                             else None)
+        self._context = ContextTopics(node, settings)
         self.session = Session(settings, self._topic)  # last, because it locks the files
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
         call_soon = in_executor(node)
@@ -137,11 +139,12 @@ class Calibrator:
         node, overrides = self._node, self._overrides
         self._heard = [
             node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR,
-                                     raw=True, qos_overriding_options=overrides),
-            node.create_subscription(
+                                     raw=True, qos_overriding_options=overrides)]
+        if 'temperature' not in context_topics(self.session.settings):
+            self._heard.append(node.create_subscription(
                 Temperature, 'temperature',
-                lambda message: self.stream.set_temperature(message.temperature), SENSOR,
-                qos_overriding_options=overrides)]
+                lambda message: self.stream.set_context('temperature', message.temperature),
+                SENSOR, qos_overriding_options=overrides))
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._page.start()
 
@@ -171,6 +174,7 @@ class Calibrator:
         self.session.imus, self.session.thermometers = published_by_others(
             self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
         self.session.mismatches = mismatches(self._node, self._heard, self._said)
+        self._context.look(self.session, self.stream.set_context)
         self.stream.flush()
         self.session.tick()
         self._on_transforms()

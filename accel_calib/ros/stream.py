@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Processing of Imu messages, from imu/data_raw to imu/data_calibrated.
+Processing of Imu messages, from imu/data_raw to imu/data_calibrated, and of their context.
 
 Messages remain serialized. Each message is corrected and published at once. The session receives
 several messages as one array later, which is cheaper and does not delay a message. A message in
@@ -13,18 +13,22 @@ same way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 import operator
 from time import monotonic
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Imu
+from rclpy.validate_topic_name import validate_topic_name
+from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
+from std_msgs.msg import Float32, Float64
 
+from .declare import published_by_others, SENSOR
 from ..calibrate import Calibration
-from ..errors import AccelCalibError
+from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION,
     IMU_DOUBLES,
@@ -38,7 +42,11 @@ from ..logs import (
 )
 from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
 from ..messages.one_reading import Triple
-from ..session import BATCH, CalibratorSettings, Session
+from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
+from ..table import Floats
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 _NO_LAYOUT = Layout(b'', 0, -1)
 _NO_BIAS = np.zeros(3)
@@ -74,6 +82,64 @@ class Output:
                 sensor.temperatures.stream(calibration.model))
 
 
+_NUMBERS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    'sensor_msgs/msg/BatteryState': (BatteryState, ('voltage', 'current', 'temperature')),
+    'sensor_msgs/msg/FluidPressure': (FluidPressure, ('fluid_pressure',)),
+    'sensor_msgs/msg/Temperature': (Temperature, ('temperature',)),
+    'std_msgs/msg/Float32': (Float32, ('data',)), 'std_msgs/msg/Float64': (Float64, ('data',))}
+"""Types of context, with their fields: the first one, or one that the name of the column has."""
+
+
+class ContextTopics:
+    """
+    The topics of the parameter `context`, whose types come from the graph.
+
+    InputError if the name of a topic is not valid.
+
+    """
+
+    def __init__(self, node: Node, settings: CalibratorSettings) -> None:
+        self._node, self._waiting = node, dict[str, str]()
+        for column, topic in context_topics(settings).items():
+            try:
+                validate_topic_name(topic)
+            except InvalidTopicNameException as error:
+                raise InputError(f'context has the topic {topic!r}, which is not a name: '
+                                 f'{str(error).splitlines()[0]}', 'correct the entry') from error
+            self._waiting[column] = node.resolve_topic_name(topic)
+
+    def look(self, session: Session, set_context: Callable[[str, float], None]) -> None:
+        """Subscribe to the topics that exist by now, and note why others do not arrive."""
+        types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
+        for column, topic in list(self._waiting.items()):
+            known = [name for name in types.get(topic, ()) if name in _NUMBERS]
+            if known:
+                del self._waiting[column]
+                kind, fields = _NUMBERS[known[0]]
+                field = next((each for each in fields if each in column), fields[0])
+                self._node.create_subscription(
+                    kind, topic, lambda message, column=column, field=field: set_context(
+                        column, getattr(message, field)), SENSOR)
+                session.missing[column] = f'nothing comes on {topic} ({_short(known[0])})'
+            else:
+                session.missing[column] = self._why(topic, types.get(topic, ()))
+
+    def _why(self, topic: str, types: Sequence[str]) -> str:
+        """Return why a topic cannot be used, and which ones can be."""
+        others = sorted({each for topics in published_by_others(self._node, _NUMBERS)
+                         for each in topics})
+        usable = f'; topics with a number: {", ".join(others)}' if others else ''
+        found = (f'{topic} has the type {" and ".join(map(_short, types))}, expected '
+                 f'{", ".join(map(_short, _NUMBERS))}: ' if types else
+                 f'there is no topic {topic}: start its driver, or ')
+        return f'{found}correct context, and restart the node{usable}'
+
+
+def _short(name: str) -> str:
+    """Return the name of a type as in the documentation of ROS."""
+    return name.replace('/msg/', '/')
+
+
 class Stream:
     """
     The messages of one sensor.
@@ -93,13 +159,14 @@ class Stream:
     def __init__(self, session: Session, publishers: Sequence[Any],
                  on_events: Callable[[], None]) -> None:
         self._session, self._on_events = session, on_events
+        self._columns = columns_of(session.settings)
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
         self._waiting: list[bytes] = []
-        self._temperatures: list[float] = []
+        self._context: Mapping[str, float] = {}
+        self._changes: list[tuple[int, Mapping[str, float]]] = [(0, self._context)]
         self._due = self._arrived = 0.0
-        self._temperature = math.nan
         self._listened = False
         self._applied: Calibration | None = None
         self._offered: Calibration | None = None
@@ -111,11 +178,19 @@ class Stream:
         self._active = active
         self._prepare()
 
-    def set_temperature(self, temperature: float) -> None:
-        """Set the temperature of the following messages [°C]; NaN is ignored."""
-        if math.isfinite(temperature):
-            self._temperature = temperature
-            self._session.statistics.temperature = temperature
+    def set_context(self, column: str, value: float) -> None:
+        """Set the context of the following messages; NaN is ignored."""
+        self._session.around.take(column, value)
+        self._note_context()
+
+    def _note_context(self) -> None:
+        """Note from which message on the context has its present values."""
+        context, count = self._session.around.values, len(self._waiting)
+        if context is not self._context:
+            self._context = context
+            if self._changes[-1][0] == count:
+                self._changes.pop()
+            self._changes.append((count, context))
 
     @property
     def newest(self) -> Triple | None:
@@ -145,7 +220,6 @@ class Stream:
         if self._listened:
             self._send(data)
         self._waiting.append(data)
-        self._temperatures.append(self._temperature)
         self._arrived = now
         if due:
             self._due = now + BATCH
@@ -160,7 +234,7 @@ class Stream:
             output.count()
         self._listened = self._active and any(output.listeners for output in self._outputs)
         gyro = session.sensor.gyro if session.settings.gyro_bias else None
-        bias = _NO_BIAS if gyro is None else gyro.at(self._temperature)
+        bias = _NO_BIAS if gyro is None else gyro.at(session.around.temperature)
         for output, calibration in ((self._calibrated, self._applied),
                                     (self._preview, session.sensor.previewed)):
             output.prepare(self._layout, calibration, session)
@@ -203,7 +277,7 @@ class Stream:
         if rewriter is None:
             return
         try:
-            corrected = rewriter(data, self._temperature)
+            corrected = rewriter(data, self._context)
         except AccelCalibError as error:
             self._session.reports.uncorrected(error)
             return
@@ -219,13 +293,21 @@ class Stream:
         """Pass the waiting messages to the session."""
         if self._waiting:
             waiting, self._waiting = self._waiting, []
-            temperatures, self._temperatures = self._temperatures, []
+            changes, self._changes = self._changes, [(0, self._context)]
             found = samples_of(joined(waiting, IMU_DOUBLES, 'imu/data_raw'))
-            rows = np.full((len(waiting), 9), np.nan)
-            rows[:, 0], rows[:, 1:4] = found['time'], found['reading']
-            rows[:, 4:7], rows[:, 7] = found['rate'], temperatures
+            rows = np.column_stack([found['time'], found['reading'], found['rate'],
+                                    self._around(changes, len(waiting))])
             self._session.push(rows, self._arrived)
+        self._session.around.expire()
+        self._note_context()
         self._on_events()
+
+    def _around(self, changes: list[tuple[int, Mapping[str, float]]], count: int) -> Floats:
+        """Return the context of each message, (n, k), from its changes."""
+        starts = [start for start, _ in changes]
+        values = [[known.get(column, math.nan) for column in self._columns]
+                  for _, known in changes]
+        return np.repeat(np.array(values), np.diff([*starts, count]), axis=0)
 
 
 def _usual(data: bytes) -> bytes:

@@ -19,6 +19,8 @@ from .session import BATCH, Session
 from .settings import (
     CalibratorSettings,
     changed,
+    columns_of,
+    context_topics,
     default_of,
     expected,
     parameter,
@@ -49,5 +51,6 @@ from .worker import (
 __all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
            'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',
            'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
-           'WorkerProcess', 'changed', 'checks', 'default_of', 'expected', 'figures', 'parameter',
-           'ros_home', 'state', 'title', 'words_of_state', 'worst']
+           'WorkerProcess', 'changed', 'checks', 'columns_of', 'context_topics', 'default_of',
+           'expected', 'figures', 'parameter', 'ros_home', 'state', 'title', 'words_of_state',
+           'worst']

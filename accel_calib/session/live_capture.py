@@ -21,13 +21,14 @@ a pose, the pose is marked as doubtful, and the fit leaves it out if possible.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import is_
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..capture import CaptureSettings, Dwell, poses_from, select, StillDetector
+from ..capture import CaptureSettings, CONTEXT, Dwell, poses_from, select, StillDetector
 from ..table import Floats, Poses
 from ..units import Units
 
@@ -43,7 +44,8 @@ _BAND = 5.0
 _SAME_MEAN = 4.0
 """Largest difference of two means of the same samples, in their standard deviations."""
 
-_CONTEXT = ('temperature', 'supply_voltage', 'rate')
+_BANDS = 5
+"""Parts of the range of another column so far; poses in different parts are not merged."""
 
 
 class PoseBook:
@@ -66,13 +68,18 @@ class PoseBook:
         return made[1]
 
     def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
-        """Keep, merge or refuse repeated poses, separately at each temperature."""
-        bands: dict[float, list[Dwell]] = {}
-        for dwell in with_temperature(dwells):
-            temperature = float(np.asarray(dwell.context.get('temperature', 0.0)))
-            bands.setdefault(round(temperature / _BAND), []).append(dwell)
+        """Keep, merge or refuse repeated poses, separately in each band of the context."""
+        dwells = with_temperature(dwells)
+        bands: dict[bytes, list[Dwell]] = {}
+        for dwell, band in zip(dwells, _bands(dwells), strict=True):
+            bands.setdefault(band.tobytes(), []).append(dwell)
         return [dwell for band in bands.values()
                 for dwell in select(band, self._settings, self._units)]
+
+    def lacking(self, column: str) -> tuple[int, int]:
+        """Return how many dwells have no value in a column of the context, and how many have."""
+        known = [column in each.context for each in (*self._earlier, *self._dwells, *self._held)]
+        return known.count(False), known.count(True)
 
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others."""
@@ -129,6 +136,19 @@ class PoseBook:
         self._earlier, self._dwells, self._held = [], [], []
 
 
+def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
+    """Return the (n, k) band of each dwell in each column of the context; unknown: -1."""
+    keys = sorted({key for dwell in dwells for key in dwell.context} - {'rate'})
+    found = np.full((len(dwells), len(keys)), -1, np.int64)
+    for k, key in enumerate(keys):
+        values = np.array([dwell.context.get(key, np.nan) for dwell in dwells], float)
+        known = np.isfinite(values)
+        least, width = np.min(values[known]), np.ptp(values[known]) / _BANDS
+        least, width = (0.0, _BAND) if key == 'temperature' else (least, width or 1.0)
+        found[known, k] = np.round((values[known] - least) / width)
+    return found
+
+
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     """
     Return dwells with missing temperatures set to that of the nearest dwell.
@@ -173,7 +193,8 @@ def _dwell_of(poses: Poses, k: int) -> Dwell:
     time = float(poses['time'][k]) if 'time' in poses else 0.0
     count = float(poses['count'][k]) if 'count' in poses else 1.0
     std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
-    context = {key: poses[key][k] for key in _CONTEXT if key in poses}
+    context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities)
+               if key in poses}
     doubtful = 'doubtful' in poses and bool(poses['doubtful'][k])
     rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
     return Dwell(time, time, time, poses.reading[k], std, count, max(1, round(count)), context,
@@ -213,10 +234,11 @@ class Change:
 
 
 class LiveCapture:
-    """The stillness detector and the poses of one sensor."""
+    """The stillness detector and the poses of one sensor; `context` as of `StillDetector`."""
 
-    def __init__(self, settings: CaptureSettings, units: Units) -> None:
-        self.detector = StillDetector(settings, units)
+    def __init__(self, settings: CaptureSettings, units: Units,
+                 context: Sequence[str] = CONTEXT) -> None:
+        self.detector = StillDetector(settings, units, context=context)
         self.book = PoseBook(settings, units)
         self._window = settings.still_window
         self._rest: Dwell | None = None
@@ -237,7 +259,7 @@ class LiveCapture:
 
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
-        Add (n, 9) samples as in `StillDetector.push`; yield each change before the next samples.
+        Add (n, 7 + k) samples as `StillDetector.push`; yield each change before the next samples.
 
         `capture`: every rest becomes a pose.
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from .guidance import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
-from .settings import CalibratorSettings, capture_settings
+from .settings import CalibratorSettings, capture_settings, columns_of
 from .stream import StreamStatistics
 from ..calibrate import (
     Calibration,
@@ -105,7 +105,7 @@ class Sensor:
     """
 
     def __init__(self, settings: CalibratorSettings, units: Units) -> None:
-        self.live = LiveCapture(capture_settings(settings), units)
+        self.live = LiveCapture(capture_settings(settings), units, columns_of(settings))
         self.guide, self.temperatures = Guide(), TemperatureHistory()
         self.calibration: Calibration | None = None
         self.applied: Calibration | None = None

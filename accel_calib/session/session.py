@@ -28,7 +28,7 @@ from .sensor import Sensor, title
 from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings
 from .store import Store, writing_advice
-from .stream import AGAIN, Reports, SILENT, StreamStatistics
+from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
 from .work import plan_for, rated, result_of
 from .worker import (
     Calibrations,
@@ -98,6 +98,10 @@ class Session:
         Whether messages are corrected.
     publishers : tuple of str or None
         Names of the nodes that publish the messages; None: the samples come from a board.
+    around : Around
+        The last values of the context.
+    missing : dict of str to str
+        Why a column of the parameter `context` does not arrive, for the log.
     imus, thermometers : tuple of str
         Topics with messages of Imus and of temperatures that other nodes publish.
     mismatches : tuple of str
@@ -119,7 +123,8 @@ class Session:
         self.settings, self.topic, self.clock = settings, topic, clock
         self.units = units_of(settings.units, settings.gravity)
         self.sensor = Sensor(settings, self.units)
-        self.statistics = StreamStatistics(clock)
+        self.statistics, self.around = StreamStatistics(clock), Around(clock)
+        self.missing: dict[str, str] = {}
         self.files = SensorFiles(settings, topic)
         self.commands, self.reports = Commands(self), Reports(self)
         self.frame_id: str | None = None
@@ -151,6 +156,12 @@ class Session:
         """Name of the sensor; empty if not known yet."""
         return self.settings.sensor or self.frame_id or ''
 
+    @property
+    def context(self) -> dict[str, float]:
+        """Present time [s], if known, and last values of the context."""
+        stamp = self.statistics.stamp
+        return {**self.around.values, **({} if math.isnan(stamp) else {'time': stamp})}
+
     def set_settings(self, settings: CalibratorSettings) -> None:
         """Replace the settings that can change while the node runs."""
         before, self.settings = self.settings, settings
@@ -179,6 +190,7 @@ class Session:
         self.reports.limits()
         self.reports.hand()
         self.reports.thermometers()
+        self.reports.context()
         self._events += self.commands.due()
 
     def close(self) -> None:
@@ -213,8 +225,8 @@ class Session:
 
         Parameters
         ----------
-        samples : (n, 9) array
-            As in `accel_calib.capture.StillDetector.push`.
+        samples : (n, 7 + k) array
+            As in `accel_calib.capture.StillDetector.push`, with the context of `columns_of`.
         arrived : float
             Arrival time of the last sample, by the steady clock [s].
 

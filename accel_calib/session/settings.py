@@ -20,9 +20,10 @@ import math
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
-from ..capture import CaptureSettings, REPEATED, Repeated
+from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated
 from ..effects import MODELS
 from ..errors import InputError
+from ..table import quantity_key
 from ..units import is_native, STANDARD_GRAVITY, UNIT_NAMES, UnitName
 
 if TYPE_CHECKING:
@@ -164,6 +165,11 @@ class CalibratorSettings:
         'this frame and that of the sensor, on /tf_static. Empty: not used')
     publish_tf: bool = parameter(
         False, 'Publish the levelled frame on /tf_static, as a child of the frame of the sensor')
+    context: list[str] = parameter(
+        [''], 'Further topics with a number that may act on the sensor, as column:=topic, such as '
+        "['supply_voltage:=battery', 'rotor_temperature:=/motor/temp']. Types: BatteryState, "
+        'FluidPressure and Temperature of sensor_msgs, Float32 and Float64 of std_msgs. ~/refine '
+        'tries each column as a cause')
     gyro_bias: bool = parameter(
         False, 'Subtract the bias of the gyro, measured at rest, from the angular velocity',
         live=True)
@@ -217,6 +223,26 @@ class CalibratorSettings:
     web_host: str = parameter(
         '127.0.0.1', 'Address at which the live page is served. 0.0.0.0: to the whole network, '
         'without encryption')
+
+
+def context_topics(settings: CalibratorSettings) -> dict[str, str]:
+    """Return the topic of each column of `context`; InputError if an entry is not usable."""
+    topics: dict[str, str] = {}
+    for entry in filter(None, settings.context):
+        column, _, topic = (part.strip() for part in entry.partition(':='))
+        known = column in (*CONTEXT, quantity_key(column))
+        if not (known and column and topic) or column in topics:
+            raise InputError(
+                f'context has the entry {entry!r}, expected column:=topic, each column once: '
+                f'{", ".join(CONTEXT)}, or a new name of letters, digits and _',
+                'correct the entry')
+        topics[column] = topic
+    return topics
+
+
+def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
+    """Return the columns of the context of a sample."""
+    return tuple(dict.fromkeys((*CONTEXT, *context_topics(settings))))
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:

@@ -21,11 +21,13 @@ import numpy as np
 
 from .guidance import is_partial, next_action, Progress
 from .sensor import title
-from .stream import SILENT, stream_faults, thermometer_words
+from .settings import context_topics
+from .stream import missing_context, SILENT, stream_faults, thermometer_words
 from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
 from ..finding import has
 from ..messages.one_reading import Triple
+from ..table import column_of
 from ..text import counted
 from ..units import MG
 
@@ -57,7 +59,7 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
         advice='' if action is None else action.words,
         command='' if action is None else action.command,
         direction=() if direction is None else tuple(direction.tolist()),
-        up=up, length=length, corrected=corrected, temperature=statistics.temperature)
+        up=up, length=length, corrected=corrected, temperature=session.around.temperature)
 
 
 def _accuracy(session: Session) -> float:
@@ -75,7 +77,7 @@ def _newest(session: Session, reading: Triple | None) -> Newest:
         if newest is None:
             return _NOT_KNOWN
         reading = tuple(newest.tolist())
-    force = sensor.force_of(reading, session.statistics.context)
+    force = sensor.force_of(reading, session.context)
     corrected = math.nan if force is None else math.hypot(*force)
     if not session.units.is_native:
         length = math.hypot(*reading)
@@ -140,7 +142,7 @@ def words_of_state(session: Session) -> str:
 
 
 def _stream(session: Session) -> Check:
-    faults = stream_faults(session)
+    faults = {**stream_faults(session), **missing_context(session)}
     if faults:
         return Check('stream', Level.WARN, '; '.join(faults.values()))
     return Check('stream', Level.OK, f'{session.statistics.rate:.1f} Hz on {session.topic}')
@@ -157,7 +159,7 @@ def _calibration(session: Session) -> Check:
         count = counted(len(sensor.live.book.poses()), 'pose')
         state = '' if sensor.offered else f'no calibration yet, captured {count}: '
         return Check('calibration', Level.WARN, f'{state}{_advice(session)}')
-    left = sensor.limits_left(session.statistics.context)
+    left = sensor.limits_left(session.context)
     words = [each.words for key, each in left.items() if key != 'std']
     if words:
         return Check('calibration', Level.WARN, f'{"; ".join(words)}: {USES_LIMIT}; '
@@ -200,8 +202,14 @@ def figures(session: Session) -> Iterator[tuple[str, str]]:
     yield from _drift_figures(sensor.drift)
     yield 'since last rest [s]', _number(sensor.rest_ago(counts.stamp))
     yield from _pose_figures(session)
-    yield 'temperature [°C]', (_number(counts.temperature) if math.isfinite(counts.temperature)
+    warm = session.around.temperature
+    yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
                                else f'not known: {thermometer_words(session)}')
+    for column in context_topics(session.settings):
+        unit = column_of(column).unit
+        if column != 'temperature':
+            yield f'{column} [{unit}]' if unit else column, _number(
+                session.around.values.get(column, math.nan))
     yield 'still below [m/s² or native]', f'{sensor.live.detector.threshold:.4g}'
     yield from _sensor_figures(session)
 
@@ -238,7 +246,7 @@ def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
     yield 'mounting', 'not known' if calibration is None or not calibration.is_levelled else (
         mounting_words(calibration.rotation, session.frame_id or '', session.settings.base_frame))
     if gyro is not None:
-        yield 'gyro bias [rad/s]', _vector(gyro.at(session.statistics.temperature))
+        yield 'gyro bias [rad/s]', _vector(gyro.at(session.around.temperature))
         yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
     if noise is not None:
         yield 'noise of acceleration [m/s² or native]', _vector(noise.force)

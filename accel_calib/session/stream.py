@@ -12,15 +12,17 @@ is played at another speed. They cover the last `_SPAN` seconds.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from .settings import context_topics
 from ..calibrate import USES_LIMIT
+from ..effects import Model
 from ..errors import AccelCalibError
-from ..table import Floats
+from ..table import Floats, is_quantity
 from ..text import counted
 from ..units import Units
 
@@ -67,8 +69,6 @@ class StreamStatistics:
         sensor, and corrected messages that are not plausible.
     stamp, arrived : float
         Stamp of the last message, and its arrival by the steady clock [s].
-    temperature : float
-        Last temperature [°C]; NaN: none.
     reading, newest : (3,) array or None
         Mean reading of the last batch, and the last reading.
     spread : float
@@ -79,7 +79,7 @@ class StreamStatistics:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self.messages = self.not_finite = self.foreign = self.implausible = 0
-        self.stamp = self.temperature = self.spread = math.nan
+        self.stamp = self.spread = math.nan
         self.arrived = self._advanced = self._dropped_at = -math.inf
         self.reading: Floats | None = None
         self.newest: Floats | None = None
@@ -146,12 +146,6 @@ class StreamStatistics:
         count = sum(batch.messages for batch in self._batches) - self._batches[0].messages
         return count / span if span > 0.0 else 0.0
 
-    @property
-    def context(self) -> dict[str, float]:
-        """Present time [s] and temperature [°C], if known."""
-        known = {'time': self.stamp, 'temperature': self.temperature}
-        return {key: value for key, value in known.items() if math.isfinite(value)}
-
     def length_g(self, units: Units) -> float:
         """Return |a| of the last messages [g]; NaN if not known."""
         if self.reading is None or units.is_native:
@@ -179,9 +173,80 @@ class StreamStatistics:
         return ''
 
 
+HELD = 30.0
+"""Time for which the last value of a quantity holds [s]."""
+
+
+class Around:
+    """
+    The last value of each column of the context, by arrival.
+
+    A quantity holds for `HELD`: after that, its effect is left out. Temperature and supply voltage
+    hold until the next value, because their effects cannot be left out without a jump.
+
+    Attributes
+    ----------
+    values : mapping of str to float
+        Values by column; another mapping after each change.
+
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock, self._begun = clock, clock()
+        self._came: dict[str, float] = {}
+        self.values: Mapping[str, float] = {}
+
+    @property
+    def temperature(self) -> float:
+        """Return the temperature [°C]; NaN: none."""
+        return self.values.get('temperature', math.nan)
+
+    def take(self, column: str, value: float) -> None:
+        """Take a value that has arrived; one that is not finite is ignored."""
+        if math.isfinite(value):
+            self._came[column] = self._clock()
+            self.values = {**self.values, column: value}
+
+    def expire(self) -> None:
+        """Remove the quantities that hold no longer."""
+        old = [column for column in self.values if is_quantity(column) and self.is_missing(column)]
+        if old:
+            self.values = {column: value for column, value in self.values.items()
+                           if column not in old}
+
+    def is_missing(self, column: str) -> bool:
+        """Return whether nothing has arrived for too long."""
+        limit = HELD if column in self._came else AGAIN
+        return self._clock() - self._came.get(column, self._begun) > limit
+
+
+def missing_context(session: Session) -> dict[str, str]:
+    """Return by column of the context why it is missing, and what follows."""
+    calibration = session.sensor.calibration
+    model = Model({}) if calibration is None else calibration.model
+    wanted = [*context_topics(session.settings), *(
+        key for key in model.needs if is_quantity(key) or key == 'supply_voltage')]
+    return {column: _missing_words(session, model, column) for column in dict.fromkeys(wanted)
+            if session.around.is_missing(column)}
+
+
+def _missing_words(session: Session, model: Model, column: str) -> str:
+    why = session.missing.get(column) or (
+        'the samples do not have it' if session.publishers is None else
+        f"start the node with context:=['{column}:=TOPIC'], and its topic")
+    names = [name for name in model.effects if column in Model({name: model.values[name]}).needs]
+    if column in session.around.values:
+        follows = '; the last value holds'
+    elif names and is_quantity(column):
+        follows = f'; {" and ".join(names)} {"is" if len(names) == 1 else "are"} left out'
+    else:
+        follows = ''
+    return f'no {column} arrives: {why}{follows}'
+
+
 def thermometer_words(session: Session) -> str:
     """Return how the node would get a temperature; empty if it has one."""
-    if math.isfinite(session.statistics.temperature):
+    if math.isfinite(session.around.temperature):
         return ''
     topics = ' or '.join(session.thermometers)
     return (f'restart the node with temperature:={topics}' if topics else
@@ -278,6 +343,7 @@ class Reports:
         self._faults: tuple[object, ...] | None = None
         self._faults_at = -math.inf
         self._left: frozenset[str] = frozenset()
+        self._missing: frozenset[str] = frozenset()
 
     def foreign(self, frame_id: str) -> None:
         """Count a message of another sensor."""
@@ -316,7 +382,7 @@ class Reports:
 
     def limits(self) -> None:
         """Log once when a quantity leaves the range of the calibration."""
-        left = self._session.sensor.limits_left(self._session.statistics.context)
+        left = self._session.sensor.limits_left(self._session.context)
         for key, each in left.items():
             if key not in self._left:
                 self._session.log(
@@ -336,9 +402,26 @@ class Reports:
         """Log which temperatures are published if none arrives."""
         session = self._session
         if (session.thermometers and session.statistics.messages
-                and math.isnan(session.statistics.temperature)):
+                and math.isnan(session.around.temperature)
+                and 'temperature' not in context_topics(session.settings)):
             session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
                         'thermometers', 10.0 * _FAULT_AGAIN)
+
+    def context(self) -> None:
+        """Log when a column of the context is missing or back, and that poses lack it."""
+        session, missing = self._session, missing_context(self._session)
+        for column, words in missing.items():
+            if column not in self._missing:
+                session.log('warning', words, f'missing {column}', _FAULT_AGAIN)
+        for column in sorted(self._missing - missing.keys()):
+            session.log('info', f'{column} arrives')
+        self._missing = frozenset(missing)
+        for column in context_topics(session.settings):
+            lack, have = session.sensor.live.book.lacking(column)
+            if lack and have:
+                session.log('warning', f'{lack} of {counted(lack + have, "pose")} have no '
+                            f'{column}, so that ~/refine cannot use it: call ~/reset, and take '
+                            'the poses again', f'poses without {column}', 10.0 * _FAULT_AGAIN)
 
     def faults(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""

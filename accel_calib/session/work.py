@@ -32,7 +32,7 @@ from ..estimate import coverage, fit_sphere, pose_noise
 from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
 from ..geometry import spread_directions
 from ..refine import PlannedPose, refine, Refinement, refitted
-from ..refine.words import residual_words, times_typical, verdict_words
+from ..refine.words import residual_words, shown_name, times_typical, verdict_words
 from ..table import Floats, Poses
 from ..text import counted, listed, now, plain
 from ..units import MG, Units
@@ -268,7 +268,7 @@ def story(refinement: Refinement, rating: Rating) -> str:
              f'{residual_words(refinement)}']
     for step in refinement.steps:
         rivals = f' (or {", ".join(step.likely_rivals)})' if step.rivals else ''
-        lines.append(f'{step.effect}{rivals} {step.gap_before_mg:.3f} to '
+        lines.append(f'{shown_name(step.name)}{rivals} {step.gap_before_mg:.3f} to '
                      f'{step.gap_after_mg:.3f} mg, {step.where}')
     if refinement.disturbed_poses:
         lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')

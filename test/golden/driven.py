@@ -69,7 +69,7 @@ class _Driver:
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 9), np.nan)
                 rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
-                self.session.statistics.temperature = t
+                self.session.around.take('temperature', t)
                 self.session.push(rows, self.now)
             self._handle()
         self.session.tick()
@@ -132,7 +132,7 @@ def messages() -> Any:
         write, single = Rewriter(layout, calibration, 1.0, G, to, noise if frame_id else None), []
         for k, raw in enumerate(raws):
             write.bias = (0.01, -0.02, 0.03) if k == 5 else (0.0, 0.0, 0.0)
-            out, begin = write(raw, 20.0 + 2.0 * k) or b'', write.layout.begin
+            out, begin = write(raw, {'temperature': 20.0 + 2.0 * k}) or b'', write.layout.begin
             single += [out[:begin], np.frombuffer(out[begin:]).tolist()]
         every, large = joined(raws, 37, 'imu'), [
             raws[0][:-96] + struct.pack('<3d', 0.0, size, 0.0) + raws[0][-72:]
@@ -145,7 +145,7 @@ def messages() -> Any:
             'ids': frame_ids(every), 'samples': samples_of(every), 'renamed': [
                 bytes(each)[:48] for each in renamed(every, 'other').each()][:2],
             'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:], 'large': [
-                isinstance(attempt(write, each, 20.0), bytes) for each in large]}
+                isinstance(attempt(write, each, {'temperature': 20.0}), bytes) for each in large]}
     raw = next(_messages('imu', 1))
     swapped = raw[:1] + b'\0' + raw[2:4] + b''.join(
         raw[k:k + 4][::-1] for k in range(4, 16, 4)) + raw[16:20] + b''.join(
