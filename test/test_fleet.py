@@ -25,8 +25,11 @@ from threading import Thread
 import time
 from typing import Any
 
+from accel_calib import simulate
+from accel_calib.effects import know_file
 from accel_calib.errors import InputError
 from accel_calib.fleet import cluster, Input, run, Store
+from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
 from fleet_case import found_in, OFFSET, QUICK, rows_of, state_of, write_fleet, write_poses
@@ -643,3 +646,38 @@ def test_recordings_are_read_from_a_store_of_s3(
         same = local[name.replace('s3://fleet/recorded', str(recorded))]
         assert [row[key] for key in ('content', 'sensor', 'status', 'offset.x')] == [
             same[key] for key in ('content', 'sensor', 'status', 'offset.x')]
+
+
+OWN = """
+import accel_calib as ac
+import numpy as np
+
+band = ac.Effect('band_of_fleet', 'dead band of each axis', typical=0.003, unit='g',
+                 form=lambda u: np.clip(u / 0.05, -1.0, 1.0),
+                 slope=lambda u: (abs(u) < 0.05) / 0.05)
+"""
+
+
+def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_path: Path
+                                                               ) -> None:
+    (tmp_path / 'own.py').write_text(OWN, encoding='utf-8')
+    options = replace(QUICK, refined=True, own=know_file(tmp_path / 'own.py'))
+    for seed in range(2):
+        poses = simulate({'offset': OFFSET, 'band_of_fleet': (0.01, -0.008, 0.006)}, poses=60,
+                         seed=seed, units='g')
+        (tmp_path / 'in').mkdir(exist_ok=True)
+        write_table(tmp_path / 'in' / f'2026-0{seed + 1}-03.csv', replace(poses, sensor='arm'))
+    store = Store(tmp_path / 'out')
+    assert run(client, found_in(tmp_path / 'in'), options, store).counts == {'ok': 2}
+    rows = rows_of(tmp_path / 'out')
+    assert [row['effects'][-1] for row in rows] == ['band_of_fleet'] * 2
+    assert run(client, found_in(tmp_path / 'in'), options, store).counts == {'skipped': 2}
+    (tmp_path / 'own.py').write_text(OWN.replace('0.05', '0.06'), encoding='utf-8')
+    changed = replace(options, own=know_file(tmp_path / 'own.py'))
+    assert run(client, found_in(tmp_path / 'in'), changed, store).counts == {'ok': 2}
+    without = subprocess.run(
+        [sys.executable, *COMMAND, 'verify', str(tmp_path / 'in' / '2026-01-03.csv'), '-c',
+         str(tmp_path / 'out' / rows_of(tmp_path / 'out')[0]['calibration'])],
+        capture_output=True, text=True, check=False)
+    assert without.returncode == 2
+    assert "needs the effect 'band_of_fleet' of the user" in without.stderr

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+import signal
 import time
 from typing import Any
 
@@ -26,13 +27,14 @@ MOVES = np.array([0.002, -0.0015, 0.001])
 """Offset per °C [g]."""
 
 
-def warmed(bench: Any, readings: Readings, publisher: Any, name: str = 'temperature [°C]') -> None:
-    """Publish poses, each at another temperature, or other quantity."""
+def warmed(bench: Any, readings: Readings, publisher: Any, name: str = 'temperature [°C]',
+           change: Callable[[float], float] = float) -> None:
+    """Publish poses, each at another temperature, or other quantity that changes the offset."""
     meet(bench, publisher, 25.0, name)
     for k, direction in enumerate(spread_directions(POSES)):
         value = 25.0 + 12.0 * np.sin(2.1 * k)
         published(bench, publisher, value, 0.05)
-        bench.feed(readings([direction], dwell=1.8) + MOVES * (value - 25.0) * 9.80665)
+        bench.feed(readings([direction], dwell=1.8) + MOVES * change(value - 25.0) * 9.80665)
 
 
 def message(publisher: Any, value: float) -> Any:
@@ -84,11 +86,12 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
     check_corrected(bench, readings, publisher, corrected)
 
 
-def check_corrected(bench: Any, readings: Readings, publisher: Any, corrected: list[Any]) -> None:
+def check_corrected(bench: Any, readings: Readings, publisher: Any, corrected: list[Any],
+                    change: Callable[[float], float] = float) -> None:
     """Check that messages at two temperatures, or other quantities, are corrected."""
     for value in (15.0, 35.0):
         published(bench, publisher, value, 0.2)
-        shift = MOVES * (value - 25.0) * 9.80665
+        shift = MOVES * change(value - 25.0) * 9.80665
         bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
                    corrected)
         up = np.mean([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
@@ -108,6 +111,40 @@ def test_a_quantity_of_a_robot_is_named_stored_and_corrected(bench: Any, reading
     np.testing.assert_allclose(found.model.values['offset_covariate-motor_current'][:3], MOVES,
                                atol=2e-4)
     check_corrected(bench, readings, publisher, corrected)
+
+
+OWN = """
+import accel_calib as ac
+
+field = ac.Effect('field_of_motor', 'field of the motor', typical=0.001, unit='g/A',
+                  variable='motor_current', change=lambda current: abs(current - 25.0))
+"""
+
+
+def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
+        bench: Any, readings: Readings, tmp_path: Path) -> None:
+    (tmp_path / 'own.py').write_text(OWN, encoding='utf-8')
+    about = {'sensor': 'arm', 'passthrough': True, 'context': ['motor_current:=motor/current']}
+    corrected = bench.listen(Imu, 'imu/data_calibrated')
+    publisher = bench.node.create_publisher(Float64, 'motor/current', 10)
+    first = bench.calibrator(**about, also=tmp_path / 'own.py')
+    warmed(bench, readings, publisher, 'motor_current', abs)
+    answer = bench.call('refine')
+    assert answer.success, answer.message
+    assert 'field_of_motor' in answer.message
+    check_corrected(bench, readings, publisher, corrected, abs)
+    assert bench.end(first, signal.SIGINT)[0] == 0
+    bench.join_anew()
+    second = bench.start('calibrator', **about)
+    bench.client('self_test')
+    status, printed = bench.end(second, signal.SIGINT)
+    assert status == 0, printed
+    assert "needs the effect 'field_of_motor' of the user" in printed
+    assert 'the parameter also of the node' in printed
+    wrong = bench.start('calibrator', also='/nowhere/own.py')
+    printed = wrong.communicate(timeout=60.0)[0]
+    assert wrong.returncode == 2, printed
+    assert 'also is /nowhere/own.py, which cannot be read' in printed
 
 
 TOPICS = {'supply_voltage [V]': ('battery', BatteryState, 12.25),

@@ -352,6 +352,7 @@ def _live(made: options.Parser) -> None:
         'real time (default: %(default)s)')
     options.add_log(made)
     options.add_capture(made)
+    options.share(made, '--also')
 
 
 def _none(made: options.Parser) -> None:

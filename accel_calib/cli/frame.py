@@ -29,7 +29,6 @@ import json
 import os
 from pathlib import Path
 import re
-import runpy
 import sys
 from textwrap import wrap
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -169,28 +168,12 @@ def _run_several(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -
 
 def _done(args: argparse.Namespace) -> Done:
     """Run the command for one input, with the own effects of the user, ``args.own``."""
+    from ..effects import know_file
+
     path = getattr(args, 'also', None)
-    args.own = () if path is None else _own_effects(path)
+    args.own = () if path is None else know_file(path)
     done: Done = _function('run', args.command)(args)
     return done
-
-
-def _own_effects(path: Path) -> tuple[str, ...]:
-    """Make the effects that a Python file defines known, and return their names."""
-    from ..effects import know, OwnEffect
-
-    try:
-        defined = runpy.run_path(str(path)).values()
-    except (AccelCalibError, OSError):
-        raise
-    except Exception as err:
-        raise InputError(f'{path} cannot be executed ({type(err).__name__}: {err}), expected '
-                         'Python with own effects', 'correct it') from err
-    found = {id(each): each for each in defined if isinstance(each, OwnEffect)}
-    if not found:
-        raise InputError(f'{path} defines no effect, expected at least one accel_calib.Effect',
-                         'see docs/effects.md for an example')
-    return know(found.values())
 
 
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:

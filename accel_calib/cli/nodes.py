@@ -56,7 +56,7 @@ def run_live(args: argparse.Namespace) -> Done:
             output.print(f'read as: {source.read_as}')
         host = Host(source, CalibratorSettings(
             units=source.units.name, gravity=args.gravity, calibration_file=str(args.output),
-            web_host=args.host, web_port=args.port, **settings(args)),
+            web_host=args.host, web_port=args.port, also=str(args.also or ''), **settings(args)),
             lambda line: output.print(line.words))
         try:
             print(host.server.announce(), flush=True)  # a file name is not wrapped

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ from .form import (
     OwnEffect,
 )
 from .thermal import Lag
-from ..errors import InputError
+from ..errors import AccelCalibError, InputError
 from ..table import column_of, Floats, is_quantity
 
 LARGEST_ITERATIONS = 100
@@ -176,6 +177,46 @@ def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
     parameter_names.cache_clear()
     terms_of.cache_clear()
     return tuple(names)
+
+
+def know_file(path: Path) -> tuple[str, ...]:
+    """
+    Execute a Python file that defines own effects, make them known, and return their names.
+
+    Raise InputError if it cannot be executed or defines none, and OSError if it cannot be read.
+
+    """
+    return know_code(str(path), path.read_bytes())
+
+
+def know_code(name: str, code: bytes) -> tuple[str, ...]:
+    """Execute the code of a file as `know_file` does, unless this process has executed it."""
+    before, names = _EXECUTED.get(name, (b'', ()))
+    if names and before == code:
+        return names
+    defined: dict[str, Any] = {'__file__': name, '__name__': Path(name).stem}
+    try:
+        exec(compile(code, name, 'exec'), defined)
+    except (AccelCalibError, OSError):
+        raise
+    except Exception as err:
+        raise InputError(f'{name} cannot be executed ({type(err).__name__}: {err}), expected '
+                         'Python with own effects', 'correct it') from err
+    found = {id(each): each for each in defined.values() if isinstance(each, OwnEffect)}
+    if not found:
+        raise InputError(f'{name} defines no effect, expected at least one accel_calib.Effect',
+                         'see docs/effects.md for an example')
+    _EXECUTED[name] = code, know(found.values())
+    return _EXECUTED[name][1]
+
+
+_EXECUTED: dict[str, tuple[bytes, tuple[str, ...]]] = {}
+"""Code and names of effects of the files that this process has executed, by name."""
+
+
+def known_code() -> dict[str, bytes]:
+    """Return the code of the files with own effects, so that another process can know them."""
+    return {name: code for name, (code, _) in _EXECUTED.items()}
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -328,9 +369,9 @@ class Model:
 
     @cached_property
     def neutral(self) -> Mapping[str, float]:
-        """Value of each quantity that counts as no change, where it is not recorded."""
-        return {key: float(np.mean(shape)) for effect, shape in self._by_effect
-                for key in effect.needs if is_quantity(key) and len(shape)}
+        """Value of each quantity that counts as no change, where it is not recorded; NaN: none."""
+        return {key: float(np.mean(shape)) if len(shape) else np.nan
+                for effect, shape in self._by_effect for key in effect.needs if is_quantity(key)}
 
     @cached_property
     def lags(self) -> Mapping[str, Lag]:

@@ -37,6 +37,7 @@ from .task import (
     unread_row,
 )
 from ..calibrate import FleetPrior
+from ..effects import know_code, known_code
 from ..errors import InputError
 from ..logs import Progress
 from ..stored import write_priors
@@ -267,7 +268,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     while True:
         while len(waiting) < limit and (batch := [alone.pop()] if alone else
                                         list(islice(rest, pace.size))):
-            future = client.submit(_each, function, batch, *others, pure=False)
+            future = client.submit(_each, known_code(), function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
         if not waiting:
@@ -301,10 +302,17 @@ def _result_of(client: Client, future: Any) -> tuple[list[Any], float]:
                          'recordings are skipped') from err
 
 
-def _each(function: Callable[..., Any], batch: Sequence[Any], *others: Any
-          ) -> tuple[list[Any], float]:
-    """Return the result of a function per item, or its exception, and the seconds of them all."""
+def _each(code: Mapping[str, bytes], function: Callable[..., Any], batch: Sequence[Any],
+          *others: Any) -> tuple[list[Any], float]:
+    """
+    Return the result of a function per item, or its exception, and the seconds of them all.
+
+    `code` are the files with own effects of the user.
+
+    """
     begin, results = time.perf_counter(), list[Any]()
+    for each in code.items():
+        know_code(*each)
     for item in batch:
         try:
             results.append(function(item, *others))

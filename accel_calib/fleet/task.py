@@ -37,7 +37,7 @@ from .. import __version__
 from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
 from ..disk import write_atomically
-from ..effects import MODELS
+from ..effects import known_code, MODELS
 from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError, system_error
 from ..findings import residual_figures
 from ..intake import Intake, poses_of
@@ -284,6 +284,8 @@ class Options:
         Look for effects beyond offset, gain and cross-axis.
     exports : tuple of str
         Formats of `accel_calib.stored.exports.FORMATS` to write beside each calibration.
+    own : tuple of str
+        Names of own effects of the user, which are tried beside the catalogue.
 
     """
 
@@ -293,6 +295,7 @@ class Options:
     settings: dict[str, Any] = field(default_factory=dict)
     refined: bool = True
     exports: tuple[str, ...] = ()
+    own: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -370,12 +373,14 @@ def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> l
 
 
 def key_of(content: str, found: Input, options: Options) -> str:
-    """Return the key of a result: content, name from the path, version and options."""
+    """Return the key of a result: content, name from the path, version, options, own effects."""
     try:
         place = sensor_of(found, '', options.sensor_from)
     except AccelCalibError as err:
         place = str(err)
-    about = json.dumps([content, place, __version__, RESULTS, asdict(options)], default=str,
+    stated = asdict(options)
+    own = [code.hex() for code in known_code().values()] if stated.pop('own') else []
+    about = json.dumps([content, place, __version__, RESULTS, stated, *own], default=str,
                        sort_keys=True)
     return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()
 
@@ -387,7 +392,7 @@ def _result(found: Input, path: Path, options: Options) -> tuple[Row, Calibratio
         intake = poses_of(path, options.log, options.settings)
         row = _about(found, options, intake.poses, path)
         outcome = calibrated(intake.poses, intake.units, Plan(
-            sensor=row['sensor'], refined=options.refined))
+            sensor=row['sensor'], refined=options.refined, also=options.own))
     except OSError:
         raise  # it may be possible to read it later
     except AccelCalibError as err:

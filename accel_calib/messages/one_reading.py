@@ -172,9 +172,16 @@ class OneReading:
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
-    """Return the factor of an effect: one float for all terms, or a list with one per term."""
+    """
+    Return the factor of an effect: one float for all terms, or a list with one per term.
+
+    A factor is 0 where its context is NaN.
+
+    """
     factor = effect.factor(known, shape) if effect.factor is not None else 1.0
-    return factor.tolist() if isinstance(factor, np.ndarray) else float(factor)
+    if isinstance(factor, np.ndarray):
+        return np.nan_to_num(factor).tolist()
+    return 0.0 if factor != factor else float(factor)
 
 
 def _row(axis: int, values: Floats) -> Floats:

@@ -177,7 +177,8 @@ class Commands:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
         fitted = yield from self._sound('refine', refined, session.units, session.name,
-                                        session.sensor.present, thermometer_words(session))
+                                        session.sensor.present, thermometer_words(session),
+                                        session.own)
         session.sensor.guide.follow(fitted.planned)
         return (yield from self._use_fit(fitted, offered=offered))
 

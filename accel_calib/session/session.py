@@ -26,7 +26,7 @@ from .guidance import next_action
 from .live_capture import Change
 from .sensor import Sensor, title
 from .sensor_files import load, Loaded, SensorFiles
-from .settings import CalibratorSettings
+from .settings import CalibratorSettings, own_effects
 from .store import Store, writing_advice
 from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
 from .work import plan_for, rated, result_of
@@ -104,6 +104,8 @@ class Session:
         Why a column of the parameter `context` does not arrive, for the log.
     imus, thermometers : tuple of str
         Topics with messages of Imus and of temperatures that other nodes publish.
+    own : tuple of str
+        Names of the own effects of the user.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     computing : int
@@ -136,6 +138,7 @@ class Session:
         self.enabled, self.still, self.still_since = True, False, math.nan
         self.computing, self.ended = 0, False
         _check_frames(settings)
+        self.own = own_effects(settings)
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._largest = (_LARGEST_NATIVE if self.units.is_native
                          else _LARGEST_G * self.units.per_g)

@@ -17,11 +17,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, Field, field, fields, MISSING, replace
 import math
+from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
 from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated
-from ..effects import MODELS
+from ..effects import know_file, MODELS
 from ..errors import InputError
 from ..table import quantity_key
 from ..units import is_native, STANDARD_GRAVITY, UNIT_NAMES, UnitName
@@ -185,6 +186,9 @@ class CalibratorSettings:
         'ROS_HOME is ~/.ros by default')
     passthrough: bool = parameter(
         False, 'Publish raw messages unchanged until there is a calibration', live=True)
+    also: str = parameter(
+        '', 'Python file with own effects (accel_calib.Effect), which ~/refine tries beside the '
+        'catalogue, and which a calibration that has them needs. It is executed. Empty: none')
     auto_capture: bool = parameter(
         True, 'Capture a pose at each rest of the sensor', live=True)
     auto_fit: bool = parameter(
@@ -223,6 +227,15 @@ class CalibratorSettings:
     web_host: str = parameter(
         '127.0.0.1', 'Address at which the live page is served. 0.0.0.0: to the whole network, '
         'without encryption')
+
+
+def own_effects(settings: CalibratorSettings) -> tuple[str, ...]:
+    """Make the effects of the file `also` known, and return their names; InputError if bad."""
+    try:
+        return know_file(Path(settings.also).expanduser()) if settings.also else ()
+    except (OSError, RuntimeError) as error:
+        raise InputError(f'also is {settings.also}, which cannot be read: {error}',
+                         'correct the parameter') from error
 
 
 def context_topics(settings: CalibratorSettings) -> dict[str, str]:

@@ -169,18 +169,19 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = ''
-            ) -> Fitted:
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = '',
+            own: tuple[str, ...] = ()) -> Fitted:
     """
     Return the refinement of a calibration (None: of a fit).
 
-    An effect far beyond those of parts is refused; `hint` says which quantity may be missing.
+    An effect far beyond those of parts is refused; `hint` says which quantity may be missing. The
+    own effects of these names are tried beside the catalogue.
     RefusedFitError if there are too few poses; InputError if the readings are clearly in another
     unit.
 
     """
     refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
-                        date=now())
+                        date=now(), also=own)
     beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
     if beyond and not refinement.refusal:
         refinement = replace(refinement, refusal=(

@@ -49,6 +49,7 @@ from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import here, writing_advice
 from ..calibrate import NextPose
+from ..effects import know_code, known_code
 from ..errors import AccelCalibError, InputError
 from ..table import Floats
 
@@ -161,7 +162,7 @@ class WorkerProcess:
             self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
-        process.stdin.write(pickle.dumps((function, given)))
+        process.stdin.write(pickle.dumps((known_code(), pickle.dumps((function, given)))))
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
             self._idle = False  # raising the priority needs privileges, so restart it
@@ -207,7 +208,10 @@ def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
     """Read calls; end the process when the node ends, even during a computation."""
     try:
         while True:
-            calls.put(pickle.load(stream))
+            code, call = pickle.load(stream)
+            for each in code.items():  # first, because models in the call may have own effects
+                know_code(*each)
+            calls.put(pickle.loads(call))
     finally:
         os._exit(0)
 

@@ -246,7 +246,7 @@ def _check_known(content: Mapping[str, Any], name: str) -> None:
             raise StoredCalibrationError(
                 f'{name} needs the effect {shown(each)} of the user ({shown(values.get("what"))}),'
                 ' expected its definition', 'use --also FILE.py with the file that defines it, '
-                'also=[effect] in Python')
+                'the parameter also of the node, or also=[effect] in Python')
 
 
 def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) -> None:
