@@ -3,10 +3,11 @@
 
 """Helpers of several tests: recordings, sensors, the command line, and tasks of a session."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 import json
 from pathlib import Path
+import re
 import subprocess
 import sys
 from typing import Any
@@ -19,7 +20,8 @@ from inside import COMMAND, main, Model, model_with
 import numpy as np
 import pytest
 
-DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT.parent / 'shared' / 'data'
 
 
 def data(name: str) -> Path:
@@ -71,6 +73,25 @@ def run_on_small_disk(folder: Path, size_kb: int, *command: object
                           capture_output=True, text=True)
     assert done.returncode != 99, done.stderr
     return done, copy
+
+
+def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, Any]:
+    """
+    Run the Python of a page in this folder, and return its names.
+
+    What the page shows below a snippet must be `printed`. A snippet whose first line is the name of
+    a file is also written to this file.
+
+    """
+    text, names = (ROOT / page).read_text(encoding='utf-8'), dict[str, Any]()
+    pattern = r'^```python\n(.*?)^```(?:\n\n```text\n(.*?)^```)?'
+    for snippet, shown in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+        file = re.match(r'# (\w+\.py)\n', snippet)
+        if file:
+            Path(file[1]).write_text(snippet, encoding='utf-8')
+        exec(compile(snippet, page, 'exec'), names)
+        assert not shown or printed(shown), shown
+    return names
 
 
 def run(*arguments: object) -> int:

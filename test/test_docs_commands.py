@@ -32,6 +32,7 @@ from faults.sample import sample
 from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
+from shared import run_snippets
 
 ROOT = Path(__file__).resolve().parents[1]
 LOGS = ROOT / 'test' / 'data' / 'logs'
@@ -159,13 +160,11 @@ def provide(name):
 @pytest.mark.parametrize('page', [
     page for page in PAGES if '```python' in text_of(page)
     and page not in {'docs/api.md', 'docs/fleet.md'}])  # signatures; test_fleet.py runs it
-def test_snippets_of_python_run(page, tmp_path, monkeypatch):
+def test_snippets_of_python_run_and_print_what_the_page_shows(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for name in re.findall(r"'([\w./]+)'", text_of(page)):
         provide(name)
-    names = {}
-    for snippet in re.findall(r'^```python\n(.*?)^```', text_of(page), re.MULTILINE | re.DOTALL):
-        exec(compile(snippet, page, 'exec'), names)
+    run_snippets(page, lambda shown: shown == capsys.readouterr().out)
 
 
 def test_every_command_without_ros_is_run_by_a_page():
