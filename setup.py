@@ -55,6 +55,8 @@ setup(
         # Flight logs of PX4 and ArduPilot, and Excel files.
         'logs': ['openpyxl>=3.1.2,<4', 'pymavlink>=2.4.41,<2.5', 'pyulog>=1.1,<2',
                  'xlrd>=2.0.1,<3'],
+        # Figures and DataFrames in a notebook.
+        'notebook': ['matplotlib>=3.6,<3.12', 'pandas>=2.1.4,<4'],
         # Allan deviation: accel-calib noise.
         'noise': ['allantools>=2024.4,<2025'],
         # The live page: its server, the QR code of its link, and serial ports.

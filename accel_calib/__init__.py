@@ -5,10 +5,15 @@
 Calibrate an accelerometer in place, with gravity (1 g at rest) as the only reference.
 
 >>> import accel_calib as ac
->>> poses = ac.capture('recording.mcap')            # or ac.read_poses('poses.csv')
->>> calibration = ac.fit(poses, flat=1)
+>>> calibration = ac.calibrate('recording.mcap')    # any log, pose table or DataFrame
+>>> calibration.rating
 >>> calibration.apply(readings)
 >>> calibration.save('calibration.yaml')
+
+or step by step:
+
+>>> poses = ac.capture('recording.mcap')            # or ac.read_poses('poses.csv')
+>>> calibration = ac.fit(poses, flat=1)
 >>> ac.refine(poses, base=calibration)
 
 Data take two paths through the package:
@@ -54,6 +59,7 @@ from types import ModuleType
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .api import calibrate as calibrate
     from .api import Calibration as Calibration
     from .api import capture as capture
     from .api import compare as compare
@@ -71,8 +77,9 @@ if TYPE_CHECKING:
 
 __version__ = '0.1.0'
 
-__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'capture', 'compare',
-           'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibrate', 'capture',
+           'compare', 'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate',
+           'verify']
 
 
 class _Package(ModuleType):
@@ -95,7 +102,7 @@ class _Package(ModuleType):
             super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *__all__})
+        return sorted([*__all__, '__version__'])
 
 
 sys.modules[__name__].__class__ = _Package

@@ -6,36 +6,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from functools import cached_property
 import math
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, overload, TypeVar
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import calibrate
+from .calibrate import Calibration as _Calibration
 from .calibrate import FrameName, Method, mounting_of, Verification
+from .calibrate import verify as verify_calibration
 from .compare import compare as compare_calibrations
 from .compare import Comparison
 from .effects import know, model_with, simulate_poses, simulate_recording
 from .effects import OwnEffect as Effect
 from .errors import InputError
 from .finding import Finding
-from .findings import rate, Rating
+from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .intake import poses_of, samples_again, still_poses
-from .logs import LogOptions, open_log, read_log
+from .logs import are_untimed_samples, Frame, LogOptions, open_log, read_log
 from .logs import read_recording as read_whole_recording
-from .pipeline import calibrated, Plan
+from .pipeline import calibrated, Flat, Plan
 from .refine import refine as find_effects
 from .refine import Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
     check_units,
-    columns_from,
+    check_values,
+    data_frame,
     Floats,
     LARGEST,
     numbered,
@@ -46,14 +48,13 @@ from .table import (
 from .text import counted, now
 from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
 
-__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'capture', 'compare',
-           'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate', 'verify']
+__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibrate', 'capture',
+           'compare', 'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate',
+           'verify']
 
 Source = str | PathLike[str]
 Data = Any
-"""A table, an (n, 3) array of readings, or a DataFrame with the column names of a pose table."""
-
-_Table = TypeVar('_Table', bound=Table)
+"""A table, an (n, 3) array of readings, or a DataFrame with the column names of any log."""
 
 _MOST_ROWS = 10_000_000
 """Largest number of simulated rows, which take some 2 GB."""
@@ -61,9 +62,11 @@ _MOST_ROWS = 10_000_000
 _LONGEST_NUMBER = 40
 
 
-class Calibration(calibrate.Calibration):
+class Calibration(_Calibration):
     """
     A fitted model that corrects readings.
+
+    Two calibrations are equal if all but their dates are.
 
     Attributes
     ----------
@@ -99,6 +102,44 @@ class Calibration(calibrate.Calibration):
     def findings(self) -> tuple[Finding, ...]:
         """Return what is worth knowing, that which decides the rating first."""
         return self.rating.findings
+
+    def to_dataframe(self) -> Any:
+        """
+        Return the figures as a pandas DataFrame: ``label``, ``unit``, ``value`` and ``sd`` by key.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+
+        """
+        found = [asdict(each) for each in figures_of(self)]
+        keys = [each.pop('key') for each in found]
+        return data_frame({name: [each[name] for each in found] for name in found[0]}, keys)
+
+    def plot(self, axes: Any = None) -> Any:
+        """
+        Draw the residual of each pose without and with the calibration.
+
+        Parameters
+        ----------
+        axes : matplotlib axes, optional
+            Where to draw; by default a new figure.
+
+        Returns
+        -------
+        matplotlib axes
+            The axes; ``axes.figure`` is the figure.
+
+        Raises
+        ------
+        InputError
+            If matplotlib is not installed.
+
+        """
+        from .report import plot_residuals
+
+        return plot_residuals(self, axes)
 
     def save(self, path: Source) -> None:
         """
@@ -239,7 +280,7 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
     Parameters
     ----------
     recording : str, Path, Recording or DataFrame
-        The samples, with ``time``.
+        The samples, with times. A DataFrame has the columns of any log.
     units : {'m/s2', 'g', 'native'}, optional
         Unit of the readings; by default the unit of the recording, or m/s².
     gravity : float
@@ -248,7 +289,8 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         As in `read_recording`.
     **settings
         Fields of `accel_calib.capture.CaptureSettings`, such as ``min_dwell=2.0``;
-        ``still_std_max`` is in the unit of the readings.
+        ``still_std_max`` is in the unit of the readings. Also fields of
+        `accel_calib.logs.LogOptions`, such as ``columns={'ax': 'acc_x'}``.
 
     Returns
     -------
@@ -262,19 +304,65 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         out of range.
 
     """
-    if isinstance(recording, str | PathLike):
-        path = Path(recording)
-        options = LogOptions(units=units or '', gravity=gravity, topic=topic, sensor=sensor)
-        with open_log(path, options) as log:
-            known = log.units
-            found, _ = still_poses(str(path), known, settings, log.blocks,
-                                   lambda: samples_again(path, options))
-    else:
-        samples = _table(recording, Recording, 'the recording')
-        known = _units(units, gravity, samples.units, 'the recording')
-        check_units(samples, known)
-        found, _ = still_poses('the recording', known, settings, samples, lambda: samples)
+    log = _log(recording)
+    if isinstance(recording, Recording):
+        return _captured(recording, units, gravity, settings)
+    if log is None:
+        raise InputError(f'found {type(recording).__name__}, expected a recording',
+                         'pass a path, a Recording, or a DataFrame with times')
+    options, asked = _options(units, gravity, {'topic': topic, 'sensor': sensor, **settings})
+    with open_log(log, options) as opened:
+        known = opened.units
+        found, _ = still_poses(str(log), known, asked, opened.blocks,
+                               lambda: samples_again(log, options))
     return replace(found.poses, units=known.name)
+
+
+def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None = None,
+              gravity: float = STANDARD_GRAVITY, flat: Flat = None,
+              nose_down: int | None = None, frame: FrameName = 'ros', sensor: str = '',
+              refined: bool = True, also: Sequence[Effect] = (), **settings: Any) -> Calibration:
+    """
+    Calibrate from any log: read or capture the poses, fit, find further effects, and level.
+
+    Parameters
+    ----------
+    log : str, Path, Poses, Recording, DataFrame or (n, 3) array
+        A recording or a pose table. A DataFrame has the columns of any log.
+    units, gravity
+        As in `fit`.
+    flat : int, 'first' or 'last', optional
+        Pose with the robot level: its row, 1-based, or the first or last pose.
+    nose_down, frame
+        As in `fit`.
+    sensor : str
+        Name of the sensor; for a bag, frame_id of the messages to read.
+    refined : bool
+        Whether to look for effects beyond offset and gain, and to add them.
+    also : sequence of Effect
+        Own effects, which are tried beside those of the catalogue.
+    **settings
+        As in `capture`.
+
+    Returns
+    -------
+    Calibration
+        The calibration; its `rating` says whether it is good.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses do not determine the model, or the result is not plausible.
+    InputError
+        If the log cannot be read, has no still stretch, or a setting is out of range.
+    OSError
+        If the file cannot be read.
+
+    """
+    plan = Plan(refined=refined, flat=flat, nose_down=nose_down, frame=frame, sensor=sensor,
+                also=know(also))
+    poses = _poses(log, units, gravity, {'sensor': sensor, **settings})
+    return _calibrated(poses, units, gravity, plan)
 
 
 def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
@@ -287,9 +375,9 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     Parameters
     ----------
     poses : str, Path, Poses, DataFrame or (n, 3) array
-        The poses.
+        The poses; a recording is captured.
     units : {'m/s2', 'g', 'native'}, optional
-        Unit of the readings; by default the unit of the poses, or m/s².
+        Unit of the readings; by default that of the poses, or m/s² for an array.
     gravity : float
         Local gravity [m/s²].
     model : {'auto', '4', '7', '9', '10', '12'}
@@ -320,11 +408,9 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
         If the readings are clearly in another unit, or a row does not exist.
 
     """
-    table = _poses(poses, units, gravity)
-    known = _units(units, gravity, table.units, 'the pose table')
     plan = Plan(model=model, method=method, refined=False, flat=flat, nose_down=nose_down,
                 frame=frame, sensor=sensor)
-    return _public(calibrated(table, known, plan).calibration)
+    return _calibrated(_poses(poses, units, gravity), units, gravity, plan)
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
@@ -363,7 +449,7 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
 
     """
     names = know(also)
-    if isinstance(base, calibrate.Calibration):
+    if isinstance(base, _Calibration):
         table = _poses(poses, _asked(units, base), base.units.per_g)
         stored = _in_units_of(base, table, units)
         found = find_effects(table, stored.units, base=stored, sensor=sensor, date=now(),
@@ -376,7 +462,7 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
     return replace(found, calibration=_public(found.calibration))
 
 
-def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibration, *,
+def verify(poses: Source | Poses | Data, calibration: Source | _Calibration, *,
            units: UnitName | None = None) -> Verification:
     """
     Compute the residuals of a calibration on poses that it was not fitted to.
@@ -403,15 +489,15 @@ def verify(poses: Source | Poses | Data, calibration: Source | calibrate.Calibra
         only one of calibration and poses is in native units.
 
     """
-    stored = (calibration if isinstance(calibration, calibrate.Calibration)
+    stored = (calibration if isinstance(calibration, _Calibration)
               else load(calibration))
     table = _poses(poses, _asked(units, stored), stored.units.per_g)
     known = _in_units_of(stored, table, units)
     check_units(table, known.units)
-    return calibrate.verify(known, table)
+    return verify_calibration(known, table)
 
 
-def compare(calibrations: Sequence[Source | calibrate.Calibration]) -> Comparison:
+def compare(calibrations: Sequence[Source | _Calibration]) -> Comparison:
     """
     Test whether calibrations of one sensor agree within their uncertainties.
 
@@ -431,7 +517,7 @@ def compare(calibrations: Sequence[Source | calibrate.Calibration]) -> Compariso
         If the calibrations cannot be compared.
 
     """
-    return compare_calibrations([each if isinstance(each, calibrate.Calibration) else load(each)
+    return compare_calibrations([each if isinstance(each, _Calibration) else load(each)
                                  for each in calibrations])
 
 
@@ -550,29 +636,60 @@ def _directions(count: int) -> Floats:
     return np.vstack([[[0.0, 0.0, 1.0]], mixed])
 
 
-def _poses(given: Source | Poses | Data, units: str | None = None,
-           gravity: float = STANDARD_GRAVITY) -> Poses:
+def _poses(given: Source | Poses | Recording | Data, units: UnitName | None = None,
+           gravity: float = STANDARD_GRAVITY, settings: Mapping[str, Any] = {}) -> Poses:
     """Return poses from a log, a table, an array or a DataFrame; a recording is captured."""
+    log = _log(given)
+    if log is not None:
+        return poses_of(log, *_options(units, gravity, settings)).poses
+    if isinstance(given, Recording):
+        return _captured(given, units, gravity, settings)
+    return given if isinstance(given, Poses) else _array(given)
+
+
+def _log(given: Source | Poses | Recording | Data) -> Path | Frame | None:
+    """Return a path or a DataFrame as a log; None for a table or an array."""
     if isinstance(given, str | PathLike):
-        known: Any = units or ''
-        return poses_of(Path(given), LogOptions(units=known, gravity=gravity)).poses
-    return _table(given, Poses, 'the pose table')
+        return Path(given)
+    return Frame(given) if hasattr(given, 'columns') and not isinstance(given, Table) else None
 
 
-def _table(given: Data, kind: type[_Table], source: str) -> _Table:
-    """Return a table from a table, an array or a DataFrame."""
-    if isinstance(given, kind):
-        return given
-    needed = ('time', 'reading') if kind is Recording else ('reading',)
-    if hasattr(given, 'columns') and not isinstance(given, Table):
-        columns = columns_from({str(name): given[name] for name in given.columns}, needed, source)
-        return kind(columns, numbered(columns))
-    readings = np.asarray(given, float)
-    if readings.ndim != 2 or readings.shape[1] != 3 or kind is Recording:
-        raise InputError(f'{source} has shape {readings.shape}, expected (n, 3) readings, or '
-                         'columns by name', 'pass a table or a DataFrame')
-    columns = columns_from(dict(zip(('ax', 'ay', 'az'), readings.T)), needed, source)
-    return kind(columns, numbered(columns))
+def _options(units: UnitName | None, gravity: float, settings: Mapping[str, Any]
+             ) -> tuple[LogOptions, dict[str, Any]]:
+    """Return how to read a log, and the settings of the capture."""
+    of_log = {each.name for each in fields(LogOptions)} & settings.keys()
+    options = LogOptions(units=units or '', gravity=gravity,
+                         **{name: settings[name] for name in of_log})
+    return options, {name: settings[name] for name in settings if name not in of_log}
+
+
+def _captured(samples: Recording, units: UnitName | None, gravity: float,
+              settings: Mapping[str, Any]) -> Poses:
+    known = _units(units, gravity, samples.units, 'the recording')
+    check_units(samples, known)
+    _, asked = _options(units, gravity, settings)
+    found, _ = still_poses('the recording', known, asked, samples, lambda: samples)
+    return replace(found.poses, units=known.name)
+
+
+def _array(given: Data) -> Poses:
+    """Return an (n, 3) array of readings as poses."""
+    columns = {'reading': np.asarray(given, float)}
+    shape = columns['reading'].shape
+    if len(shape) != 2 or shape[1] != 3:
+        raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
+                         'pass such an array, a table or a DataFrame')
+    check_values(columns, 'the array')
+    if are_untimed_samples(columns):
+        raise InputError(f'the {shape[0]} rows of the array look like samples of a recording, '
+                         'expected one row for each pose', 'pass a Recording, or a DataFrame with '
+                         'a column time')
+    return Poses(columns, numbered(columns))
+
+
+def _calibrated(poses: Poses, units: UnitName | None, gravity: float, plan: Plan) -> Calibration:
+    known = _units(units, gravity, poses.units, 'the pose table')
+    return _public(calibrated(poses, known, plan).calibration)
 
 
 def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> Units:
@@ -583,13 +700,13 @@ def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> 
     return units_of(name, gravity)
 
 
-def _asked(units: UnitName | None, calibration: calibrate.Calibration) -> UnitName | None:
+def _asked(units: UnitName | None, calibration: _Calibration) -> UnitName | None:
     """Return the unit to read poses in: native for a native calibration, else recognised."""
     return units or ('native' if calibration.units.is_native else None)
 
 
-def _in_units_of(calibration: calibrate.Calibration, table: Table, asked: UnitName | None
-                 ) -> calibrate.Calibration:
+def _in_units_of(calibration: _Calibration, table: Table, asked: UnitName | None
+                 ) -> _Calibration:
     """Return a calibration in the unit that the caller or the table states, or that it shows."""
     if asked is not None:
         _units(asked, STANDARD_GRAVITY, table.units, 'the pose table')
@@ -597,6 +714,6 @@ def _in_units_of(calibration: calibrate.Calibration, table: Table, asked: UnitNa
     return calibration.in_units_of(table)
 
 
-def _public(calibration: calibrate.Calibration) -> Calibration:
+def _public(calibration: _Calibration) -> Calibration:
     return Calibration(**{each.name: getattr(calibration, each.name)
-                          for each in fields(calibrate.Calibration)})
+                          for each in fields(_Calibration)})

@@ -51,6 +51,16 @@ class InputError(AccelCalibError):
     """A file, a column or a number is not valid."""
 
 
+@contextmanager
+def needing(libraries: str, what: str) -> Iterator[None]:
+    """Turn the ImportError of an optional library, or of several, into an InputError."""
+    try:
+        yield
+    except ImportError as err:
+        raise InputError(f'{libraries.split()[0]} is not installed, but {what} needs it ({err})',
+                         f'run pip install {libraries}') from err
+
+
 class RefusedFitError(AccelCalibError):
     """The poses do not determine the model, or the result is not plausible."""
 

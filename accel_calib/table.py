@@ -14,19 +14,20 @@ letters and digits.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 import re
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import InputError, needing
 from .text import counted, table
 from .units import Floats, STANDARD_GRAVITY, UnitName, Units
 
-__all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Recording', 'Table', 'check_values',
-           'column_of', 'columns_from', 'is_quantity', 'numbered', 'present', 'quantity_key']
+__all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Record', 'Recording', 'Table',
+           'check_values', 'column_of', 'columns_from', 'data_frame', 'is_quantity', 'numbered',
+           'present', 'quantity_key']
 
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
@@ -99,14 +100,47 @@ def column_of(key: str) -> Column:
     return COLUMNS.get(key) or Column((key,), '', key.replace('_', ' '))
 
 
+class Record:
+    """
+    Base of frozen records with arrays, which are equal if all values that they compare are.
+
+    Arrays can be changed, so that such a record has no hash, as they have none.
+
+    """
+
+    def __eq__(self, other: object) -> bool:
+        related = isinstance(other, type(self)) or isinstance(self, type(other))
+        return related and _same_fields(self, other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _same_fields(one: Any, other: Any) -> bool:
+    return all(_same(getattr(one, each.name), getattr(other, each.name))
+               for each in fields(one) if each.compare)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two values are equal; NaN is equal to NaN."""
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=one.dtype.kind == 'f')
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if is_dataclass(one) and not isinstance(one, Record):
+        return type(one) is type(other) and _same_fields(one, other)
+    return bool(one == other or (one != one and other != other))
+
+
 _Self = TypeVar('_Self', bound='Table')
 
 _PREVIEW_ROWS = 20
 """Number of rows in the preview of a notebook."""
 
 
-@dataclass(frozen=True, repr=False)
-class Table:
+@dataclass(frozen=True, repr=False, eq=False)
+class Table(Record):
     """
     Rows of readings and context, in order.
 
@@ -153,7 +187,7 @@ class Table:
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table, for notebooks."""
-        keys = [*(key for key in COLUMNS if key in self), *self.quantities]
+        keys = self._in_order
         names = [name for key in keys for name in column_of(key).names]
         first = self.take(slice(_PREVIEW_ROWS))
         cells = [[str(row)] for row in first.row]
@@ -163,6 +197,28 @@ class Table:
                          for each in values]
         more = f'<p>{self!r}</p>' if len(self) > _PREVIEW_ROWS else ''
         return table(['row', *names], cells) + more
+
+    @property
+    def _in_order(self) -> list[str]:
+        return [*(key for key in COLUMNS if key in self), *self.quantities]
+
+    def to_dataframe(self) -> Any:
+        """
+        Return the rows as a pandas DataFrame, with the column names of a file.
+
+        The index is `row`; ``attrs`` holds the unit of the readings and the sensor.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+
+        """
+        parts = ((name, values) for key in self._in_order for name, values in zip(
+            column_of(key).names, np.atleast_2d(self[key].T), strict=True))
+        made = data_frame(dict(parts), self.row)
+        made.attrs |= {'units': self.units, 'sensor': self.sensor}
+        return made
 
     @property
     def reading(self) -> Floats:
@@ -202,6 +258,13 @@ class Recording(Table):
         super().__post_init__()
         if 'time' not in self.columns:
             raise ValueError('the recording has no times, expected the column time')
+
+
+def data_frame(columns: Mapping[str, Any], index: Any) -> Any:
+    """Return columns as a DataFrame; raise InputError if pandas is not installed."""
+    with needing('pandas', 'a DataFrame'):
+        import pandas
+    return pandas.DataFrame(columns, index=index)
 
 
 def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:

@@ -21,8 +21,8 @@ from accel_calib.compare.comparison import Run
 from accel_calib.refine import PlannedPose, PosePlan, Stage, Step
 from accel_calib.units import Units
 
-FUNCTIONS = ('capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify', 'compare',
-             'simulate', 'load')
+FUNCTIONS = ('calibrate', 'capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify',
+             'compare', 'simulate', 'load')
 RECORDS = ('Poses', 'Recording', 'Calibration', 'Refinement', 'Effect')
 """The names of ``accel_calib.__all__``, in the order of the page."""
 
@@ -38,17 +38,17 @@ _OPENING = """\
 <!-- Made by `python docs/tables.py` from the docstrings; do not edit. -->
 
 The functions are those of `import accel_calib as ac`. A path is a `str` or a `Path`. Poses are
-`Poses`, the path of a [pose table](files.md#pose-table), a DataFrame with the column names of such
-a table, or an (n, 3) array of readings.
+`Poses`, the path of a [pose table](files.md#pose-table), a DataFrame with the columns of
+[any log](logs.md), or an (n, 3) array of readings. Recordings are captured.
 
 ## Functions"""
 
 _RECORDS = """
 ## Records
 
-Records are frozen: no function changes them. `Poses` and `Recording` are tables: they support
-`len(poses)`, `'temperature' in poses` and `poses['temperature']`. The first column of
-[this table](files.md#pose-table) lists the names."""
+Records are frozen: no function changes them. Two are equal if all their values are. `Poses` and
+`Recording` are tables: they support `len(poses)`, `'temperature' in poses` and
+`poses['temperature']`. The first column of [this table](files.md#pose-table) lists the names."""
 
 _OTHERS = """
 ## Records in results and settings

@@ -3,7 +3,9 @@
 
 """The public face: what users have in hand is accepted, and results are as the docs state."""
 
+from dataclasses import replace
 import importlib
+from pathlib import Path
 import pickle
 import subprocess
 import sys
@@ -40,7 +42,7 @@ def frame_of(poses):
 
 
 def test_names_of_the_package_are_its_public_face():
-    assert set(ac.__all__) <= set(dir(ac))
+    assert [name for name in dir(ac) if not name.startswith('_')] == sorted(ac.__all__)
     for name in ac.__all__:
         assert getattr(ac, name).__doc__
     with pytest.raises(AttributeError, match='no attribute'):
@@ -48,9 +50,12 @@ def test_names_of_the_package_are_its_public_face():
 
 
 def test_functions_stay_when_a_folder_of_their_name_is_imported():
-    for name in ('capture', 'compare', 'refine'):
+    code = ('import accel_calib as ac, accel_calib.{0}; from accel_calib import {0} as one; '
+            'assert one is ac.{0} and callable(one)')
+    for name in ('calibrate', 'capture', 'compare', 'refine'):
         importlib.import_module(f'accel_calib.{name}')
         assert callable(getattr(ac, name))
+        subprocess.run([sys.executable, '-c', code.format(name)], check=True, timeout=60)
 
 
 @pytest.mark.parametrize(('imported', 'without'), [
@@ -109,6 +114,137 @@ def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
     assert len(ac.capture(recording, min_dwell=2.0)) == 6
     with pytest.raises(InputError, match='has no still stretch'):
         ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
+
+
+LOGS = Path(__file__).parent / 'data' / 'logs'
+
+
+@pytest.mark.parametrize('name', ['esp32/micros.csv', 'phyphox/semicolon_point.csv',
+                                  'sensor-logger/android/TotalAcceleration.csv'])
+def test_a_data_frame_of_samples_is_read_as_the_file_is(name):
+    pandas = pytest.importorskip('pandas')
+    path = LOGS / name
+    frame = pandas.read_csv(path, sep=None, engine='python')
+    expected = ac.capture(path)
+    for given in (frame, frame.set_index(frame.columns[0])):
+        np.testing.assert_allclose(ac.capture(given).reading, expected.reading, rtol=1e-9)
+    assert ac.fit(frame) == ac.fit(path)  # the samples are captured, not fitted
+
+
+def test_a_data_frame_has_times_as_dates_too():
+    pandas = pytest.importorskip('pandas')
+    recording = ac.simulate(SENSOR, recording=True, poses=6, seed=3)
+    frame = recording.to_dataframe()
+    start = pandas.Timestamp('2026-01-31T23:59:50', tz='UTC')
+    frame.index = start + pandas.to_timedelta(frame.pop('time'), unit='s')
+    for given in (frame, frame.tz_localize(None)):
+        np.testing.assert_allclose(ac.capture(given).reading, ac.capture(recording).reading,
+                                   atol=2e-3)
+
+
+def test_samples_without_times_are_refused():
+    pandas = pytest.importorskip('pandas')
+    recording = ac.simulate(SENSOR, recording=True, poses=6, seed=3)
+    frame = pandas.DataFrame(recording.reading, columns=['ax', 'ay', 'az'])
+    with pytest.raises(InputError, match='look like samples of a recording'):
+        ac.fit(frame)
+    with pytest.raises(InputError, match='look like samples of a recording'):
+        ac.fit(recording.reading)
+    assert len(ac.capture(frame, rate=100.0)) == 6
+
+
+def test_a_log_is_calibrated_in_one_call(tmp_path):
+    recording = ac.simulate(SENSOR, recording=True, poses=20, seed=3)
+    path = tmp_path / 'log.csv'
+    write_table(path, recording)
+    found = [ac.calibrate(given, flat='first', sensor='imu_link')
+             for given in (path, recording, ac.capture(recording), recording.to_dataframe())]
+    for calibration in found:
+        assert isinstance(calibration, ac.Calibration)
+        assert calibration.rating.name == 'GOOD'
+        assert calibration.findings == calibration.rating.findings
+        assert (calibration.sensor, calibration.is_levelled) == ('imu_link', True)
+        np.testing.assert_allclose(calibration.matrix, MATRIX, atol=2e-3)
+
+
+def test_calibrate_looks_for_effects_unless_told_otherwise():
+    warm = {'offset': [0.02, -0.01, 0.03], 'offset_temperature': [1e-3, 2e-3, -1e-3]}
+    poses = ac.simulate(warm, poses=40, temperature=(10.0, 50.0), noise=1e-3, seed=1)
+    assert 'offset_temperature' in ac.calibrate(poses).model.effects
+    assert 'offset_temperature' not in ac.calibrate(poses, refined=False).model.effects
+
+
+def test_a_flat_pose_levels_a_calibration_with_effects_of_its_context():
+    warm = {**SENSOR, 'offset_temperature': [1e-3, 2e-3, -1e-3]}
+    poses = ac.simulate(warm, poses=40, temperature=(10.0, 50.0), noise=1e-3,
+                        mounting=(3.0, -5.0, 0.0), seed=1)
+    found = ac.calibrate(poses, flat='first')
+    assert 'offset_temperature' in found.model.effects
+    up = found.apply(poses.reading[0], temperature=10.0)
+    np.testing.assert_allclose(up / 9.80665, [0.0, 0.0, 1.0], atol=3e-3)
+
+
+def test_calibrate_takes_the_options_of_reading_and_of_capture():
+    recording = ac.simulate(SENSOR, recording=True, poses=12, seed=3)
+    frame = recording.to_dataframe().rename(columns={'ax': 'p', 'ay': 'q', 'az': 'r'})
+    named = {'ax': 'p', 'ay': 'q', 'az': 'r'}
+    assert len(ac.calibrate(frame, columns=named, min_dwell=2.0).poses) == 12
+    with pytest.raises(InputError, match='min_dwel'):
+        ac.calibrate(frame, columns=named, min_dwel=2.0)
+
+
+def test_a_table_becomes_a_data_frame_and_is_read_again(poses, calibration):
+    pytest.importorskip('pandas')
+    frame = poses.to_dataframe()
+    assert {'ax', 'ay', 'az', 'std_x', 'count'} <= {*frame.columns}
+    assert [*frame.index] == [*poses.row]
+    np.testing.assert_array_equal(frame['ay'], poses.reading[:, 1])
+    assert ac.fit(frame, flat=1, sensor='imu_link') == calibration
+    in_g = ac.simulate(SENSOR, seed=1, units='g')
+    assert ac.fit(in_g.to_dataframe()).units.name == 'g'
+
+
+def test_the_figures_of_a_calibration_become_a_data_frame(calibration):
+    pytest.importorskip('pandas')
+    frame = calibration.to_dataframe()
+    assert [*frame.columns] == ['label', 'unit', 'value', 'sd']
+    offsets = frame.loc[['offset.x', 'offset.y', 'offset.z']]
+    np.testing.assert_array_equal(offsets['value'], calibration.offset)
+    np.testing.assert_array_equal(offsets['sd'], calibration.offset_sd)
+    assert {*offsets['unit']} == {'m/s²'}
+    assert frame.loc['rms_after_mg', 'value'] == calibration.quality.rms_after_mg
+
+
+def test_the_residuals_of_a_calibration_are_drawn(calibration):
+    matplotlib = pytest.importorskip('matplotlib')
+    matplotlib.use('Agg')
+    axes = calibration.plot()
+    before, after = (line.get_ydata() for line in axes.get_lines()[:2])
+    assert len(before) == len(after) == len(calibration.used_poses)
+    rms = [np.sqrt(np.mean(np.square(each))) for each in (before, after)]
+    np.testing.assert_allclose(rms, [calibration.quality.rms_before_mg,
+                                     calibration.quality.rms_after_mg], rtol=0.05)
+    assert calibration.plot(axes) is axes
+    assert axes.get_xlabel() == 'row of the pose'
+    from matplotlib import pyplot
+    pyplot.close(axes.figure)
+
+
+def test_calibrations_are_equal_if_all_values_are(calibration, poses, tmp_path):
+    calibration.save(tmp_path / 'calibration.yaml')
+    again = ac.load(tmp_path / 'calibration.yaml')
+    assert calibration == again
+    assert again == calibration.in_units('m/s2')
+    assert poses == ac.simulate(SENSOR, seed=1)
+    for other in (ac.fit(poses, sensor='imu_link'), ac.fit(poses, flat=1),
+                  ac.fit(poses.take(slice(1, None)), sensor='imu_link'), None, 'GOOD'):
+        assert calibration != other
+    assert calibration in [None, again]
+    assert poses != ac.simulate(SENSOR, seed=2)
+    later = replace(calibration, date='2030-01-01T00:00:00+00:00')
+    assert later == calibration  # the same poses fitted later
+    with pytest.raises(TypeError, match='unhashable'):
+        hash(calibration)
 
 
 def test_records_are_shown_in_a_line_and_as_html(calibration, poses):

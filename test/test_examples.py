@@ -3,6 +3,7 @@
 
 """The examples run without the repository as working folder, and print the expected result."""
 
+import json
 import os
 from pathlib import Path
 import re
@@ -13,13 +14,22 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-EXAMPLES = sorted(path.name for path in (ROOT / 'examples').glob('*.py'))
+EXAMPLES = sorted(path.name for path in (ROOT / 'examples').iterdir() if path.is_file())
+
+
+def text_of(name):
+    """Return the code of an example: of a notebook, that of all its cells."""
+    text = (ROOT / 'examples' / name).read_text(encoding='utf-8')
+    if not name.endswith('.ipynb'):
+        return text
+    return '\n'.join(''.join(cell['source']) for cell in json.loads(text)['cells']
+                     if cell['cell_type'] == 'code')
 
 
 def output_of(name, folder, *written):
     """Run an example in an empty folder, and return its output; it may write these files."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    done = subprocess.run([sys.executable, ROOT / 'examples' / name, *written], cwd=folder,
+    done = subprocess.run([sys.executable, '-', *written], cwd=folder, input=text_of(name),
                           text=True, env=environment, capture_output=True, timeout=120,
                           check=False)
     assert done.returncode == 0, done.stderr
@@ -53,9 +63,27 @@ def test_error_falls_from_model_to_model_and_is_drawn(tmp_path):
     assert paths[1].read_bytes().startswith(b'\x89PNG')
 
 
+def test_the_notebook_runs_from_top_to_bottom(tmp_path):
+    pytest.importorskip('matplotlib')
+    pytest.importorskip('pandas')
+    output = output_of('calibrate.ipynb', tmp_path)
+    assert 'offset_temperature' in text_of('calibrate.ipynb')
+    before, after = map(float, re.search(r'residual (\S+) -> (\S+) mg', output).groups())
+    assert before > 20.0
+    assert after < 0.5
+
+
+def test_the_notebook_holds_no_output():
+    notebook = json.loads((ROOT / 'examples' / 'calibrate.ipynb').read_text(encoding='utf-8'))
+    code = [cell for cell in notebook['cells'] if cell['cell_type'] == 'code']
+    assert code
+    assert not [cell for cell in code if cell['outputs'] or cell['execution_count']]
+    assert notebook['nbformat'] == 4
+
+
 @pytest.mark.parametrize('name', EXAMPLES)
 def test_examples_use_nothing_but_the_public_face(name):
-    text = (ROOT / 'examples' / name).read_text(encoding='utf-8')
+    text = text_of(name)
     imports = re.findall(r'^(?:from|import) .*', text, re.MULTILINE)
     own = [line for line in imports if 'accel_calib' in line]
     assert own == ['import accel_calib as ac']

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from typing import get_args, Literal, TypeVar
@@ -29,7 +29,7 @@ from ..effects import (
 )
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
-from ..table import Floats, Poses, Table
+from ..table import Floats, Poses, Record, Table
 from ..text import table, with_sd
 from ..units import UnitName, Units, units_of
 
@@ -107,10 +107,12 @@ class Rejected:
     kind: RejectedKind = 'implausible'
 
 
-@dataclass(frozen=True, repr=False)
-class Calibration:
+@dataclass(frozen=True, repr=False, eq=False)
+class Calibration(Record):
     """
     A fitted model that corrects readings.
+
+    Two calibrations are equal if all but their dates are.
 
     Parameters
     ----------
@@ -156,7 +158,7 @@ class Calibration:
     units: Units
     sensor: str
     frame: FrameName
-    date: str
+    date: str = field(compare=False)
     covariance: Floats
     quality: Quality
     poses: Poses
@@ -168,6 +170,8 @@ class Calibration:
     noise: SampleNoise | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'poses', replace(
+            self.poses, units=self.units.name, sensor=self.sensor))
         size, stated = len(self.model.vector), self.model.stated
         if self.covariance.shape == (np.sum(stated), np.sum(stated)) and not np.all(stated):
             covariance = np.zeros((size, size))

@@ -43,7 +43,9 @@ from typing import Any
 import numpy as np
 
 from .calibration import Calibration, FrameName
+from .context import with_history
 from .known_orientation import wiring
+from .quality import in_g
 from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError
 from ..finding import Finding, without
@@ -241,15 +243,20 @@ def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat
             raise InputError('there is a row with the nose down but no flat row, expected both',
                              'set both rows, or only the flat row')
         return replace(calibration, frame=frame)
-    levelled = level(calibration, _reading_in(poses, flat), frame)
-    return levelled if nose_down is None else set_heading(levelled, _reading_in(poses, nose_down))
+    reading, context = _pose_in(poses, flat, calibration)
+    levelled = level(calibration, reading, frame, context)
+    if nose_down is None:
+        return levelled
+    return set_heading(levelled, *_pose_in(poses, nose_down, calibration))
 
 
-def _reading_in(poses: Poses, row: int) -> Floats:
+def _pose_in(poses: Poses, row: int, calibration: Calibration) -> tuple[Floats, Context]:
+    """Return the reading of a row, and its context in g."""
     if not 1 <= row <= len(poses):
         raise InputError(f'row {row} is not in the table, expected 1 to {len(poses)}',
                          'correct the row number')
-    return poses.reading[row - 1]
+    known = with_history(in_g(poses, calibration.units), calibration.model)
+    return poses.reading[row - 1], known.take(slice(row - 1, row)).columns
 
 
 def level(calibration: Calibration, reading: Floats, frame: FrameName,

@@ -50,7 +50,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..table import Floats, Poses
+from ..table import Floats, Poses, Record
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -77,8 +77,8 @@ _MAD_FEW = (1.0, 1.0, 1.196, 1.495, 1.363, 1.206, 1.200, 1.140, 1.129, 1.107)
 """Factors on the median absolute deviation of 0 to 9 values."""
 
 
-@dataclass(frozen=True)
-class GyroBias:
+@dataclass(frozen=True, eq=False)
+class GyroBias(Record):
     """
     Mean angular rate of a gyro at rest.
 
@@ -140,8 +140,8 @@ class GyroBias:
         return self.bias + self.slope * (held - self.temperature)
 
 
-@dataclass(frozen=True)
-class SampleNoise:
+@dataclass(frozen=True, eq=False)
+class SampleNoise(Record):
     """
     White noise of one sample at rest.
 

@@ -45,7 +45,7 @@ from .form import (
 )
 from .thermal import Lag
 from ..errors import AccelCalibError, InputError
-from ..table import column_of, Floats, is_quantity
+from ..table import column_of, Floats, is_quantity, Record
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
@@ -311,8 +311,8 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
     return found
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, eq=False)
+class Model(Record):
     """
     Effects and their values.
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reader of logs: text of any dialect, bags, and flight logs of PX4 and ArduPilot.
+Reader of logs: text of any dialect, bags, flight logs of PX4 and ArduPilot, and DataFrames.
 
 `open_log` recognises the format, the columns and the units. What it assumed is one line,
 `OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `serialized` defines the places of
@@ -13,8 +13,9 @@ the fields in serialized messages, and `tables` writes our own tables.
 from .bag import Bag, damage_as_input_error, is_bag, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
+from .containers import Frame
 from .formats import NAMES
-from .quantities import are_samples
+from .quantities import are_samples, are_untimed_samples
 from .read import LineReader, Log, open_log, OpenLog, Progress, read_log, read_recording
 from .serialized import (
     ACCELERATION,
@@ -45,8 +46,8 @@ from .tables import read_poses, write_blocks, write_table
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
            'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'STAMP', 'STAMP_AT', 'THREE', 'Bag',
-           'ContextTopics', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages', 'OpenLog',
-           'Progress', 'are_samples', 'context_of', 'damage_as_input_error', 'doubles_at',
-           'is_bag', 'joined', 'layout_of', 'layout_with', 'open_bag', 'open_log', 'put_doubles',
-           'read_log', 'read_poses', 'read_recording', 'renamed', 'samples_of', 'write_blocks',
-           'write_table']
+           'ContextTopics', 'Frame', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages',
+           'OpenLog', 'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
+           'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of', 'layout_with',
+           'open_bag', 'open_log', 'put_doubles', 'read_log', 'read_poses', 'read_recording',
+           'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Files that hold several tables: ZIP archives, sheets of Excel, and arrays of MATLAB.
+Files that hold several tables: ZIP archives, sheets of Excel, and arrays of MATLAB; DataFrames.
 
 phyphox and Sensor Logger export a ZIP archive with one CSV file for each sensor, and phyphox an
 Excel file with one sheet for each. `members_of` recognises such a file by its first bytes and
 returns its tables, and `member_of` returns that of the accelerometer. Each table is handed over as
-the bytes of a CSV file, piece by piece, so that it is read as any other text log is.
+the bytes of a CSV file, piece by piece, so that it is read as any other text log is. So is a
+DataFrame.
 
 ZIP is read with the standard library, ``.xlsx`` with `openpyxl`, ``.xls`` with `xlrd`, and
 ``.mat`` up to version 7 with `scipy`. Structs and timetables of MATLAB are refused: only MATLAB
@@ -24,7 +25,8 @@ from dataclasses import dataclass
 from datetime import date, datetime, time
 from functools import partial
 import io
-from itertools import islice
+from itertools import chain, islice
+import json
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -33,7 +35,7 @@ import zlib
 import numpy as np
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
-from .dialect import shown
+from .dialect import ABOUT, shown
 from .flight import missing, sound_log
 from .formats import record_instead
 from .names import meaning, READING
@@ -56,6 +58,9 @@ _SMALL, _LARGEST_RATIO = 2_000_000, 100
 
 _ROWS = 500
 """Number of rows of a sheet that are read at once."""
+
+_CELL_BYTES = 18
+"""Bytes of a number as text, about."""
 
 _BY_ORDER = (3, 4, 5, 7, 8)
 """Widths of arrays that are read by the order of their columns."""
@@ -255,14 +260,20 @@ def _old_sheets(path: Path) -> list[Member]:
 
 def _rows(path: Path, rows: Callable[[], Iterator[Sequence[Any]]]) -> _Stream:
     """Open the rows of a sheet as a CSV file."""
-    return _Stream(_csv(path, rows()))
+    return _Stream(_csv(_padded(path, rows())))
 
 
-def _csv(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
-    """Yield the rows of a sheet as lines of a CSV file; all rows have the same number of cells."""
+def _csv(rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
+    """Yield rows as lines of a CSV file."""
+    while block := list(islice(rows, _ROWS)):
+        text = io.StringIO()
+        csv.writer(text, lineterminator='\n').writerows(block)
+        yield text.getvalue().encode()
+
+
+def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[str]]:
+    """Yield the rows of a sheet as text; all rows have the same number of cells."""
     width = cells = 0
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
     while True:
         with sound_log(path, 'an Excel file', _AGAIN):
             block = [[_cell(value) for value in row] for row in islice(rows, _ROWS)]
@@ -273,10 +284,7 @@ def _csv(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
         if cells > _MOST_CELLS:
             raise InputError(f'{path} has more than {_MOST_CELLS} cells, expected a smaller Excel '
                              'file', _AGAIN)
-        writer.writerows([*row, *[''] * (width - len(row))] for row in block)
-        yield text.getvalue().encode()
-        text.seek(0)
-        text.truncate()
+        yield from ([*row, *[''] * (width - len(row))] for row in block)
 
 
 def _cell(value: object) -> str:
@@ -341,11 +349,56 @@ def _names(name: str, values: Any) -> list[str]:
 def _array_table(name: str, group: Mapping[str, Any]) -> Member:
     header = [cell for each, values in group.items() for cell in _names(each, values)]
     table = np.hstack([values.astype(float) for values in group.values()])
+    rows = [header] if header else []
+    return Member(name, table.size * _CELL_BYTES,
+                  lambda: _Stream(_csv(chain(rows, table.tolist()))))
 
-    def lines() -> Iterator[bytes]:
-        if header:
-            yield f'{",".join(header)}\n'.encode()
-        for row in table.tolist():
-            yield f'{",".join(map(repr, row))}\n'.encode()
 
-    return Member(name, table.size * 18, lambda: _Stream(lines()))
+# --------------------------------------------------------------------------------- DataFrame
+
+@dataclass(frozen=True)
+class Frame:
+    """
+    A DataFrame that is read as a log; the text of it is its name in messages.
+
+    Its index is a column if it has a name, or holds dates or fractions, which are then times. The
+    unit and the sensor are read from ``attrs``, where `accel_calib.table.Table.to_dataframe` puts
+    them.
+
+    """
+
+    data: Any
+
+    def __str__(self) -> str:
+        return 'the DataFrame'
+
+    @property
+    def table(self) -> Member:
+        """Return the DataFrame as a table of a container."""
+        columns = dict(self._columns())
+        about = getattr(self.data, 'attrs', {})
+        head = ''.join(f'# {name}: {json.dumps(about[name])}\n' for name in ABOUT
+                       if about.get(name))
+
+        def lines() -> Iterator[bytes]:
+            cells = [_plain(values) for values in columns.values()]
+            yield head.encode()
+            yield from _csv(chain([list(columns)], zip(*cells, strict=True)))
+
+        size = len(columns) * len(self.data) * _CELL_BYTES
+        return Member('', size, lambda: _Stream(lines()))
+
+    def _columns(self) -> Iterator[tuple[str, Any]]:
+        index = getattr(self.data, 'index', None)
+        if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
+            yield str(index.name or 'time'), index
+        yield from ((str(name), self.data[name]) for name in self.data.columns)
+
+
+def _plain(values: Any) -> list[Any]:
+    """Return a column as numbers or text; dates in UTC, durations in s."""
+    is_date = getattr(values.dtype, 'kind', '') == 'M'
+    cells = np.asarray(values, 'M8[ns]' if is_date else None)
+    if cells.dtype.kind == 'M':
+        return np.datetime_as_string(cells).tolist()
+    return (cells / np.timedelta64(1, 's') if cells.dtype.kind == 'm' else cells).tolist()

@@ -56,7 +56,7 @@ from ..effects import (
 )
 from ..estimate import judge, kinds
 from ..geometry import ATTITUDES
-from ..table import column_of, Floats, Poses
+from ..table import column_of, Floats, Poses, Record
 from ..text import listed, table
 from ..units import MG
 
@@ -145,8 +145,8 @@ class Stage:
     residual_mg: Floats
 
 
-@dataclass(frozen=True, repr=False)
-class Refinement:
+@dataclass(frozen=True, repr=False, eq=False)
+class Refinement(Record):
     """
     The result of a refinement.
 

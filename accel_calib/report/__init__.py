@@ -13,10 +13,10 @@ refinement. matplotlib is imported only when a figure is drawn.
 
 """
 
-from .charts import check_matplotlib, has_matplotlib
+from .charts import check_matplotlib, has_matplotlib, plot_residuals
 from .drawings import write_figures
 from .page import write_calibration_page, write_page
 from .repeats import write_comparison_page, write_history_page
 
-__all__ = ['check_matplotlib', 'has_matplotlib', 'write_calibration_page',
+__all__ = ['check_matplotlib', 'has_matplotlib', 'plot_residuals', 'write_calibration_page',
            'write_comparison_page', 'write_figures', 'write_history_page', 'write_page']

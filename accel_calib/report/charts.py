@@ -23,7 +23,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .residuals import recorded, Residuals, Variable, variables_of
+from .residuals import recorded, Residuals, residuals_of, Variable, variables_of
+from ..calibrate import Calibration
 from ..errors import InputError
 from ..estimate import uncovered
 from ..table import Floats
@@ -313,29 +314,49 @@ def of_coverage(residuals: Residuals, share: float, next_pose: Floats | None) ->
 
 def of_before_after(residuals: Residuals, floor_mg: float | None) -> Drawing:
     """Draw the size of the residual of each pose without and with the calibration."""
-    before = float(np.sqrt(np.mean(residuals.before_mg ** 2)))
-    title = f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
-    hover, signed = dict[str, Marks](), residuals.signed
+    title = _before_after_title(residuals)
     with styled():
         figure = new_figure(HEIGHT_INCHES, title)
-        panel: Any = figure.subplots()
-        panel.grid(visible=True, axis='y')
-        for name, values, colour in (('before', residuals.before_mg, BEFORE),
-                                     ('after', residuals.after_mg, AFTER)):
-            panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), _LEAST_MG), 'o',
-                       color=colour, gid=name, label=name, **EDGE,
-                       markersize=float(np.clip(7.0 - len(values) / 60.0, 3.0, 7.0)))
-            hover[name] = _marks(residuals, values)
-        if floor_mg:
-            panel.axhline(floor_mg, color=ACCENT, linestyle=(0, (5, 3)), label='noise floor')
-        panel.set_yscale('log')
-        panel.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
-        panel.locator_params(axis='x', integer=True)
-        panel.margins(y=0.1)
-        panel.set(xlabel='row of the pose',
-                  ylabel='size of |force| − 1 g [mg]' if signed else _label(signed=False))
+        panel = figure.subplots()
+        _draw_before_after(panel, residuals, floor_mg)
         legend_below(figure, 3)
-    return Drawing('before_after', title, figure, hover)
+    return Drawing('before_after', title, figure, {
+        'before': _marks(residuals, residuals.before_mg), 'after': _marks(residuals)})
+
+
+def _before_after_title(residuals: Residuals) -> str:
+    before = float(np.sqrt(np.mean(residuals.before_mg ** 2)))
+    return f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
+
+
+def _draw_before_after(panel: Any, residuals: Residuals, floor_mg: float | None) -> None:
+    panel.grid(visible=True, axis='y')
+    for name, values, colour in (('before', residuals.before_mg, BEFORE),
+                                 ('after', residuals.after_mg, AFTER)):
+        panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), _LEAST_MG), 'o',
+                   color=colour, gid=name, label=name, **EDGE,
+                   markersize=float(np.clip(7.0 - len(values) / 60.0, 3.0, 7.0)))
+    if floor_mg:
+        panel.axhline(floor_mg, color=ACCENT, linestyle=(0, (5, 3)), label='noise floor')
+    panel.set_yscale('log')
+    panel.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
+    panel.locator_params(axis='x', integer=True)
+    panel.margins(y=0.1)
+    panel.set(xlabel='row of the pose', ylabel=(
+        'size of |force| − 1 g [mg]' if residuals.signed else _label(signed=False)))
+
+
+def plot_residuals(calibration: Calibration, axes: Any = None) -> Any:
+    """Draw the poses before and after into axes of matplotlib, by default new ones of pyplot."""
+    check_matplotlib()
+    from matplotlib import pyplot
+
+    residuals = residuals_of(calibration)
+    panel = pyplot.subplots()[1] if axes is None else axes
+    _draw_before_after(panel, residuals, calibration.quality.noise_floor_mg)
+    panel.set_title(_before_after_title(residuals))
+    panel.legend()
+    return panel
 
 
 def _label(*, signed: bool) -> str:
