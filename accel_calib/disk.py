@@ -21,10 +21,13 @@ from pathlib import Path
 import secrets
 import shutil
 import stat
+import sys
 import time
 from typing import BinaryIO, TextIO
 
 from .errors import InputError
+
+STANDARD_OUTPUT = '-'
 
 _SUFFIX = '.tmp'
 _STALE_S = 3600.0
@@ -45,7 +48,8 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     Write a file through a temporary file, which is flushed to the disk and renamed.
 
     The function `write` writes the content to an open file. The target of a link is replaced, not
-    the link. With `keep_before` the previous file is kept as ``<name>.before``.
+    the link. With `keep_before` the previous file is kept as ``<name>.before``. The path ``-`` is
+    standard output.
 
     Raises
     ------
@@ -55,6 +59,11 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
         If the folder is missing or cannot be written. The file is then unchanged.
 
     """
+    if str(path) == STANDARD_OUTPUT:
+        sys.stdout.flush()
+        write(sys.stdout)
+        sys.stdout.flush()
+        return
     target = Path(os.path.realpath(path))
     with _replacing(target) as file, open(os.dup(file.fileno()), 'w', encoding='utf-8',
                                           errors='backslashreplace', newline='') as text:

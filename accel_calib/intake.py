@@ -13,7 +13,7 @@ from typing import Any
 
 from .capture import capture, Captured, settings_from
 from .errors import InputError
-from .logs import Frame, LogOptions, open_log, Progress
+from .logs import Frame, LogOptions, open_log, Piped, Progress
 from .table import Poses, Recording
 from .text import counted
 from .units import Units
@@ -53,7 +53,7 @@ class Intake:
                                    *self.captured)))
 
 
-def poses_of(path: Path | Frame, options: LogOptions = LogOptions(),
+def poses_of(path: Path | Piped | Frame, options: LogOptions = LogOptions(),
              settings: Mapping[str, Any] = {},
              progress: Progress = lambda done, count: None) -> Intake:
     """
@@ -61,7 +61,7 @@ def poses_of(path: Path | Frame, options: LogOptions = LogOptions(),
 
     Parameters
     ----------
-    path : Path or Frame
+    path : Path, Piped or Frame
         Pose table or recording, in any format that `accel_calib.logs` reads.
     options : LogOptions
         How to read the log; by default it is recognised.
@@ -89,7 +89,7 @@ def poses_of(path: Path | Frame, options: LogOptions = LogOptions(),
                       log.notes, (words, *wider))
 
 
-def samples_again(path: Path | Frame, options: LogOptions) -> Iterator[Recording]:
+def samples_again(path: Path | Piped | Frame, options: LogOptions) -> Iterator[Recording]:
     """Yield the blocks of a log from its beginning."""
     with open_log(path, options) as log:
         yield from log.blocks

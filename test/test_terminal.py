@@ -4,16 +4,21 @@
 """Text on terminals of any width and encoding, and help for wrong arguments."""
 
 import io
+import json
 import os
+from pathlib import Path
 import pty
+import shlex
 import subprocess
 import sys
 
+import accel_calib as ac
 from inside import COMMAND, in_one_line, main, Output, shown
 import numpy as np
 import pytest
 
 RUN = [sys.executable, *COMMAND]
+ROOT = str(Path(__file__).parent.parent)
 
 
 @pytest.fixture
@@ -104,6 +109,129 @@ def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
     shown_text = os.read(ours, 1 << 16).decode()
     os.close(ours)
     assert 'samples' in shown_text
+
+
+def on_a_terminal(arguments, **environment):
+    """Return the exit status of a command, and its text on a terminal."""
+    ours, theirs = pty.openpty()
+    plain = {name: value for name, value in os.environ.items() if name != 'NO_COLOR'}
+    process = subprocess.Popen([*RUN, *map(str, arguments)], stdout=theirs, stderr=theirs,
+                               env={**plain, 'TERM': 'xterm', **environment})
+    os.close(theirs)
+    text = b''
+    while part := _read(ours):
+        text += part
+    os.close(ours)
+    return process.wait(), text.decode()
+
+
+def _read(terminal):
+    try:
+        return os.read(terminal, 1 << 16)
+    except OSError:  # the last process has closed it
+        return b''
+
+
+@pytest.fixture
+def worse(poses, tmp_path):
+    """Return a stored calibration, and poses of another sensor."""
+    stored, other = tmp_path / 'c.yaml', tmp_path / 'other.csv'
+    assert main(['fit', str(poses), '-o', str(stored)]) == 0
+    assert main(['simulate', '-o', str(other), '--effect', 'offset=0.09,-0.01,0.03']) == 0
+    return stored, other
+
+
+def test_the_verdict_has_a_colour_on_a_terminal_only(poses, worse):
+    stored, other = worse
+    for arguments, verdict, colour in ((['fit', poses], 'GOOD', 32),
+                                       (['verify', other, '-c', stored], 'BAD', 31),
+                                       (['fit', poses, poses], 'GOOD', 32)):
+        _, text = on_a_terminal(arguments)
+        assert f'\x1b[1;{colour}m{verdict}\x1b[0m' in text
+        _, plain = on_a_terminal(arguments, NO_COLOR='1')
+        assert verdict in plain
+        assert f'{colour}m' not in plain
+        piped = subprocess.run([*RUN, *map(str, arguments)], capture_output=True, text=True,
+                               check=False)
+        assert verdict in piped.stdout
+        assert '\x1b' not in piped.stdout + piped.stderr
+
+
+def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch, tmp_path):
+    stored, other = worse
+    capsys.readouterr()
+    monkeypatch.setenv('COLUMNS', '300')
+    result = tmp_path / 'result.json'
+    assert main(['verify', str(other), '-c', str(stored), '--max', '5', '--json', str(result)]
+                ) == 1
+    why = 'mg is above --max 5 mg: exit status 1'
+    assert why in capsys.readouterr().out
+    found = json.loads(result.read_text(encoding='utf-8'))
+    assert (found['max_mg'], found['above_max']) == (5.0, True)
+    assert main(['verify', str(poses), '-c', str(stored), '--max', '5']) == 0
+    assert 'above' not in capsys.readouterr().out
+    assert main(['verify', str(poses), str(other), '-c', str(stored), '--max', '5']) == 1
+    lines = [line for line in capsys.readouterr().out.splitlines() if why in line]
+    assert [line.split(':')[0] for line in lines] == [str(other)]
+
+
+def piped(line, folder):
+    """Return what a line of the shell prints; each command ends with status 0."""
+    done = subprocess.run(['bash', '-euc',
+                           f'accel-calib() {{ {shlex.join(RUN)} "$@"; }}; {line}'],
+                          cwd=folder, capture_output=True, text=True, check=False,
+                          env={**os.environ, 'PYTHONPATH': ROOT, 'COLUMNS': '200'})
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_logs_and_tables_go_through_pipes(tmp_path):
+    simulate = 'accel-calib simulate -o - --recording --poses 14 --effect offset=0.02,-0.01,0.03'
+    piped(f'{simulate} | accel-calib capture - -o - | accel-calib fit - -o piped.yaml', tmp_path)
+    piped(f'{simulate} >r.csv; accel-calib capture r.csv -o p.csv; '
+          'accel-calib fit p.csv -o stored.yaml', tmp_path)
+    one, other = (ac.load(tmp_path / name) for name in ('piped.yaml', 'stored.yaml'))
+    assert one == other
+    assert 'standard input' in piped('accel-calib verify - -c stored.yaml <p.csv', tmp_path).stdout
+    shown_on = piped('accel-calib calibrate - -o - <r.csv >made.yaml', tmp_path)
+    assert 'GOOD' in shown_on.stderr
+    assert ac.load(tmp_path / 'made.yaml').rating.name == 'GOOD'
+    assert 'accel-calib calibrate -' in shown_on.stderr
+    assert not (tmp_path / '-.html').exists()
+    table = piped('accel-calib apply - -c stored.yaml -o - <r.csv', tmp_path)
+    assert table.stdout.startswith('# units: "m/s2"\n')
+    assert 'corrected' in table.stderr
+    line = 'accel-calib fit - --json - <p.csv'
+    assert json.loads(piped(line, tmp_path).stdout)['file'] == 'standard input'
+
+
+def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
+    done = piped('accel-calib simulate -o - --poses 20000 | head -1', tmp_path)
+    assert done.stdout == '# units: "m/s2"\n'
+    assert 'Broken' not in done.stderr
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['simulate', '-o', '-', '--json', '-'], 'unrecognized arguments: --json'),
+    (['capture', 'r.csv', '-o', '-', '--json', '-'], '-o and --json are both -'),
+    (['fit', 'r.csv', 'r.csv', '-o', '-'], '-o is -, expected a folder'),
+    (['fit', '-'], 'standard input is empty'),
+    (['fleet', 'r.csv', '-o', '-'], '-o is -, expected a folder')])
+def test_what_cannot_go_through_a_pipe_is_refused(arguments, message, tmp_path):
+    (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
+    done = subprocess.run([*RUN, *arguments], cwd=tmp_path, stdin=subprocess.DEVNULL,
+                          capture_output=True, text=True, check=False,
+                          env={**os.environ, 'PYTHONPATH': ROOT})
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_a_terminal_is_no_standard_input(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdin, 'isatty', lambda: True, raising=False)
+    with pytest.raises(SystemExit, match='2'):
+        main(['fit', '-'])
+    assert 'expected a log through a pipe' in capsys.readouterr().err
 
 
 def test_the_shell_completes_options(tmp_path):

@@ -87,7 +87,9 @@ def _words(value: object) -> list[str]:
     """Return the value of an option as words of a command line."""
     if isinstance(value, list):  # --columns
         return [','.join('='.join(pair) for each in value for pair in each.items())]
-    return [str(value)]
+    from ..logs import Piped
+
+    return [options.STANDARD_INPUT if isinstance(value, Piped) else str(value)]
 
 
 def next_command(step: NextStep, args: argparse.Namespace) -> str:
@@ -150,8 +152,9 @@ def _fit(made: options.Parser) -> None:
 
 def _calibrate(made: options.Parser) -> None:
     add = made.add_argument
-    add('log', type=Path, metavar='LOG', help='recording or pose table: CSV in any dialect, '
-        'rosbag2, .mcap, .db3, ROS 1 .bag, PX4 .ulg, ArduPilot .bin')
+    add('log', type=options.log_path, metavar='LOG', help='recording or pose table: CSV in any '
+        'dialect, rosbag2, .mcap, .db3, ROS 1 .bag, PX4 .ulg, ArduPilot .bin; - for standard '
+        'input')
     add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
         help='calibration to write (default: %(default)s); the page has the same name with .html')
     add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
@@ -196,21 +199,24 @@ def _compare(made: options.Parser) -> None:
 
 
 def _capture(made: options.Parser) -> None:
-    made.add_argument('recording', type=Path, metavar='RECORDING', help='CSV in any dialect, '
-                      'rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or ArduPilot .bin')
+    made.add_argument('recording', type=options.log_path, metavar='RECORDING', help='CSV in any '
+                      'dialect, rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or ArduPilot '
+                      '.bin; - for standard input')
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
-                      help='pose table to write')
+                      help='pose table to write; - for standard output')
     options.add_capture(made)
     options.add_log(made)
     options.share(made, '--json')
 
 
 def _apply(made: options.Parser) -> None:
-    made.add_argument('recording', type=Path, metavar='RECORDING',
-                      help='any log: CSV, rosbag2 folder, .mcap, .db3, ROS 1 .bag, …')
+    made.add_argument('recording', type=options.log_path, metavar='RECORDING',
+                      help='any log: CSV, rosbag2 folder, .mcap, .db3, ROS 1 .bag, …; - for '
+                      'standard input')
     options.add_stored(made, required=True)
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
-                      help='CSV table or bag to write, of the same kind as the recording')
+                      help='CSV table or bag to write, of the same kind as the recording; - '
+                      'for a table on standard output')
     made.add_argument('--no-rotate', action='store_true', help='correct offset and gain alone, '
                       'and stay in the frame of the sensor; otherwise a levelled calibration '
                       'turns everything in a message, and its frame_id ends with _levelled')
@@ -244,8 +250,8 @@ def _export(made: options.Parser) -> None:
 
 
 def _noise(made: options.Parser) -> None:
-    made.add_argument('recording', type=Path, metavar='RECORDING',
-                      help='recording with a long rest: any log, or a bag')
+    made.add_argument('recording', type=options.log_path, metavar='RECORDING',
+                      help='recording with a long rest: any log, or a bag; - for standard input')
     options.add_stored(made, 'stored calibration to apply first, for readings in counts or volts')
     options.add_page(made, 'page to write with the Allan deviation and the figures (HTML)')
     options.add_log(made)
@@ -256,7 +262,8 @@ def _simulate(made: options.Parser) -> None:
     from ..logs import LogOptions
 
     add = made.add_argument
-    add('-o', '--output', type=Path, required=True, metavar='OUT', help='CSV table to write')
+    add('-o', '--output', type=Path, required=True, metavar='OUT', help='CSV table to write; - '
+        'for standard output')
     add('--effect', action='append', default=[], metavar='NAME=VALUE,...', help='effect of the '
         'catalogue with its values, in g (offset), g/g (gains), g/g2 (quadratic), ...; one value '
         'is used for all axes; can be repeated')

@@ -16,7 +16,7 @@ from rich import box
 from rich.table import Table
 
 from .fit import error_line, short_if_known
-from .frame import Done, rated, rating_lines, table, working
+from .frame import Done, rated, rating_lines, table, Verdict, working
 from .inputs import intake, rows_between, stored_calibration
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
@@ -57,6 +57,7 @@ def run_verify(args: argparse.Namespace) -> Done:
               **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
               'rating_lines': rating_lines(rating, args)}
     above = args.max is not None and not verification.rms_after_mg <= args.max
+    result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
     return Done(result, several_verify([plain(result)]), FAILED if above else 0)
 
 
@@ -73,8 +74,11 @@ def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
           short(result['max_after_percent'] * 10), short_if_known(result['noise_floor_mg']))
          for result in results if 'error' not in result))
     for name, result in zip(names, results, strict=True):
-        for line in result.get('rating_lines', ()):
-            yield f'{name}{line}'
+        for k, line in enumerate(result.get('rating_lines', ())):
+            yield f'{name}{line}' if k else Verdict(f'{name}{line}', result['rating'], len(name))
+        if result.get('above_max'):
+            yield (f'{name}residual {short(result["rms_after_mg"])} mg is above --max '
+                   f'{result["max_mg"]:g} mg: exit status {FAILED}')
 
 
 def run_compare(args: argparse.Namespace) -> Done:

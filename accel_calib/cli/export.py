@@ -8,38 +8,28 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-import sys
 
-from .frame import check_target, Done, Output, STANDARD_OUTPUT, Target
+from .frame import check_target, Done, Output, Target
 from .inputs import given, stored_calibration
-from ..disk import write_atomically
-from ..errors import InputError
+from ..disk import STANDARD_OUTPUT, write_atomically
 from ..stored.exports import export, Exported, identifier, Options, read_noise
 
 
 def run_export(args: argparse.Namespace) -> Done:
     """Write the file, and print what it does not hold on standard error."""
-    if args.output == STANDARD_OUTPUT == args.json:
-        raise InputError('-o and --json are both -, expected one of them on standard output',
-                         'give one of them the name of a file')
     calibration = stored_calibration(args.calibration)
     chosen = Options(**{**given(Options, args), 'name': args.name or _name(args)})
     noise = None if args.noise is None else read_noise(args.noise)
     made = export(calibration, args.to, noise, chosen)
     target = _target(args, made)
-    if target is None:
-        sys.stdout.flush()
-        made.write(sys.stdout)
-        sys.stdout.flush()
-    else:
-        write_atomically(target, made.write)
-    console = Output(stderr=True)
+    write_atomically(target, made.write)
+    console, is_file = Output(stderr=True), args.output != STANDARD_OUTPUT
     for line in (*made.losses, *(f'note: {note}' for note in made.notes),
-                 *([] if target is None else [f'stored in {target}'])):
+                 *([f'stored in {target}'] if is_file else [])):
         console.print(line)
-    return Done({'format': args.to, 'file': target, 'calibration': args.calibration,
-                 'leaves_mg': made.leaves_mg, 'losses': [asdict(loss) for loss in made.details],
-                 'notes': made.notes})
+    return Done({'format': args.to, 'file': target if is_file else None,
+                 'calibration': args.calibration, 'leaves_mg': made.leaves_mg,
+                 'losses': [asdict(loss) for loss in made.details], 'notes': made.notes})
 
 
 def _name(args: argparse.Namespace) -> str:
@@ -48,10 +38,10 @@ def _name(args: argparse.Namespace) -> str:
     return identifier(Path(named).stem)
 
 
-def _target(args: argparse.Namespace, made: Exported) -> Path | None:
-    """Return the file to write; None: standard output."""
+def _target(args: argparse.Namespace, made: Exported) -> Path:
+    """Return the file to write."""
     if args.output == STANDARD_OUTPUT:
-        return None
+        return Path(args.output)
     target = (args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')
               if args.output is None else Path(args.output))
     check_target(Target('-o', target, 'export'), [args.calibration], force=args.force)

@@ -13,9 +13,10 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from rich.table import Table
 
-from .frame import console, Done, progress, rated, rating_lines, table, working
+from .frame import console, Done, progress, rated, rating_lines, table, Verdict, working
 from .inputs import given, intake, log_options, plan_of, rows_between, settings
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
+from ..disk import STANDARD_OUTPUT
 from ..errors import system_error
 from ..findings import (
     calibration_json,
@@ -78,9 +79,11 @@ def _shown(found: Intake, calibration: Calibration, ahead: Outlook) -> Iterator[
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        yield f'{result["file"]} ' + (error_line(result) or (
+        line = f'{result["file"]} ' + (error_line(result) or (
             f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-            f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}'))
+            f'{result["rms_after_mg"]:.3g} mg, '))
+        yield line if 'error' in result else Verdict(
+            f'{line}{result["rating"]}', result['rating'], len(line))
 
 
 def error_line(result: dict[str, Any]) -> str:
@@ -108,6 +111,8 @@ def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -
     from ..report import has_matplotlib, write_calibration_page
 
     line = _store(args, outcome.calibration, outcome.rating)
+    if str(args.output) == STANDARD_OUTPUT:
+        return [line]
     page = args.output.with_suffix('.html')
     if not has_matplotlib():
         return [line, f'no page {page}: matplotlib is not installed']

@@ -35,17 +35,16 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT
 from .terminal import plain_character
-from ..disk import replaceable, write_atomically
+from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
 from ..text import counted, plain
 
 if TYPE_CHECKING:
-    from rich.text import Text
-
     from ..findings import Rating
     from ..logs import Progress
 
@@ -60,9 +59,12 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
 """Beginning of a file of each kind."""
 
 _HEAD = 4096
-STANDARD_OUTPUT = '-'
-
 _NO_BREAK = '\N{NO-BREAK SPACE}'
+_MARK = '\ue000'
+"""Stands for a letter of the rating while a line is broken."""
+
+_COLOURS = {'GOOD': 'bold green', 'USABLE': 'bold yellow', 'BAD': 'bold red'}
+
 _TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²|poses?)\b)'
 """Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
 
@@ -194,10 +196,24 @@ def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
     return rating_json(rating, step.kind, step.text, next_command(step, args))
 
 
+class Verdict(str):
+    """A line of text with a rating from a character on, which a terminal shows in colour."""
+
+    rating: str
+    start: int
+
+    def __new__(cls, line: str, rating: str, start: int = 0) -> Verdict:
+        """Return the line with these attributes."""
+        made = super().__new__(cls, line)
+        made.rating, made.start = rating, start
+        return made
+
+
 def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
     """Return a rating as lines of text, the last one the next command if there is one."""
     command = next_command(rating.next, args)
-    return [*rating.lines, *([f'      {command}'] if command else [])]
+    first, *others = rating.lines
+    return [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
 
 
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
@@ -237,12 +253,8 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
 
 def write_json(target: str | None, result: object) -> None:
     """Write a result as JSON to a file, or to standard output for ``-``; None: do nothing."""
-    if target is None:
-        return
-    text = json.dumps(plain(result), indent=2, allow_nan=False)
-    if target == STANDARD_OUTPUT:
-        print(text)
-    else:
+    if target is not None:
+        text = json.dumps(plain(result), indent=2, allow_nan=False)
         write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
 
 
@@ -254,7 +266,7 @@ def _for_each(args: argparse.Namespace) -> list[argparse.Namespace]:
     folders = [(name, target) for name, target in _outputs(args)
                if len(sources) > 1 and target.kind in _SUFFIXES]
     return [argparse.Namespace(**{**vars(args), 'poses': source, **{
-        name: _in_folder(target, source).path for name, target in folders}})
+        name: _in_folder(target, Path(source)).path for name, target in folders}})
         for source in sources]
 
 
@@ -287,7 +299,20 @@ def _targets(args: argparse.Namespace) -> Iterator[Target]:
             yield Target('the page of -o', target.path.with_suffix('.html'), 'page')
 
 
+def _check_piped(args: argparse.Namespace) -> None:
+    """Check that at most one result goes to standard output."""
+    piped = _piped(args)
+    if len(piped) > 1:
+        raise InputError(f'{" and ".join(piped)} are both -, expected one of them on standard '
+                         'output', 'give one of them the name of a file')
+    several = isinstance(getattr(args, 'poses', None), list) and len(args.poses) > 1
+    if piped and piped != ['--json'] and (several or not COMMANDS[args.command].writes):
+        raise InputError(f'{piped[0]} is -, expected a folder here',
+                         'use a folder; results of several files do not fit into one')
+
+
 def _check_targets(args: argparse.Namespace) -> None:
+    _check_piped(args)
     inputs = [path for name in _INPUTS for path in _paths(getattr(args, name, None))]
     seen: dict[Path, str] = {}
     for target in _targets(args):
@@ -357,10 +382,17 @@ class Output(Console):
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
         """Print; lines of text break at words, and the rest of a line is indented."""
         if len(objects) == 1 and isinstance(objects[0], str):
-            super().print('\n'.join(map(self._broken, objects[0].split('\n'))), soft_wrap=True,
-                          **options)
+            super().print(self._line(objects[0]), soft_wrap=True, **options)
         else:
             super().print(*objects, **options)
+
+    def _line(self, line: str) -> Text:
+        if not isinstance(line, Verdict):
+            return self.render_str('\n'.join(map(self._broken, line.split('\n'))))
+        end, mark = line.start + len(line.rating), _MARK * len(line.rating)
+        before, _, after = self._broken(f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
+        return Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
+                             self.render_str(after))
 
     def _broken(self, line: str) -> str:
         tied = re.sub(_TIED, _NO_BREAK, line)
@@ -408,11 +440,11 @@ def progress(what: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    columns = (BarColumn(), TextColumn('{task.completed:,.0f} of {task.total:,.0f} ' + what),
-               TimeRemainingColumn())
+    columns = (BarColumn(), TextColumn('{task.description}'), TimeRemainingColumn())
     with Bar(*columns, console=Output(stderr=True), transient=True) as bar:
-        task = bar.add_task('', visible=False)
-        yield lambda done, count: bar.update(task, completed=done, total=count, visible=True)
+        task = bar.add_task(what, total=None)  # the bar moves to and fro until a number is known
+        yield lambda done, count: bar.update(task, completed=done, total=count,
+                                             description=f'{done:,} of {count:,} {what}')
 
 
 @contextmanager
@@ -426,5 +458,12 @@ def working(what: str) -> Iterator[None]:
 
 
 def console(args: argparse.Namespace) -> Output:
-    """Return the console for text output: standard error if JSON goes to standard output."""
-    return Output(stderr=getattr(args, 'json', None) == STANDARD_OUTPUT)
+    """Return the console for text output: standard error if a result goes to standard output."""
+    return Output(stderr=bool(_piped(args)))
+
+
+def _piped(args: argparse.Namespace) -> list[str]:
+    """Return the options whose result goes to standard output."""
+    named = {'-o': 'output', **{f'--{name}': name for name in _OUTPUTS}}
+    return [option for option, name in named.items()
+            if str(getattr(args, name, None)) == STANDARD_OUTPUT]

@@ -20,6 +20,8 @@ import sys
 from threading import current_thread, main_thread
 
 INTERRUPTED = 130
+NOT_READ = 141
+"""Exit status of a program that SIGPIPE ends."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,6 +57,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(args)
     except AccelCalibError as err:
         line = str(err)
+    except BrokenPipeError:  # `accel-calib … | head`: nobody reads the rest
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOT_READ
     except OSError as err:
         line = str(system_error(err))
     except KeyboardInterrupt:

@@ -16,12 +16,15 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 import re
+import sys
 from typing import Any, NoReturn
 
 from .terminal import in_one_line
 
 BAD_INPUT = 2
 """Exit status for invalid input."""
+
+STANDARD_INPUT = '-'
 
 
 class Parser(argparse.ArgumentParser):
@@ -70,6 +73,18 @@ def utf8(text: str) -> str:
     except UnicodeEncodeError:
         raise argparse.ArgumentTypeError(f'{text!a}: expected text in UTF-8') from None
     return text
+
+
+def log_path(text: str) -> Any:
+    """Return the path of a log; for ``-``, what comes through standard input."""
+    if text != STANDARD_INPUT:
+        return Path(text)
+    from ..logs import Piped
+
+    if sys.stdin.isatty():
+        raise argparse.ArgumentTypeError('- is standard input, which is a terminal, expected a '
+                                         'log through a pipe')
+    return Piped(sys.stdin.buffer.read())
 
 
 def _columns(text: str) -> dict[str, str]:
@@ -183,8 +198,9 @@ def add_capture(made: Parser) -> None:
 
 def add_poses(made: Parser, number: str | None = '+') -> None:
     """Add the options for reading the poses of one or several logs."""
-    made.add_argument('poses', nargs=number, type=Path, metavar='POSES',
-                      help='pose table, or a recording, whose poses are captured first')
+    made.add_argument('poses', nargs=number, type=log_path, metavar='POSES',
+                      help='pose table, or a recording, whose poses are captured first; - for '
+                      'standard input')
     share(made, '--rows')
     add_log(made)
     add_capture(made)
@@ -193,7 +209,8 @@ def add_poses(made: Parser, number: str | None = '+') -> None:
 def add_outputs(made: Parser, output: str, page: str = 'page') -> None:
     """Add the options for the files that a command writes for one or several POSES."""
     made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help=f'{output} to write (YAML); a folder for several POSES')
+                      help=f'{output} to write (YAML); - for standard output; a folder for '
+                      'several POSES')
     add_page(made, f'{page} to write (HTML); a folder for several POSES')
     share(made, '--jobs', '--json')
 

@@ -25,6 +25,7 @@ from ..calibrate import (
     SampleContext,
 )
 from ..capture import Captured
+from ..disk import STANDARD_OUTPUT
 from ..effects import Context, parse_effect
 from ..errors import InputError
 from ..intake import Intake, samples_again, still_poses
@@ -70,9 +71,12 @@ def run_apply(args: argparse.Namespace) -> Done:
         calibration = calibration.in_sensor_frame
     left: list[Outside] = []
     lines: list[str] = []
-    if is_bag(args.recording):
+    if isinstance(args.recording, Path) and is_bag(args.recording):
         from ..messages import correct_bag
 
+        if str(args.output) == STANDARD_OUTPUT:
+            raise InputError('a bag cannot be written to standard output, expected a file',
+                             'name a file with -o')
         with progress('messages') as moved:
             count = correct_bag(args.recording, calibration, args.output, args.topic, moved,
                                 left.append, note=lambda line: lines.append(f'note: {line}'),

@@ -13,7 +13,7 @@ the fields in serialized messages, and `tables` writes our own tables.
 from .bag import Bag, damage_as_input_error, is_bag, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
-from .containers import Frame
+from .containers import Frame, Piped
 from .formats import NAMES
 from .quantities import are_samples, are_untimed_samples
 from .read import LineReader, Log, open_log, OpenLog, Progress, read_log, read_recording
@@ -47,7 +47,7 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
            'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'STAMP', 'STAMP_AT', 'THREE', 'Bag',
            'ContextTopics', 'Frame', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages',
-           'OpenLog', 'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
+           'OpenLog', 'Piped', 'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
            'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of', 'layout_with',
            'open_bag', 'open_log', 'put_doubles', 'read_log', 'read_poses', 'read_recording',
            'renamed', 'samples_of', 'write_blocks', 'write_table']

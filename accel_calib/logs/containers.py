@@ -354,7 +354,27 @@ def _array_table(name: str, group: Mapping[str, Any]) -> Member:
                   lambda: _Stream(_csv(chain(rows, table.tolist()))))
 
 
-# --------------------------------------------------------------------------------- DataFrame
+# ---------------------------------------------------------------- standard input, DataFrame
+
+class Piped(str):
+    """The bytes of a text log that came through standard input; the text is its name."""
+
+    data: bytes
+
+    def __new__(cls, data: bytes) -> Piped:
+        """Return the log with these bytes."""
+        made = super().__new__(cls, 'standard input')
+        made.data = data
+        return made
+
+    def __getnewargs__(self) -> tuple[bytes]:  # type: ignore[override]
+        return (self.data,)
+
+    @property
+    def table(self) -> Member:
+        """Return the log as a table of a container."""
+        return Member('', len(self.data), lambda: io.BytesIO(self.data))
+
 
 @dataclass(frozen=True)
 class Frame:

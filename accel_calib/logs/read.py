@@ -19,7 +19,7 @@ from .ardupilot import is_dataflash, read_dataflash
 from .bag import Bag, is_bag, open_bag
 from .bag_samples import context_of, imu_samples, together
 from .columns import chosen, is_log_header, LogOptions
-from .containers import Frame, member_of, members_of
+from .containers import Frame, member_of, members_of, Piped
 from .dialect import layout_of
 from .flight import FlightLog, is_ulg, read_ulg
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
@@ -112,14 +112,14 @@ def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
 
 
 @contextmanager
-def open_log(path: Path | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
+def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
     """
     Open a log of any kind: text, a bag, a flight log of PX4 or ArduPilot, or a DataFrame.
 
     Parameters
     ----------
-    path : Path or Frame
-        The file, the folder of a rosbag2, or the DataFrame.
+    path : Path, Piped or Frame
+        The file, the folder of a rosbag2, standard input, or the DataFrame.
     options : LogOptions
         How to read it; by default it is recognised.
 
@@ -139,9 +139,9 @@ def open_log(path: Path | Frame, options: LogOptions = LogOptions()) -> Iterator
 
 
 @contextmanager
-def _opened(path: Path | Frame, options: LogOptions) -> Iterator[OpenLog]:
+def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog]:
     """Open a log; parameters and errors as in `open_log`."""
-    if isinstance(path, Frame):
+    if not isinstance(path, Path):
         name = Path(str(path))
         with path.table.text(name, options) as text:
             yield _text(name, text, options)
