@@ -79,8 +79,8 @@ def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, 
     """
     Run the Python of a page in this folder, and return its names.
 
-    What the page shows below a snippet must be `printed`. A snippet whose first line is the name of
-    a file is also written to this file.
+    What the page shows below a snippet must be `printed`. A snippet whose first line is the name
+    of a file is also written to this file.
 
     """
     text, names = (ROOT / page).read_text(encoding='utf-8'), dict[str, Any]()
