@@ -393,3 +393,20 @@ def test_a_wave_in_noisy_new_poses_is_still_found():
     found = refine(new.with_columns(reading=new.reading + wave + more), G, base=base)
     assert found.steps
     assert found.remaining_gap_mg < 0.5 * found.gap_mg
+
+
+@pytest.mark.parametrize('count', [12, 24])
+def test_the_change_of_each_axis_has_its_own_uncertainty(count):
+    away = []
+    for seed in range(8):
+        rng = np.random.default_rng([77, seed])
+        model, moved = with_effects(rng), rng.normal(size=3) * 0.003
+        base = fit_poses(poses_of(model, rng, random_directions(30, rng)), G)
+        truth = Model({**model.values, 'offset': model.values['offset'] + moved})
+        step, = refine(poses_of(truth, rng, random_directions(count, rng)), G, base=base).steps
+        assert step.effect == 'offset'
+        assert step.where.count('±') == 3
+        away += [(step.parameters[axis] - change) / step.parameters_sd[axis]
+                 for axis, change in zip('xyz', moved)]
+    assert 0.7 < np.sqrt(np.mean(np.square(away))) < 1.4  # chi² of 24 values: 0.72 to 1.28 at 95 %
+    assert np.max(np.abs(away)) < 4.0

@@ -90,6 +90,8 @@ class Step:
         Probability of the effect and of each effect in its place, by name.
     parameters : dict
         Values by name. For a change of a stored calibration: the changes of the values.
+    parameters_sd : dict
+        Their standard deviations, of those that are fitted.
     gap_before_mg, gap_after_mg : float
         Residual without and with the effect [mg].
     held_out_before_mg, held_out_after_mg : float
@@ -109,6 +111,7 @@ class Step:
     rivals: tuple[str, ...]
     probabilities: dict[str, float]
     parameters: dict[str, float]
+    parameters_sd: dict[str, float]
     gap_before_mg: float
     gap_after_mg: float
     held_out_before_mg: float
@@ -272,16 +275,19 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
     rivals, chances = _rivals(name, found)
     if name == WANDER:
         residual, held_out = beside_walk(found)
-        return Step(name, rivals, chances, {}, before.gap_mg(before.residual),
+        return Step(name, rivals, chances, {}, {}, before.gap_mg(before.residual),
                     before.gap_mg(residual), before.gap_mg(before.held_out),
                     before.gap_mg(held_out), _p_value(name, before, found),
                     _where(name, before, residual), name)
     effect, first, last = effect_named(name), before.fit.residual, after.fit.residual
     values = after.model.values.get(name, np.zeros(len(effect.values)))
     words = _curve(name, before, last) if is_curve(name) else _where(name, before, last)
+    deviations = _deviations(name, after)
     if name in CHANGES:
-        words = f'{_change(name, after, date)}; {words}'
-    return Step(kind_of(shown_name(name)), rivals, chances, effect.shown(values),
+        words = f'{change_words(name, values, [*deviations.values()], date)}; {words}'
+    shown = effect.shown(values)
+    return Step(kind_of(shown_name(name)), rivals, chances, shown,
+                {part: deviations[part] for part in shown if deviations.get(part)},
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first if unseen else before.held_out),
                 after.gap_mg(after.held_out), _p_value(name, before, found), words,
@@ -319,11 +325,12 @@ def _output_steps(found: Found) -> list[Step]:
         whole, limit_g = found.with_clipped, found.clipped.limit_g
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
         steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': limit_g},
-                          whole.gap_mg(whole.residual), gap, whole.gap_mg(whole.held_out),
-                          held_out, 0.0, limit_words(rows, limit_g), 'saturation'))
+                          {}, whole.gap_mg(whole.residual), gap,
+                          whole.gap_mg(whole.held_out), held_out, 0.0,
+                          limit_words(rows, limit_g), 'saturation'))
     if found.grid_g is not None:
-        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, gap,
-                          gap, held_out, held_out, 0.0, grid_words(found.grid_g * MG),
+        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, {},
+                          gap, gap, held_out, held_out, 0.0, grid_words(found.grid_g * MG),
                           'quantisation'))
     return steps
 
@@ -344,12 +351,12 @@ def _curve(name: str, before: State, after: Floats) -> str:
                        nearest_effects(before))
 
 
-def _change(name: str, state: State, date: str) -> str:
-    """Return a text about the change of a value since a stored calibration, with uncertainty."""
-    names, model = parameter_names(state.model.effects), state.model
-    which = [names.index(f'{name}.{part}') for part in effect_named(name).parameters]
-    deviation = float(np.sqrt(np.mean(np.diag(state.fit.covariance)[which])))
-    return change_words(name, model.values[name], deviation, date)
+def _deviations(name: str, state: State) -> dict[str, float]:
+    """Return the standard deviations of the values of an effect of a model; empty without it."""
+    names = parameter_names(state.model.effects)
+    spread = np.sqrt(np.diag(state.fit.covariance)).tolist()
+    return {part: spread[names.index(f'{name}.{part}')] for part in effect_named(name).values
+            if name in state.model.values}
 
 
 def _where(name: str, before: State, after: Floats) -> str:

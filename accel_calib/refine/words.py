@@ -29,7 +29,7 @@ from ..effects import (
 )
 from ..geometry import ATTITUDES, unit
 from ..table import column_of, Floats, is_quantity
-from ..text import counted, short
+from ..text import counted, short, with_sd
 
 if TYPE_CHECKING:
     from .result import Refinement, Step
@@ -185,15 +185,14 @@ def direction_words(means: Sequence[tuple[Floats, float, int]], total: int) -> s
                                for signs, mean, count in means)
 
 
-def change_words(name: str, values: Floats, deviation: float, date: str) -> str:
-    """Return the change of a value since a stored calibration of a date, with its uncertainty."""
+def change_words(name: str, values: Floats, deviations: Sequence[float], date: str) -> str:
+    """Return the change of values since a stored calibration of a date, with uncertainties."""
     effect = effect_named(CHANGES[name].base)
     scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
-    digits = max(0, -int(np.floor(np.log10(max(deviation * scale, 1e-6)))))
-    shown = ', '.join(f'{value * scale:+.{digits}f}' for value in values)
+    shown = ', '.join(f'{"+" if value > 0.0 else ""}{with_sd(value * scale, sd * scale)}'
+                      for value, sd in zip(values.tolist(), deviations, strict=True))
     since = f' since {date[:10]}' if date else ''
-    return (f'the {effect.words} has changed by ({shown}) ± {deviation * scale:.{digits}f} '
-            f'{unit_name}{since}')
+    return f'the {effect.words} has changed by ({shown}) {unit_name}{since}'
 
 
 def plain_name(name: str) -> str:
