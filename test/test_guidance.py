@@ -208,6 +208,23 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     assert 'temperature:=/board/temperature or /cpu' in driver.logged('warning')
 
 
+def test_answers_are_short_and_the_log_and_the_result_have_the_details() -> None:
+    driver = Driver(sensor='arm')
+    person = Person(driver, warming, warming=1.2)
+    person.follow()
+    answers = []
+    for command in ('calibrate_at_rest', 'set_level', 'fit', 'refine'):
+        person.rest(person.flat, 4.0)
+        answers.append(driver.done(getattr(driver.session.commands, command)()))
+    assert all(0 < len(answer) < 250 and '; next: ' in answer for answer in answers), answers
+    assert all('arm.yaml' not in answer and 'changes offset' not in answer for answer in answers)
+    store = driver.session.files.store
+    assert driver.logged('info').count(f'stored in {store.calibration}') >= len(answers)
+    assert 'changes offset by' in driver.logged('info')
+    assert 'static_transform_publisher --roll' in driver.logged('info')
+    assert figures(driver)['mounting']['urdf'] in driver.logged('info')
+
+
 def test_the_heading_by_a_raised_nose_is_questioned() -> None:
     driver = Driver()
     person = Person(driver, healthy)

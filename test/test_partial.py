@@ -6,7 +6,6 @@
 from dataclasses import replace
 
 from accel_calib.calibrate import (
-    carried_words,
     directions_of,
     fit_partial,
     fit_poses,
@@ -243,7 +242,7 @@ def test_level_and_the_offset_along_gravity_come_from_one_rest():
     _, poses = tilting(13, 1, 0.1)
     found = level(fit_partial(poses, G), poses.reading[0], 'ros')
     np.testing.assert_allclose(found.correct(poses.reading), [[0.0, 0.0, 1.0]], atol=1e-3)
-    assert 'sum of offset and gain' in carried_words(found)
+    assert 'sum of offset and gain' in found.reason
 
 
 @pytest.mark.parametrize('make', [fit_partial, mounting_only])

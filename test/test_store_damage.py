@@ -133,7 +133,8 @@ def works(path: Path, readings: Readings) -> None:
     """Check that a calibrator starts, fits and stores, and that the next one uses the result."""
     driver = Driver(calibration_file=str(path))
     driver.feed(readings(spread_directions(10)))
-    assert 'stored in' in driver.done(driver.session.commands.fit())
+    assert driver.done(driver.session.commands.fit())
+    assert 'stored in' in driver.logged('info')
     driver.session.close()
     after = Driver(calibration_file=str(path))
     after.feed(readings([[0, 0, 1]])[:10])

@@ -210,11 +210,17 @@ def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str,
 def mounting_words(rotation: Floats, sensor: str, base: str = '') -> str:
     """Return `mounting_figures` as one line."""
     found = mounting_figures(rotation, sensor, base)
-    angles = ', '.join(f'{name} {math.degrees(found[name]):.2f}°'
-                       for name in ('roll', 'pitch', 'yaw'))
+    angles = angle_words(rotation)
     quaternion = ', '.join(f'{part:.6f}' for part in found['quaternion'])
     return (f'mounting of the sensor: {angles}; quaternion ({quaternion}); URDF {found["urdf"]}; '
             f'or {found["static_transform_publisher"]}')
+
+
+def angle_words(rotation: Floats) -> str:
+    """Return roll, pitch and yaw of the sensor in words."""
+    found = mounting_figures(rotation, '')
+    return ', '.join(f'{name} {math.degrees(found[name]):.2f}°' for name in (
+        'roll', 'pitch', 'yaw'))
 
 
 def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:

@@ -257,16 +257,6 @@ def _across(covariance: Floats, axis: Floats) -> float:
     return float(np.sqrt(np.max(np.linalg.eigvalsh(across @ covariance @ across))))
 
 
-def carried_words(calibration: Calibration) -> str:
-    """Return what a partial calibration carries and leaves open; empty for another method."""
-    if calibration.method != PRIOR:
-        return ''
-    if not calibration.model.effects:
-        return f'mounting alone; {_not_calibrated()}'
-    about = carried(calibration)
-    return f'{_known_words(about)}; {_open(about).words}'
-
-
 def _known_words(about: Carried) -> str:
     """Return a text about what the poses determine."""
     if about.count == 1:

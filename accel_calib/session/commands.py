@@ -26,8 +26,8 @@ from .stream import thermometer_words
 from .work import at_rest, change_words, fit, Fitted, plan_for, refined
 from .worker import Calibrations, Compute, Files, Found, Part, Task
 from ..calibrate import (
+    angle_words,
     Calibration,
-    carried_words,
     level,
     mounting_only,
     mounting_words,
@@ -113,10 +113,8 @@ class Commands:
 
     def _use_fit(self, fitted: Fitted, *, offered: bool = False) -> Part[str]:
         """Store and use, or offer, a fit or a refinement; return the answer."""
-        answer = yield from self._use(fitted.calibration, fitted.words, fitted.refinement,
-                                      fitted.rating, offered=offered)
-        waits = self._session.sensor.offered is not None  # then the answer says so
-        return answer if waits else f'{answer}{self._next()}'
+        return (yield from self._use(fitted.calibration, fitted.words, fitted.details,
+                                     fitted.refinement, fitted.rating, offered=offered))
 
     def due(self) -> list[Task]:
         """Return an automatic fit if one is due."""
@@ -162,10 +160,10 @@ class Commands:
             fitted = yield from self._unless_changed(name, function, poses, *given)
             if fitted.refusal:
                 session.rate(fitted.refinement)
-                raise RefusedFitError(f'{fitted.words[0]}; not used: {fitted.refusal[0]}',
+                raise RefusedFitError(f'{fitted.words}; not used: {fitted.refusal[0]}',
                                       fitted.refusal[1])
             if fitted.rating.name == 'BAD':
-                raise RefusedFitError(f'{fitted.words[0]}; not used: {fitted.rating.reason}',
+                raise RefusedFitError(f'{fitted.words}; not used: {fitted.rating.reason}',
                                       fitted.rating.next.text)
         except RefusedFitError as error:
             sensor.guide.refuse(len(poses), error.advice)
@@ -205,7 +203,7 @@ class Commands:
             calibration = session.with_given(mounting_only(
                 poses_from([rest]), session.units, sensor=session.name, date=now()))
         return (yield from self._use_mounting(
-            self._levelled(calibration, rest), ['the mounting is levelled by this pose'],
+            self._levelled(calibration, rest), 'the mounting is levelled by this pose',
             offered=offered))
 
     def set_heading(self, *, offered: bool = False) -> Task:
@@ -217,10 +215,10 @@ class Commands:
         rest = self._rest()
         headed = set_heading(calibration, rest.mean,
                              self._session.sensor.context_of(rest, calibration))
-        words = ['the heading is set by this pose']
+        words = 'the heading is set by this pose'
         if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
-            words.append('the front of the robot is now on the other side of the sensor: if the '
-                         'nose was up, tilt it down and call ~/set_heading again')
+            words += ('; the front of the robot is now on the other side of the sensor: if the '
+                      'nose was up, tilt it down and call ~/set_heading again')
         return (yield from self._use_mounting(headed, words, offered=offered))
 
     def calibrate_at_rest(self, *, offered: bool = False) -> Task:
@@ -228,11 +226,11 @@ class Commands:
         session, rest = self._session, self._rest()
         before = session.sensor.present
         calibration = session.with_given(at_rest(rest, session.units, session.name, before))
-        words = [carried_words(calibration) if before is None or is_partial(before)
-                 else 'offset and gain of the fit are kept']
+        words = (calibration.reason if before is None or is_partial(before)
+                 else 'offset and gain of the fit are kept')
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
-            words.append(f'gyro bias ({bias}) °/s')
+            words += f', gyro bias ({bias}) °/s'
         return (yield from self._use_mounting(self._levelled(calibration, rest), words,
                                               offered=offered))
 
@@ -247,19 +245,18 @@ class Commands:
                              'given mounting and restart the node')
         return levelled
 
-    def _use_mounting(self, calibration: Calibration, words: list[str], *, offered: bool
-                      ) -> Part[str]:
+    def _use_mounting(self, calibration: Calibration, words: str, *, offered: bool) -> Part[str]:
         """Store and use, or offer, a calibration with a new mounting; return the answer."""
-        words = [*words, change_words(self._session.sensor.present, calibration), *(
-            each.words for each in calibration.noted
-            if each.kind in ('flat_pose', 'heading'))]
-        return (yield from self._use(calibration, words, self._session.sensor.refinement,
-                                     offered=offered))
+        details = [change_words(self._session.sensor.present, calibration), *(
+            each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
+        return (yield from self._use(
+            calibration, f'{words}; {angle_words(calibration.rotation)}', details,
+            self._session.sensor.refinement, offered=offered))
 
-    def _use(self, calibration: Calibration, words: list[str],
+    def _use(self, calibration: Calibration, words: str, details: list[str],
              refinement: Refinement | None = None, rating: Rating | None = None, *,
              offered: bool = False) -> Part[str]:
-        """Store and use, or offer, a calibration; return the answer."""
+        """Store and use, or offer, a calibration; log the details, and return the answer."""
         session, store = self._session, self._session.files.usable()
         offered = offered or session.settings.confirm
         not_stored = yield from self._with_files(_stored, store, None if offered else calibration)
@@ -267,16 +264,17 @@ class Commands:
             calibration.rotation, session.frame_id or '', session.settings.base_frame)]
         if offered:
             session.offer(calibration, refinement, rating)
-            end = ('published on ~/preview only: call ~/save to use and store it, or ~/undo to '
-                   'discard it')
-            return '; '.join(filter(None, [*words, end, *mounting]))
+            session.log('info', '; '.join(filter(None, [*details, *mounting])))
+            return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
+                    '~/undo to discard it')
         session.adopt(calibration, refinement, rating)
         if not_stored is not None:
             session.sensor.unsaved = True
             raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
                              f'{writing_advice(not_stored)}, and call ~/save')
         stored = f'stored in {store.calibration}'
-        return '; '.join(filter(None, [*words, stored, *mounting]))
+        session.log('info', '; '.join(filter(None, [*details, stored, *mounting])))
+        return f'{words}{self._next()}'
 
     def _with_files(self, function: Callable[..., Found], *given: Any) -> Part[Found]:
         """Use files; fail if another sensor replaces this one meanwhile."""

@@ -47,6 +47,7 @@ from ..calibrate import (
     Calibration,
     FrameName,
     in_frame,
+    mounting_figures,
     mounting_of,
     mounting_words,
     on_topics,
@@ -413,8 +414,11 @@ class Session:
         action = next_action(self)
         if rating is not None and action is not None and sensor.present is calibration:
             service = f'~/{action.command}' if action.command else ''
+            mounting = {'mounting': mounting_figures(
+                calibration.rotation, self.frame_id or '', self.settings.base_frame)}
             self._events.append(Result(json.dumps({
                 **found, 'in_use': sensor.offered is not calibration,
+                **(mounting if calibration.is_levelled else {}),
                 **rating_json(rating, action.kind, action.words, service)})))
         return ''
 

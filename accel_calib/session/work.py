@@ -50,16 +50,18 @@ _FEWEST_NATIVE = 4
 @dataclass(frozen=True)
 class Fitted:
     """
-    A fit, or a refinement, with its rating and what to answer.
+    A fit, or a refinement, with its rating.
 
-    `differs`: an automatic fit replaces the calibration before it. `refusal` is the reason and
-    the advice if it must not be used, and `planned` are the poses to take next.
+    `words` are the answer, one sentence, and `details` are for the log. `differs`: an automatic
+    fit replaces the calibration before it. `refusal` is the reason and the advice if it must not
+    be used, and `planned` are the poses to take next.
 
     """
 
     calibration: Calibration
     rating: Rating
-    words: list[str]
+    words: str
+    details: list[str]
     differs: bool = True
     refinement: Refinement | None = None
 
@@ -79,8 +81,8 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
     """Return a fit of all poses with its rating; parameters and errors are as in `fitted`."""
     calibration = fitted(poses, units, settings, sensor, before)
     rating = rate(calibration)
-    return Fitted(calibration, rating, [summary(calibration, rating),
-                                        change_words(before, calibration)],
+    return Fitted(calibration, rating, summary(calibration, rating),
+                  [*fit_details(calibration), change_words(before, calibration)],
                   replaces(before, calibration))
 
 
@@ -189,10 +191,11 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
             f'find what else changed with it; {hint}' if hint else 'find what else changed with '
             'it: check the mounting and the setup, and take the poses again'))
     rating = rate_refinement(refinement)
-    words = [story(refinement, rating)]
+    details = refinement_details(refinement)
     if not refinement.refusal:
-        words.append(change_words(before, refinement.calibration))
-    return Fitted(refinement.calibration, rating, words, refinement=refinement)
+        details.append(change_words(before, refinement.calibration))
+    return Fitted(refinement.calibration, rating, summary_of(refinement, rating), details,
+                  refinement=refinement)
 
 
 def rated(calibration: Calibration, refinement: Refinement | None) -> Rating:
@@ -248,29 +251,40 @@ def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
 
 
 def summary(calibration: Calibration, rating: Rating) -> str:
-    """Return the rating and the quality of a fit as one line."""
+    """Return the rating and the residual of a fit in one sentence."""
     quality = calibration.quality
-    floor = ('' if quality.noise_floor_mg is None
-             else f', noise floor {quality.noise_floor_mg:.3f} mg')
-    words = [f'{rating.name}: model {calibration.name} from '
-             f'{len(calibration.used_poses)} of {counted(len(calibration.poses), "pose")}: '
-             f'residual {quality.rms_before_mg:.2f} mg before, {quality.rms_after_mg:.3f} mg after'
-             f'{floor}']
-    if is_partial(calibration):
-        words.append(calibration.reason)
-    words += [f'pose {rejected.row} left out: {rejected.reason}'
-              for rejected in calibration.rejected]
-    return '; '.join([*words, *calibration.warnings])
+    about = calibration.reason if is_partial(calibration) else (
+        f'model {calibration.name} from {len(calibration.used_poses)} of '
+        f'{counted(len(calibration.poses), "pose")}')
+    return (f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
+            f'{quality.rms_after_mg:.3f} mg after')
 
 
-def story(refinement: Refinement, rating: Rating) -> str:
-    """Return the rating and the result of a refinement as one line."""
-    lines = [f'{rating.name}: {verdict_words(refinement).rstrip(".")}; '
-             f'{residual_words(refinement)}']
-    for step in refinement.steps:
-        rivals = f' (or {", ".join(step.likely_rivals)})' if step.rivals else ''
-        lines.append(f'{shown_name(step.name)}{rivals} {step.gap_before_mg:.3f} to '
-                     f'{step.gap_after_mg:.3f} mg, {step.where}')
+def fit_details(calibration: Calibration) -> list[str]:
+    """Return noise floor, poses that are left out, and warnings of a fit."""
+    floor = calibration.quality.noise_floor_mg
+    return [*([] if floor is None else [f'noise floor {floor:.3f} mg']),
+            *(f'pose {each.row} left out: {each.reason}' for each in calibration.rejected),
+            *calibration.warnings]
+
+
+def summary_of(refinement: Refinement, rating: Rating) -> str:
+    """Return the rating, the verdict with the named effects, and the residual in one sentence."""
+    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
+                                      else '') for step in refinement.steps]
+    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
+    verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+               'described': f'{found} describe{verb} the gap'}.get(
+        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
+        'effect explains')
+    return f'{rating.name}: {verdict}, {residual_words(refinement)}'
+
+
+def refinement_details(refinement: Refinement) -> list[str]:
+    """Return the verdict, where each effect shows, poses that are left out, and warnings."""
+    lines = [verdict_words(refinement).rstrip('.')]
+    lines += [f'{shown_name(step.name)} {step.gap_before_mg:.3f} to {step.gap_after_mg:.3f} mg, '
+              f'{step.where}' for step in refinement.steps]
     if refinement.disturbed_poses:
         lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
-    return '; '.join([*lines, *refinement.calibration.warnings, *refinement.advice])
+    return [*lines, *refinement.calibration.warnings, *refinement.advice]
