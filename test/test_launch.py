@@ -23,6 +23,7 @@ from typing import Any
 from accel_calib.session import CalibratorSettings, WEB_PORT
 from inside import default_of
 import pytest
+import yaml
 
 ROOT = Path(__file__).parent.parent
 CALIBRATOR = ROOT / 'launch' / 'calibrator.launch.py'
@@ -372,6 +373,66 @@ def test_filters_use_orientation_rate_and_acceleration_of_the_imu(started: Any) 
     assert used == {
         'imu0': ['roll', 'pitch', 'yaw', 'vroll', 'vpitch', 'vyaw', 'ax', 'ay', 'az'],
         'odom0': ['vx', 'vy']}
+
+
+# Names of other packages
+
+NAV2 = ROOT / 'docs' / 'guides' / 'nav2.md'
+
+_IMU = ('', '_config', '_differential', '_relative', '_queue_size', '_pose_rejection_threshold',
+        '_twist_rejection_threshold', '_linear_acceleration_rejection_threshold',
+        '_remove_gravitational_acceleration')
+_ODOM = (*_IMU[:7], '_pose_use_child_frame')
+_ODOMETRY = frozenset({'odom_topic'})
+
+THEIRS = {
+    # robot_localization, src/ros_filter.cpp
+    'ekf_filter_node': {
+        'print_diagnostics', 'gravitational_acceleration', 'debug', 'debug_out_file', 'map_frame',
+        'odom_frame', 'base_link_frame', 'base_link_frame_output', 'world_frame', 'tf_prefix',
+        'publish_tf', 'publish_acceleration', 'permit_corrected_publication',
+        'transform_time_offset', 'transform_timeout', 'frequency', 'predict_to_current_time',
+        'sensor_timeout', 'two_d_mode', 'smooth_lagged_data', 'history_length',
+        'reset_on_time_jump', 'disabled_at_startup', *(f'imu0{end}' for end in _IMU),
+        *(f'odom0{end}' for end in _ODOM)},
+    # imu_filter_madgwick, src/imu_filter_ros.cpp
+    'imu_filter': {
+        'stateless', 'use_mag', 'publish_tf', 'reverse_tf', 'fixed_frame', 'constant_dt',
+        'remove_gravity_vector', 'publish_debug_topics', 'yaw_offset', 'declination',
+        'world_frame', 'gain', 'zeta', 'mag_bias_x', 'mag_bias_y', 'mag_bias_z',
+        'orientation_stddev'},
+    # nav2_lifecycle_manager, src/lifecycle_manager.cpp
+    'lifecycle_manager_imu': {'node_names', 'autostart', 'bond_timeout',
+                              'bond_respawn_max_duration', 'attempt_respawn_reconnection'},
+    # nav2_bt_navigator, nav2_controller, nav2_velocity_smoother: what the page uses
+    'bt_navigator': _ODOMETRY, 'controller_server': _ODOMETRY, 'velocity_smoother': _ODOMETRY,
+    'calibrator': set(DEFAULTS)}
+"""Names of the parameters of each node, in the files of its package at the commits `FROM`."""
+
+BRINGUP = {'namespace', 'use_namespace', 'slam', 'map', 'use_localization', 'use_sim_time',
+           'params_file', 'autostart', 'use_composition', 'use_respawn', 'log_level'}
+"""Arguments of nav2_bringup, launch/bringup_launch.py."""
+
+FROM = {'robot_localization': '1cb953379378d13b3e0935ed73d0c7407bd80543',
+        'imu_filter_madgwick': 'c8a27cda72ad4e89245e851c732888a089e86065',
+        'nav2_bringup, nav2_lifecycle_manager': 'f4108e5b1c2bce804a1aa0c7be6673a8eb4a1501'}
+
+
+def test_parameters_of_other_packages_have_their_names(started: Any) -> None:
+    text = NAV2.read_text(encoding='utf-8')
+    shown = [yaml.safe_load(block)
+             for block in re.findall(r'^```yaml\n(.*?)^```', text, re.MULTILINE | re.DOTALL)]
+    given = {name: about['ros__parameters'] for block in shown for name, about in block.items()}
+    assert set(given) == set(THEIRS)
+    _, madgwick, ekf = started(ROOT / 'launch' / 'with_filters.launch.py').nodes
+    for name, values in (*given.items(), ('imu_filter', madgwick.values()),
+                         ('ekf_filter_node', ekf.values())):
+        assert set(values) <= THEIRS[name], name
+    for key in ('imu0_config', 'odom0_config'):
+        assert [type(each) for each in given['ekf_filter_node'][key]] == [bool] * 15
+    bringup, = re.findall(r'ros2 launch nav2_bringup bringup_launch.py (.*)', text)
+    assert {each.partition(':=')[0] for each in bringup.split()} <= BRINGUP
+    assert dict(re.findall(r'^\| (\S.*?) \| .* \| `(\w{40})` \|$', text, re.MULTILINE)) == FROM
 
 
 @pytest.mark.parametrize(('name', 'more'), [
