@@ -55,6 +55,10 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'undetermined': 'the poses do not determine the largest model',
     'copies': 'equal rows count as one pose',
     'unlike_fleet': 'the sensor is unlike the fleet',
+    'not_calibrated': 'recordings of a fleet have no usable calibration',
+    'unnamed': 'recordings of a fleet do not say of which sensor they are',
+    'noisy': 'the white noise at rest is larger than that of common parts',
+    'not_seen': 'a rest does not show all figures of the noise',
     'open': 'what poses near one direction leave open',
     'correction_in_file': 'an edited file states another correction than its effects',
     'note': 'a note'})
@@ -71,10 +75,12 @@ STEPS: Mapping[str, str] = MappingProxyType({
     'accept': 'use the offered calibration, or discard it',
     'save': 'store the calibration',
     'verify': 'check the calibration with new poses',
+    'record': 'record again, as the words say',
     'done': 'nothing more needs to be done'})
 """Kinds of next steps and their meaning, in the order of a calibration."""
 
-_STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify'}
+_STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify',
+            **dict.fromkeys(('not_calibrated', 'unnamed', 'noisy', 'not_seen'), 'record')}
 """Step by kind of finding; for other kinds, poses are to be taken."""
 
 _RANKS = {kind: rank for rank, kind in enumerate(KINDS)}

@@ -98,6 +98,21 @@ def test_each_recording_becomes_a_row_and_a_calibration(client: Any, tmp_path: P
         assert stored.date == row['date'] == f'{Path(row["recording"]).stem}T00:00:00+00:00'
 
 
+def test_recordings_without_a_name_are_said_to_need_one(client: Any, tmp_path: Path) -> None:
+    for k in range(3):
+        write_poses(tmp_path / 'in' / f'board{k}.csv', OFFSET, seed=k, sensor='')
+    summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
+    (finding,) = [each for each in summary.rating.findings if each.kind == 'unnamed']
+    assert finding.text.startswith('3 recordings')
+    assert '--sensor-from' in finding.advice
+    page = (tmp_path / 'out' / 'fleet.html').read_text(encoding='utf-8')
+    assert '--sensor-from' in page
+    named = replace(QUICK, sensor_from=r'board\d')
+    summary = run(client, found_in(tmp_path / 'in'), named, Store(tmp_path / 'other'))
+    assert {row['sensor'] for row in summary.sensors} == {'board0', 'board1', 'board2'}
+    assert 'unnamed' not in {each.kind for each in summary.rating.findings}
+
+
 def test_workers_do_what_is_to_be_done_for_each_sensor(
         client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)

@@ -14,6 +14,7 @@ from accel_calib import simulate
 from accel_calib.calibrate import fit_poses, FleetPrior
 from accel_calib.compare import history_of
 from accel_calib.estimate import Prior
+from accel_calib.findings import rate_fleet
 from accel_calib.fleet import Store
 from accel_calib.stored import write_calibration
 from accel_calib.units import Units
@@ -189,6 +190,7 @@ def write_store(folder: Path, count: int, dates: int = 6, name: str = 'robot_{}/
                   'p_value': 1e-9, 'parameter': 'offset.y', 'change': 0.012, 'sd': 4e-4,
                   'for_good': True, 'recording': rows[dates // 2]['recording']}
         sensors.append({'sensor': unquote(as_folder(name.format(k))), 'calibrations': dates,
+                        'recordings': dates,
                         'last': rows[-1]['date'], 'p_value': 1e-9 if k == 3 else 0.5,
                         'changes': [change] if k == 3 else [], 'drift': None})
     return store, sensors
@@ -226,6 +228,26 @@ def test_the_page_draws_the_values_the_drift_and_the_sensors_that_changed(page: 
     assert 'logs/3_3.mcap: offset y +12.00 ± 0.40 mg, for good' in changed
     assert '12.3' in page.partition('Typical values')[2]
     assert 'other sensors not shown' in page
+
+
+def test_the_page_begins_with_a_verdict(page: str) -> None:
+    body = page.partition('<h1')[2]
+    assert '<title>Usable: fleet</title>' in page
+    assert body.index('class="verdict USABLE"') < body.index('<section')
+    verdict = body.partition('class="verdict')[2].partition('</div>')[0]
+    assert '180 recordings of 30 sensors: 180 GOOD' in verdict
+    assert '1 sensor changed' in verdict
+
+
+@pytest.mark.parametrize(('counts', 'changed', 'unnamed', 'name', 'kinds'), [
+    ({'GOOD': 3, 'USABLE': 1}, 0, 0, 'GOOD', []),
+    ({'GOOD': 3, 'error': 1}, 0, 1, 'USABLE', ['not_calibrated']),
+    ({'BAD': 1, 'unread': 1}, 0, 0, 'BAD', ['not_calibrated']),
+    ({'GOOD': 4}, 0, 4, 'USABLE', ['unnamed']), ({'GOOD': 4}, 1, 0, 'USABLE', ['changed'])])
+def test_a_fleet_is_rated_by_its_recordings(
+        counts: dict[str, int], changed: int, unnamed: int, name: str, kinds: list[str]) -> None:
+    rating = rate_fleet(counts, 2, changed, unnamed)
+    assert (rating.name, [each.kind for each in rating.findings]) == (name, kinds)
 
 
 def test_the_page_needs_no_script_and_no_other_file(page: str) -> None:

@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 from accel_calib.errors import InputError
+from accel_calib.findings import rate_noise
 from accel_calib.logs import write_table
 from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
@@ -293,10 +294,30 @@ def test_the_figures_are_printed_written_and_drawn(
     assert made['accelerometer_random_walk'] is None
     assert all(limit > 0.0 for limit in made['accelerometer_random_walk_axes_upper'])
     text = (tmp_path / 'noise.html').read_text()
-    for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density'):
+    for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density',
+                  '49 to 280', 'class="verdict USABLE"'):
         assert words in text
     assert 'http:' not in text
     assert 'https:' not in text
+
+
+def test_figures_are_beside_those_of_common_parts(capsys: pytest.CaptureFixture[str],
+                                                  tmp_path: Path) -> None:
+    path = tmp_path / 'rest.csv'
+    write_table(path, resting(20, 6000, gyro=1e-4))
+    assert main(['noise', str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith('typical')] == [
+        'typical white noise: 49 to 280 µg/√Hz', 'typical white noise: 2 to 3.5 m°/s/√Hz']
+    assert any(line.startswith('USABLE') for line in lines)
+
+
+@pytest.mark.parametrize(('white', 'kind'), [(1e-4, 'not_seen'), (1e-3, 'noisy')])
+def test_a_rest_is_rated(white: float, kind: str) -> None:
+    rating = rate_noise(noise_of(resting(20, 6000, white), G))
+    assert rating.name == 'USABLE'
+    assert kind in {each.kind for each in rating.findings}
+    assert ('noisy' in {each.kind for each in rating.findings}) is (kind == 'noisy')
 
 
 def test_a_calibration_turns_counts_into_g(tmp_path: Path) -> None:

@@ -141,7 +141,8 @@ def run_fleet(args: argparse.Namespace) -> Done:
             summary = run(client, found, asked, Store(args.output.absolute()), moved,
                           args.time_limit or LIMIT_S)
     return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
-                 'sensors': summary.sensors}, _summary_lines(summary, args.output))
+                 'sensors': summary.sensors, **rated(summary.rating, args)},
+                [*_summary_lines(summary, args.output), *rating_lines(summary.rating, args)])
 
 
 def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:

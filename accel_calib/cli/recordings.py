@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from rich import box
 from rich.table import Table
 
-from .frame import Done, progress, working
+from .frame import Done, progress, rated, rating_lines, working
 from .inputs import log_options, settings, stored_calibration
 from ..calibrate import (
     Calibration,
@@ -28,6 +28,7 @@ from ..capture import Captured
 from ..disk import STANDARD_OUTPUT
 from ..effects import Context, parse_effect
 from ..errors import InputError
+from ..findings import rate_noise
 from ..intake import Intake, samples_again, still_poses
 from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
 from ..table import Poses, Recording
@@ -146,8 +147,9 @@ def run_noise(args: argparse.Namespace) -> Done:
         stored = [f'stored in {args.report}']
     else:
         stored = []
-    return Done({'recording': args.recording, **to_json(found)},
-                [*lines, *_noise_lines(found), *stored])
+    rating = rate_noise(found)
+    return Done({'recording': args.recording, **to_json(found), **rated(rating, args)},
+                [*lines, *_noise_lines(found), *stored, *rating_lines(rating, args)])
 
 
 def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
@@ -200,12 +202,14 @@ def _corrected_rest(recording: Recording, units: Units, calibration: Calibration
 def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
     """Yield the figures by axis, the notes, and the figures for Kalibr."""
     from ..noise import duration
-    from ..report.noise_page import kalibr_lines, need_lines
+    from ..report.noise_page import figure_rows, kalibr_lines, need_lines
 
     yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
            f'{found.rate:.5g} Hz')
     for kind in found.kinds:
         yield _noise_table(kind, found.of(kind))
+        yield from (f'typical {label}: {cells[-1]} {unit}'
+                    for label, unit, cells in figure_rows(found.of(kind)) if cells[-1])
     yield from (f'note: {note}' for note in found.notes)
     yield from need_lines(found)
     yield from kalibr_lines(found)
@@ -220,5 +224,5 @@ def _noise_table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
     for axis in axes:
         table.add_column(axis.axis, justify='right', no_wrap=True)
     for label, unit, cells in figure_rows(axes):
-        table.add_row(f'{label}, {unit}', *cells)
+        table.add_row(f'{label}, {unit}', *cells[:-1])
     return table

@@ -40,9 +40,18 @@ from .figures import (
     scale_of,
 )
 from .limits import GOOD_MG, Limit, LIMITS
-from .verdicts import rate, rate_comparison, rate_refinement, rate_verification, Rating
+from .verdicts import (
+    rate,
+    rate_comparison,
+    rate_fleet,
+    rate_noise,
+    rate_refinement,
+    rate_verification,
+    Rating,
+)
 
 __all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'OFFSETS', 'Expected', 'Figure', 'Limit',
            'Rating', 'calibration_json', 'change_in_words', 'effect_figures', 'figures_of',
-           'in_words', 'linear_figures', 'rate', 'rate_comparison', 'rate_refinement',
-           'rate_verification', 'rating_json', 'refinement_json', 'residual_figures', 'scale_of']
+           'in_words', 'linear_figures', 'rate', 'rate_comparison', 'rate_fleet', 'rate_noise',
+           'rate_refinement', 'rate_verification', 'rating_json', 'refinement_json',
+           'residual_figures', 'scale_of']

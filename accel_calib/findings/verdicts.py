@@ -1,11 +1,11 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rating of calibrations, refinements, verifications and comparisons."""
+"""The rating of calibrations, refinements, verifications, comparisons, rests and fleets."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from .rules import degrees, findings_of, mg, number, step_after
 from ..calibrate import Calibration, Verification
 from ..estimate import coverage
 from ..finding import Finding, Level, NextStep, ranked
+from ..noise import duration, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..table import Poses
 from ..text import counted
 from ..units import MG
@@ -218,6 +219,81 @@ def rate_comparison(comparison: Comparison) -> Rating:
                              'mounted again', 'USABLE'))
     return _rated(found, 'the calibrations agree within their uncertainties', figures,
                   NextStep('done', 'use the latest calibration'))
+
+
+_NOISY = 2.0
+"""White noise in units of the largest typical one that is worth a finding."""
+
+
+def rate_noise(found: NoiseFigures) -> Rating:
+    """
+    Rate the figures of a rest.
+
+    Returns
+    -------
+    Rating
+        GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not
+        seen or the noise is larger than that of common parts, BAD without white noise.
+
+    """
+    findings, shown = list[Finding](), [f'rest of {duration(found.seconds)}']
+    for kind in found.kinds:
+        axes, density = found.of(kind), found.common(kind, 'noise_density')[0]
+        unit, scale = shown_unit(kind, 'noise_density', axes[0].unit)
+        if math.isfinite(density):
+            shown.append(f'{kind} {density * scale:.3g} {unit}')
+        unseen = [name for name in ('noise_density', 'random_walk') if (kind, name) in found.needs]
+        findings += [Finding(
+            'not_seen', f'the rest does not show the {WORDS[name]} of the {kind} on all axes',
+            found.needs[kind, name], 'BAD' if name == 'noise_density' else 'USABLE')
+            for name in unseen[:1]]
+        limits = TYPICAL.get((kind, 'noise_density', axes[0].unit))
+        if limits and density > _NOISY * limits[1]:
+            findings.append(Finding(
+                'noisy', f'the white noise of the {kind} is {density / limits[1]:.1f} times that '
+                'of noisy common parts', 'keep vibration and fans away, and record again',
+                'USABLE'))
+    return _rated(findings, 'the rest shows all figures', ', '.join(shown),
+                  NextStep('done', 'use the figures'))
+
+
+def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: int) -> Rating:
+    """
+    Rate the calibrations of a fleet.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+        Recordings by rating, or by status without a rating.
+    sensors, changed : int
+        Number of sensors, and of those whose calibrations do not agree.
+    unnamed : int
+        Number of recordings without a name of their sensor.
+
+    Returns
+    -------
+    Rating
+        GOOD if every recording has a usable calibration and no sensor changed, BAD if none has.
+
+    """
+    total, usable = sum(counts.values()), counts.get('GOOD', 0) + counts.get('USABLE', 0)
+    figures = (f'{counted(total, "recording")} of {counted(sensors, "sensor")}: '
+               f'{", ".join(f"{count} {name}" for name, count in sorted(counts.items()))}')
+    found = []
+    if usable < total:
+        found.append(Finding(
+            'not_calibrated', f'{total - usable} of {counted(total, "recording")} have no usable '
+            'calibration', 'see their errors, and record them again',
+            'USABLE' if usable else 'BAD'))
+    if changed:
+        found.append(Finding('changed', f'{counted(changed, "sensor")} changed',
+                             'use the latest calibrations of these', 'USABLE', step='done'))
+    if unnamed > 1:
+        found.append(Finding(
+            'unnamed', f'{unnamed} recordings do not state their sensor, and count as one sensor',
+            'take the names of the sensors from the paths with --sensor-from REGEX', 'USABLE'))
+    return _rated(found, 'each recording has a usable calibration', figures,
+                  NextStep('done', 'use the calibrations'))
 
 
 def _without_noise(residual_mg: float, noise_mg: float | None) -> float:

@@ -30,11 +30,12 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from .inputs import UNKNOWN
 from .sensors import alike, FEWEST, Typical, typical_of
 from .task import Row, Store
 from ..compare import NAMES
 from ..effects import LADDER
-from ..findings import scale_of
+from ..findings import rate_fleet, Rating, scale_of
 from ..table import Floats
 from ..text import counted, short
 
@@ -285,6 +286,12 @@ def not_agreeing(sensors: Iterable[Row]) -> list[Row]:
     last = max((k for k, row in enumerate(tested, 1) if row['p_value'] <= _FALSE * k / count),
                default=0)
     return tested[:last]
+
+
+def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
+    """Return the rating of a fleet."""
+    unnamed = sum(int(row['recordings']) for row in sensors if row['sensor'] == UNKNOWN)
+    return rate_fleet(known.counts, len(sensors), len(not_agreeing(sensors)), unnamed)
 
 
 def shared_effects(effects: Mapping[str, Mapping[str, float]]) -> list[str]:

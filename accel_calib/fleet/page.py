@@ -28,14 +28,21 @@ from .charts import (
     of_sensor,
     of_values,
 )
-from .overview import not_agreeing, odd_sensors, OfModel, Overview, shared_effects
+from .overview import (
+    not_agreeing,
+    odd_sensors,
+    OfModel,
+    Overview,
+    rating_of,
+    shared_effects,
+)
 from .sensors import alike
 from .task import Row, Store
 from .. import __version__
 from ..calibrate import FleetPrior
 from ..compare import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import scale_of
+from ..findings import Rating, scale_of
 from ..report.charts import Drawing, has_matplotlib
 from ..report.repeats import spoken
 from ..report.sheet import (
@@ -43,9 +50,10 @@ from ..report.sheet import (
     heading,
     listing,
     paragraph,
+    rated_sheet,
     scroll_table,
     section,
-    sheet,
+    verdict_box,
     write_sheet,
 )
 from ..text import counted, short
@@ -71,18 +79,17 @@ _DRIFTS = 0.05
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    write_sheet(store.folder / PAGE, sheet('Fleet', _body(store, known, sensors, priors),
-                                           script=False))
+    rating = rating_of(known, sensors)
+    write_sheet(store.folder / PAGE, rated_sheet('Fleet', rating, _body(
+        store, known, sensors, priors, rating), script=False))
 
 
 def _body(store: Store, known: Overview, sensors: Sequence[Row],
-          priors: Mapping[str, FleetPrior]) -> Iterator[str]:
+          priors: Mapping[str, FleetPrior], rating: Rating) -> Iterator[str]:
     """Yield the parts of the page."""
     differ = not_agreeing(sensors)
-    yield heading('Calibrations of a fleet', [
-        counted(sum(known.counts.values()), 'recording'), counted(len(sensors), 'sensor'),
-        ', '.join(f'{count} {name}' for name, count in sorted(known.counts.items())),
-        f'accel_calib {__version__}'])
+    yield heading('Calibrations of a fleet', [f'accel_calib {__version__}'])
+    yield verdict_box(rating)
     if not has_matplotlib():
         yield paragraph('This page has no figures, because matplotlib is not installed.')
     yield paragraph(f'Not compared: {counted(known.left_out, "recording")} whose poses do not '

@@ -22,7 +22,7 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from .inputs import Input
-from .overview import digest_of, Overview, overview
+from .overview import digest_of, Overview, overview, rating_of
 from .page import write_fleet_page
 from .sensors import merge_sensor, PRIOR_FILE, priors_of, read_sensors, write_sensors
 from .task import (
@@ -39,6 +39,7 @@ from .task import (
 from ..calibrate import FleetPrior
 from ..effects import know_code, known_code
 from ..errors import InputError
+from ..findings import Rating
 from ..logs import Progress
 from ..stored import write_priors
 
@@ -94,6 +95,8 @@ class Summary:
         Typical values by model of sensor.
     damaged : tuple of str
         Damaged files of the results, under their new names; their content was made again.
+    rating : Rating
+        The verdict about the whole fleet.
 
     """
 
@@ -101,6 +104,7 @@ class Summary:
     sensors: tuple[Row, ...]
     priors: Mapping[str, FleetPrior]
     damaged: tuple[str, ...]
+    rating: Rating
 
 
 @contextmanager
@@ -193,7 +197,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         known = overview(_by_sensor(client, digest_of, [*store.sensors(), UNREAD], store))
         priors = _stored_priors(store, known)
         write_fleet_page(store, known, sensors, priors)
-        return Summary(counts, sensors, priors, damaged)
+        return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
 
 
 def _stored_priors(store: Store, known: Overview) -> dict[str, FleetPrior]:

@@ -10,9 +10,9 @@ returns these by axis, with their limits in words, and as JSON.
 
 """
 
-from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
+from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from .curve import check_allantools, whole
 from .figures import duration, noise_of, to_json
 
-__all__ = ['FIGURES', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
+__all__ = ['FIGURES', 'TYPICAL', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
            'duration', 'noise_of', 'shown_unit', 'to_json', 'whole']

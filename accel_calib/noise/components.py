@@ -280,6 +280,22 @@ _MICRO_G = 1e6 / STANDARD_GRAVITY
 
 _MILLI_DEGREES = float(np.degrees(1e3))
 
+_ONE_SIDED = 2.0 ** 0.5
+"""Data sheets state the density for positive frequencies alone, which is √2 N."""
+
+TYPICAL: Mapping[tuple[str, str, str], tuple[float, float]] = {
+    ('accelerometer', 'noise_density', 'm/s²'): (
+        70.0 / _MICRO_G / _ONE_SIDED, 400.0 / _MICRO_G / _ONE_SIDED),
+    ('gyroscope', 'noise_density', 'rad/s'): (
+        2.8 / _MILLI_DEGREES / _ONE_SIDED, 5.0 / _MILLI_DEGREES / _ONE_SIDED)}
+"""
+N of a quiet and of a noisy common part, by sensor, figure and unit.
+
+From the data sheets of ICM-42688-P (TDK DS-000347, tables 1 and 2) and MPU-6050 (InvenSense
+PS-MPU-6000A-00, revision 3.4, sections 6.1 and 6.2). They do not state the other figures.
+
+"""
+
 _SHOWN = {
     ('accelerometer', 'noise_density'): ('µg/√Hz', _MICRO_G),
     ('accelerometer', 'bias_instability'): ('µg', _MICRO_G),

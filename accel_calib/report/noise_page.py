@@ -25,13 +25,15 @@ from .sheet import (
     listing,
     numbers,
     paragraph,
+    rated_sheet,
     scroll_table,
     section,
-    sheet,
+    verdict_box,
     write_sheet,
 )
 from .. import __version__
-from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, WORDS
+from ..findings import rate_noise
+from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..text import power_of_ten, with_sd
 from ..units import is_native
 
@@ -82,13 +84,14 @@ def _page(found: NoiseFigures, source: str) -> str:
     title = f'Noise of {Path(source).name or source}'
     about = [source, f'accel_calib {__version__}']
     drawn = (_allan(found.of(kind)) for kind in found.kinds)
-    body = [heading(title, about), _rest(found), figures(drawn, 'pair'),
+    rating = rate_noise(found)
+    body = [heading(title, about), verdict_box(rating), _rest(found), figures(drawn, 'pair'),
             *(_table(found, kind) for kind in found.kinds),
             section('Notes', listing(found.notes)),
             section('Not seen', listing(need_lines(found))),
             section('For Kalibr and VINS', listing(kalibr_lines(found))),
             how_to_read(_HOW_TO_READ)]
-    return sheet(title, body)
+    return rated_sheet(title, rating, body)
 
 
 def _allan(axes: Sequence[AxisNoise]) -> Drawing:
@@ -141,21 +144,25 @@ def _table(found: NoiseFigures, kind: Kind) -> str:
     axes = found.of(kind)
     rows = [[f'{label} [{unit}]', *cells] for label, unit, cells in figure_rows(axes)]
     rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
-                             for axis in axes)])
-    head = ['', *(axis.axis for axis in axes)]
+                             for axis in axes), ''])
+    head = ['', *(axis.axis for axis in axes), 'typical']
     return section(_NAMES[kind], scroll_table(head, rows, 'whole-cells', f'Noise of the {kind}'),
                    paragraph('± is one standard deviation; < is the upper limit with 95 % '
-                             'probability of a figure that the curve does not show.', 'soft'))
+                             'probability of a figure that the curve does not show. Typical: '
+                             'common parts, from the data sheets of ICM-42688-P and MPU-6050, '
+                             'divided by √2; data sheets do not state the other figures.', 'soft'))
 
 
 def figure_rows(axes: Sequence[AxisNoise]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield words, unit and a cell for each axis of each figure."""
+    """Yield words, unit, and a cell for each axis and for typical values of each figure."""
     for figure in FIGURES:
         unit, scale = shown_unit(axes[0].kind, figure, axes[0].unit)
         found = [axis.figures[figure] for axis in axes]
         yield WORDS[figure], unit, [
-            with_sd(each.value * scale, each.sd * scale) if each.seen
-            else f'< {float(f"{each.upper * scale:.2g}"):g}' for each in found]
+            *(with_sd(each.value * scale, each.sd * scale) if each.seen
+              else f'< {float(f"{each.upper * scale:.2g}"):g}' for each in found),
+            ' to '.join(f'{float(f"{limit * scale:.2g}"):g}' for limit in TYPICAL.get(
+                (axes[0].kind, figure, axes[0].unit), ()))]
 
 
 def need_lines(found: NoiseFigures) -> list[str]:

@@ -82,9 +82,9 @@ def policy(*, script: bool = True) -> str:
             "base-uri 'none'; form-action 'none'")
 
 
-def rated_sheet(title: str, rating: Rating, body: Iterable[str]) -> str:
+def rated_sheet(title: str, rating: Rating, body: Iterable[str], *, script: bool = True) -> str:
     """Return a page whose title in the browser begins with the verdict."""
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body)
+    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body, script=script)
 
 
 @cache
