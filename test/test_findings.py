@@ -14,7 +14,7 @@ from accel_calib.findings import figures_of, rate, Rating
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import format_calibration, parse_calibration
+from inside import format_calibration, Model, parse_calibration
 import numpy as np
 import pytest
 from shared import random_directions
@@ -125,6 +125,15 @@ def test_the_figures_of_a_calibration_are_those_of_its_fields() -> None:
     row = calibration.parameters.index('quadratic.z')
     assert found['quadratic.z'].value == 1000.0 * calibration.model.vector[row]
     assert found['quadratic.z'].unit == 'mg/g²'
+
+
+def test_a_gain_that_is_not_fitted_is_a_figure_without_deviation() -> None:
+    calibration = ac.fit(poses_of().reading, units='g')
+    fixed = replace(calibration, model=Model({'offset': calibration.offset}),
+                    covariance=calibration.covariance[:3, :3])
+    found = {figure.key: figure for figure in figures_of(fixed)}
+    assert (found['gain.x'].value, found['gain.x'].sd) == (1.0, 0.0)
+    assert 'gain.xy' not in found
 
 
 def test_figures_that_are_not_known_are_left_out() -> None:

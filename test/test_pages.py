@@ -306,6 +306,13 @@ def test_history_is_in_order_of_date_and_finds_the_change(dated):
     np.testing.assert_allclose(offset.values, expected, atol=1e-9)
 
 
+def test_calibrations_of_one_day_are_labelled_with_their_time(dated):
+    morning, evening = (replace(dated[0], date=f'2026-03-12T{hour}:30:00+00:00')
+                        for hour in ('08', '19'))
+    assert history_of([evening, dated[1], morning]).labels == (
+        '2026-02-12 10:00', '2026-03-12 08:30', '2026-03-12 19:30')
+
+
 def test_history_without_dates_keeps_the_order(dated):
     undated = [dated[2], replace(dated[0], date=''), dated[1]]
     history = history_of(undated)

@@ -191,6 +191,7 @@ def test_the_gap_of_a_stored_calibration_is_that_of_the_file(stored):
         new = poses_of(truth, rng, random_directions(16, rng), temperature=np.full(16, 20.0))
         found = refine(new, G, base=base)
         assert found.gap_mg == pytest.approx(verify(base, new).rms_after_mg)
+        assert len(set(found.poses_g.row.tolist())) == len(found.poses_g)
         assert (found.verdict == 'no_gap') is (truth is model)
 
 
@@ -331,6 +332,18 @@ def test_a_slow_change_of_the_offset_is_described_and_not_explained():
     assert 'offset_wander' in [step.effect for step in found.steps]
     assert found.verdict == 'described'
     assert 'a slow change of the offset' in verdict_words(found)
+
+
+def test_a_walk_beside_an_effect_is_a_step_of_its_own():
+    rng = np.random.default_rng([41, 2])
+    model = with_effects(rng, quadratic=np.array([0.012, -0.009, 0.01]))
+    poses = poses_of(model, rng, random_directions(60, rng), time=np.arange(60) * 30.0)
+    walk = np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3
+    found = refine(poses.with_columns(reading=poses.reading + walk), G)
+    assert [step.effect for step in found.steps] == ['quadratic', 'offset_wander']
+    first, second = found.steps
+    assert second.gap_before_mg == pytest.approx(first.gap_after_mg)
+    assert second.gap_after_mg < 0.5 * second.gap_before_mg
 
 
 @pytest.mark.parametrize('seed', [0, 1, 8])
