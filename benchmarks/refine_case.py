@@ -83,6 +83,9 @@ class Case:
         Whether the hidden effects are random.
     base : str
         Base of the refinement.
+    columns : int
+        Number of columns that the catalogue does not know. The first one is the temperature under
+        another name, so that an effect of it is one of a column; the others are noise.
 
     """
 
@@ -94,6 +97,7 @@ class Case:
     group: str = ''
     drawn: bool = False
     base: str = '10'
+    columns: int = 0
 
 
 @dataclass(frozen=True)
@@ -209,12 +213,13 @@ def run(case: Case) -> Outcome:
     """Simulate the poses of a case, refine them and judge the result."""
     made = simulate(np.random.default_rng(case.seed), case.hidden, case.setup)
     knocked = {row: abs(shown) / made.noise[row - 1] for row, shown in made.knocked.items()}
-    poses, started = poses_of(made), time.perf_counter()
+    poses = _with_columns(poses_of(made), case, 2)
+    started = time.perf_counter()
     try:
         refined = refine(poses, units_of('m/s2'), base=case.base)
         seconds = time.perf_counter() - started
-        named = tuple((step.effect, tuple(step.rivals)) for step in refined.steps
-                      if step.effect not in (*BASE, EMPIRICAL))
+        named = tuple((_of_temperature(step.name), tuple(map(_of_temperature, step.rivals)))
+                      for step in refined.steps if step.effect not in (*BASE, EMPIRICAL))
         other = again(np.random.default_rng((*case.seed, 1)), made)
         fresh = _fresh(case, poses, refined, other)
         return Outcome(case, refined.verdict, named, frozenset(refined.disturbed_poses), knocked,
@@ -225,6 +230,28 @@ def run(case: Case) -> Outcome:
     except Exception:
         return Outcome(case, 'error', (), frozenset(), knocked, (), None, None, (), None,
                        time.perf_counter() - started, traceback.format_exc())
+
+
+def _with_columns(poses: Poses, case: Case, salt: int) -> Poses:
+    """Return poses with the columns of a case in place of the temperature."""
+    if not case.columns:
+        return poses
+    rng, columns = np.random.default_rng((*case.seed, salt)), dict(poses.columns)
+    columns['column_0'] = columns.pop('temperature')
+    for k in range(1, case.columns):
+        noise = rng.normal(size=len(poses))
+        columns[f'column_{k}'] = np.cumsum(noise) if k % 2 else noise
+    return replace(poses, columns=columns)
+
+
+def _of_temperature(name: str) -> str:
+    """Return the name of an effect; those of the renamed temperature have their usual name."""
+    kind, _, variable = name.partition('-')
+    known = _COVARIATES.get(kind)
+    return known if known and variable in ('column_0', 'column_0-2') else name
+
+
+_COVARIATES = {'offset_covariate': 'offset_temperature', 'gain_covariate': 'gain_temperature'}
 
 
 def _lag(refined: Any) -> float | None:
@@ -238,7 +265,7 @@ def _lag(refined: Any) -> float | None:
 def _fresh(case: Case, poses: Poses, refined: Any, other: Simulated) -> Fresh:
     """Return the residuals that the base and the refined calibration leave in fresh poses."""
     base = fit_poses(poses, units_of('m/s2'), model=case.base)
-    fresh = poses_of(other)
+    fresh = _with_columns(poses_of(other), case, 3)
     return Fresh(verify(base, fresh).rms_after_mg, verify(refined.calibration, fresh).rms_after_mg,
                  float(np.sqrt(np.mean(other.noise ** 2)) * 1e3))
 

@@ -136,15 +136,17 @@ _TITLES = {
     'curved': 'offset linear and quadratic in temperature, size 5',
     'chamber': 'offset and gain over temperature, and warm-up, size 5',
     'sign': 'hysteresis by the sign of the motion, size 3', 'spoiled': 'nothing hidden',
-    'flicker': '1/f noise of the offset', 'large': 'two effects'}
+    'flicker': '1/f noise of the offset', 'large': 'two effects',
+    'columns': 'one effect of an unknown column', 'noise_columns': 'nothing hidden'}
 
 _RIGHT = {'faint': (0.85, 0.97), 'few': (0.65, 0.85), 'three': (0.9, 0.975, 0.975),
           'knocked_and_one': (0.95, 0.93, 0.9, 0.6), 'curved': (0.95,), 'chamber': (0.9,),
-          'sign': (0.95,), 'large': (0.995,), 'two': (0.95,), 'rising': (0.95,)}
+          'sign': (0.95,), 'large': (0.995,), 'two': (0.95,), 'rising': (0.95,),
+          'columns': (0.95, 0.95)}
 """Share of sets with the right names that is asked, by group."""
 
 _CHECKS: dict[str, tuple[Check, ...]] = {
-    **dict.fromkeys((*NOTHING, 'spoiled'), (
+    **dict.fromkeys((*NOTHING, 'spoiled', 'noise_columns'), (
         ('a name', _a_name, None, 0.02),
         ('an empirical term', lambda o: bool(o.where), None, 0.02),
         ('verdict no_gap', _no_gap, None, None))),

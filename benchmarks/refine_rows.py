@@ -12,7 +12,7 @@ random generator, so that the sets depend only on the seed, the row and their nu
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from generator import EFFECTS, ON_OUTPUT, OUTSIDE, Setup
 import numpy as np
@@ -59,6 +59,8 @@ class Group:
         Whether the hidden effects are random, and the kinds are therefore counted together.
     base : str
         Base of the refinement.
+    columns : int
+        As in `Case`.
 
     """
 
@@ -66,6 +68,7 @@ class Group:
     draw: Callable[[np.random.Generator], list[Kind]]
     drawn: bool = False
     base: str = '10'
+    columns: int = 0
 
 
 def _each(names: tuple[str, ...], size: float, setup: Setup = Setup()) -> Group:
@@ -148,6 +151,10 @@ GROUPS: dict[str, tuple[Group, ...]] = {
     'large': (_drawn('60 poses, sizes 100 and 3', (100.0, 3.0), Setup(noise_mg=1.0), BIG),),
     'outside60': (_each(OUTSIDE, 8.0),),
     'outside200': tuple(_each(OUTSIDE, size, Setup(poses=200)) for size in (3.0, 8.0)),
+    'columns': tuple(
+        replace(_each(('offset_temperature', 'gain_temperature'), 3.0), columns=count,
+                what=f'size 3, beside {count - 1} of noise') for count in (1, 10)),
+    'noise_columns': (replace(_fixed('25 columns of noise', {}, Setup()), columns=25),),
 }
 """The groups of each row; the seeds depend on the order of the rows."""
 
@@ -177,4 +184,4 @@ def cases_of(row: str, sets: int, seed: int) -> Iterator[Case]:
             kinds = group.draw(np.random.default_rng((*place, number)))
             for kind, (hidden, setup) in enumerate(kinds):
                 yield Case(row, hidden, setup, (*place, kind, number), row in ALONE,
-                           group.what, group.drawn, group.base)
+                           group.what, group.drawn, group.base, group.columns)
