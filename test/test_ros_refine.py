@@ -88,10 +88,11 @@ def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: 
 
 
 def check_corrected(bench: Any, readings: Readings, publisher: Any, corrected: list[Any],
-                    change: Callable[[float], float] = float) -> None:
+                    name: str = 'temperature [°C]', change: Callable[[float], float] = float
+                    ) -> None:
     """Check that messages at two temperatures, or other quantities, are corrected."""
     for value in (15.0, 35.0):
-        published(bench, publisher, value, 0.2)
+        meet(bench, publisher, value, name)
         shift = MOVES * change(value - 25.0) * 9.80665
         bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
                    corrected)
@@ -111,7 +112,7 @@ def test_a_quantity_of_a_robot_is_named_stored_and_corrected(bench: Any, reading
     found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
     np.testing.assert_allclose(found.model.values['offset_covariate-motor_current'][:3], MOVES,
                                atol=2e-4)
-    check_corrected(bench, readings, publisher, corrected)
+    check_corrected(bench, readings, publisher, corrected, 'motor_current')
 
 
 OWN = """
@@ -133,7 +134,7 @@ def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
     answer = bench.call('refine')
     assert answer.success, answer.message
     assert 'field_of_motor' in answer.message
-    check_corrected(bench, readings, publisher, corrected, abs)
+    check_corrected(bench, readings, publisher, corrected, 'motor_current', abs)
     assert bench.end(first, signal.SIGINT)[0] == 0
     bench.join_anew()
     second = bench.start('calibrator', **about)

@@ -248,6 +248,8 @@ def thermometer_words(session: Session) -> str:
     """Return how the node would get a temperature; empty if it has one."""
     if math.isfinite(session.around.temperature):
         return ''
+    if 'temperature' in session.missing:
+        return session.missing['temperature']
     topics = ' or '.join(session.thermometers)
     return (f'restart the node with temperature:={topics}' if topics else
             'publish the temperature of the sensor on the topic temperature')
