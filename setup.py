@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 NAME = 'accel_calib'
+# bloom and ROS read it there, and the package too; it stands nowhere else.
+VERSION = ElementTree.parse('package.xml').findtext('version')
 URL = 'https://github.com/accel-calib/accel_calib'
 
 FLEET = ['bokeh>=3.1,<4', 'dask[distributed]>=2024.2,<2027', 'distributed>=2024.2,<2027',
@@ -13,9 +17,11 @@ FLEET = ['bokeh>=3.1,<4', 'dask[distributed]>=2024.2,<2027', 'distributed>=2024.
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=VERSION,
     description='Calibrates an accelerometer in place: offset, gain, cross-axis and mounting '
                 'from still poses, and the named effects behind what is left.',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     author='The accel_calib authors',
     maintainer='The accel_calib authors',
     maintainer_email='maintainers@users.noreply.h-seed-877d15be.example',
@@ -78,6 +84,7 @@ setup(
         # What changes operators, and which tests execute a line: make mutants.
         'mutants': ['cosmic-ray>=8.4.1,<9', 'pytest-cov>=5,<8'],
         'dev': [
+            'build',
             'flake8',
             'flake8-builtins',
             'flake8-comprehensions',
@@ -89,6 +96,7 @@ setup(
             'reuse',
             'ruff~=0.17.5',
             'scipy-stubs',
+            'twine',
             'types-PyYAML',
         ],
     },

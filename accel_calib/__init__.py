@@ -54,6 +54,7 @@ Arrays are (n, 3): one row per pose or sample, columns x, y, z. A vector in fram
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 import sys
 from types import ModuleType
 from typing import Any, TYPE_CHECKING
@@ -75,7 +76,7 @@ if TYPE_CHECKING:
     from .api import simulate as simulate
     from .api import verify as verify
 
-__version__ = '0.1.0'
+    __version__: str
 
 __all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibrate', 'capture',
            'compare', 'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate',
@@ -93,6 +94,9 @@ class _Package(ModuleType):
     """
 
     def __getattr__(self, name: str) -> Any:
+        if name == '__version__':
+            self.__version__ = _version()
+            return self.__version__
         if name not in __all__:
             raise AttributeError(f'module {self.__name__!r} has no attribute {name!r}')
         return getattr(import_module('.api', self.__name__), name)
@@ -103,6 +107,16 @@ class _Package(ModuleType):
 
     def __dir__(self) -> list[str]:
         return sorted([*__all__, '__version__'])
+
+
+def _version() -> str:
+    """Return the version: that of package.xml beside the package, or of the installed package."""
+    source = Path(__file__).parent.parent / 'package.xml'
+    if source.is_file():
+        return source.read_text(encoding='utf-8').partition('<version>')[2].partition('<')[0]
+    from importlib.metadata import version  # slow, and not needed in a clone
+
+    return version(__name__)
 
 
 sys.modules[__name__].__class__ = _Package

@@ -93,9 +93,7 @@ text { font: 13px system-ui, sans-serif; fill: #222; text-anchor: middle; }
 .number { font-weight: 700; }
 .ground { fill: #000; opacity: 0.12; }
 .up { stroke: #222; stroke-width: 2; fill: none; }
-@media (prefers-color-scheme: dark) {
-  text { fill: #eee; } .ground { fill: #fff; } .up { stroke: #eee; }
-}
+.paper { fill: #fff; }
 </style>"""
 
 
@@ -118,7 +116,8 @@ def poses_svg() -> str:
     names = '; '.join(f'{k}: {words} up' for k, (_, words) in enumerate(poses, 1))
     parts = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" '
              f'aria-labelledby="title"><title id="title">{len(poses)} poses of the sensor. '
-             f'{escape(names)}</title>', _STYLE]
+             f'{escape(names)}</title>', _STYLE,
+             f'<rect class="paper" width="{width}" height="{height}" rx="8"/>']
     for k, (direction, words) in enumerate(poses):
         parts.append(f'<g transform="translate({k % 4 * _CELL[0] + _CELL[0] // 2} '
                      f'{k // 4 * _CELL[1] + 72})">')

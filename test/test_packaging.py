@@ -92,6 +92,47 @@ def test_version_email_and_addresses_agree(
                     'bugtracker': setup_py['project_urls']['Bug Tracker']}
 
 
+def test_the_version_stands_in_one_place(package_xml: ElementTree.Element) -> None:
+    (version,) = texts(package_xml, 'version')
+    files = [ROOT / 'setup.py', *ROOT.glob('*.md'), *(
+        path for folder in ('accel_calib', 'docs', 'launch', 'scripts')
+        for path in (ROOT / folder).rglob('*') if path.suffix in ('.py', '.md', '.rst'))]
+    assert len(files) > 200
+    assert not [path for path in files
+                if re.search(rf'\b{re.escape(version)}\b', path.read_text(encoding='utf-8'))]
+
+
+def test_the_page_about_installation_lists_every_part(setup_py: dict[str, Any]) -> None:
+    page = (ROOT / 'docs' / 'install.md').read_text(encoding='utf-8')
+    assert {*setup_py['extras_require']} <= {*re.findall(r'`([\w-]+)`', page)}
+
+
+def test_the_readme_installs_what_it_uses(setup_py: dict[str, Any]) -> None:
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    parts = re.findall(r"pip install './accel_calib\[([\w,]+)\]'", text)[0].split(',')
+    used = {'live': 'accel-calib live', 'logs': '.ulg', 'report': 'pictures/page.png',
+            'notebook': 'to_dataframe'}
+    assert set(parts) <= {*setup_py['extras_require']}
+    assert {part for part, mark in used.items() if mark in text} == set(parts)
+
+
+def test_messages_name_packages_of_the_index(setup_py: dict[str, Any]) -> None:
+    sources = [path.read_text(encoding='utf-8') for path in (ROOT / 'accel_calib').rglob('*.py')]
+    asked = {name for source in sources for names in re.findall(r"needing\('([^']+)'", source)
+             for name in names.split()}
+    known = {name for extra in setup_py['extras_require'].values()
+             for name in distributions(extra)}
+    assert {'aiohttp', 'dask', 'pandas', 'pyulog'} <= asked <= known
+    assert not [each for each in sources if re.search(r'pip install .{0,4}accel_calib', each)]
+
+
+def test_the_public_forge_runs_what_contributors_run() -> None:
+    workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'check.yaml').read_text())
+    steps = [step.get('run') for job in workflow['jobs'].values() for step in job['steps']]
+    assert steps[-1] == 'bash .ci/run'
+    assert os.access(ROOT / '.ci' / 'run', os.X_OK)
+
+
 def test_each_requirement_has_its_rosdep_key(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     extras = setup_py['extras_require']

@@ -38,7 +38,7 @@ from .task import (
 )
 from ..calibrate import FleetPrior
 from ..effects import know_code, known_code
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..findings import Rating
 from ..logs import Progress
 from ..stored import write_priors
@@ -125,13 +125,10 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         If Dask is not installed, or the scheduler cannot be reached.
 
     """
-    try:
+    with needing('dask distributed fsspec pyarrow bokeh', 'the command fleet'):
         import dask
         from distributed import Client, LocalCluster
         import pyarrow  # noqa: F401
-    except ImportError as err:
-        raise InputError(f'{err.name} is not installed, expected Dask and pyarrow',
-                         "run pip install 'accel_calib[fleet]'") from err
     if address:
         try:
             client = Client(address, timeout=_CONNECT_S, set_as_default=False)

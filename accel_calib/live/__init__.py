@@ -10,13 +10,10 @@ files for the browser.
 
 """
 
-from ..errors import InputError
+from ..errors import needing
 
 
 def check_installed() -> None:
     """Raise InputError if aiohttp, which the modules of this folder import, is not installed."""
-    try:
+    with needing('aiohttp pyserial segno', 'the live page'):
         import aiohttp  # noqa: F401
-    except ImportError as error:
-        raise InputError('aiohttp is not installed, but the live page needs it',
-                         "run pip install 'accel_calib[live]'") from error

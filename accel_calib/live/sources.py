@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..capture import samples_of
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..logs import LineReader, LogOptions, open_log
 from ..table import Floats, Recording
 from ..units import Units
@@ -202,11 +202,8 @@ class _Port:
                    for line in lines]
 
     def _open(self) -> None:
-        try:
+        with needing('pyserial', 'a serial port'):
             import serial
-        except ImportError as err:
-            raise InputError('pyserial is not installed, but a serial port needs it',
-                             "run pip install 'accel_calib[live]'") from err
         try:
             self._port = serial.serial_for_url(self._name, baudrate=self._baud, timeout=_WAIT_S)
         except (OSError, ValueError) as err:  # SerialException is an OSError

@@ -40,12 +40,11 @@ from .flight import (
     FlightLog,
     Message,
     MICRO,
-    missing,
     sound,
     sound_log,
     taken,
 )
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..table import Floats
 from ..text import counted
 
@@ -181,10 +180,8 @@ def _wanted(name: str) -> bool:
 
 def _indexed(path: Path) -> Any:
     """Return the log of pymavlink, which knows where each message begins."""
-    try:
+    with needing('pymavlink', 'an ArduPilot log (.bin)'):
         from pymavlink.DFReader import DFReader_binary
-    except ImportError as err:
-        raise missing('pymavlink', 'ArduPilot logs (.bin)', err) from err
 
     class Index(DFReader_binary):  # type: ignore[misc]
         def init_clock(self) -> None:

@@ -36,11 +36,11 @@ import numpy as np
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import ABOUT, shown
-from .flight import missing, sound_log
+from .flight import sound_log
 from .formats import record_instead
 from .names import meaning, READING
 from .text import open_text, TextTable
-from ..errors import InputError
+from ..errors import InputError, needing
 
 _ZIP, _OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
 _MATLAB, _MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
@@ -225,10 +225,8 @@ def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
     if size > _MOST_BYTES:
         raise InputError(f'{path} unpacks to more than {_MOST_BYTES} bytes, expected a smaller '
                          'Excel file', _AGAIN)
-    try:
+    with needing('openpyxl', 'an Excel file (.xlsx)'):
         import openpyxl
-    except ImportError as err:
-        raise missing('openpyxl', 'Excel files (.xlsx)', err) from err
     with sound_log(path, 'an Excel file (.xlsx)', _AGAIN):
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         for sheet in book.worksheets:
@@ -242,10 +240,8 @@ def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
 
 def _old_sheets(path: Path) -> list[Member]:
     """Return the sheets of an ``.xls`` file."""
-    try:
+    with needing('xlrd', 'an Excel file (.xls)'):
         import xlrd
-    except ImportError as err:
-        raise missing('xlrd', 'Excel files (.xls)', err) from err
     with sound_log(path, 'an Excel file (.xls)', _AGAIN):
         book = xlrd.open_workbook(path, ragged_rows=True)
 

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .formats import PX4_FIELDS, PX4_SPANS
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..table import COLUMNS, columns_from, Floats, numbered, Recording
 from ..text import counted, some
 
@@ -239,12 +239,6 @@ def _silent_c() -> Iterator[None]:
         os.close(kept)
 
 
-def missing(library: str, what: str, err: ImportError) -> InputError:
-    """Return the error for a library that is not installed."""
-    return InputError(f'{library} is not installed, it reads {what} ({err})',
-                      f'run pip install {library}')
-
-
 # --------------------------------------------------------------------------------------- PX4
 
 MAGIC = b'ULog\x01\x12\x35'
@@ -318,10 +312,8 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
 
 def _messages(path: Path) -> tuple[list[Message], list[str]]:
     """Return the messages that matter, and notes on a log that is damaged in part."""
-    try:
+    with needing('pyulog', 'a PX4 log (.ulg)'):
         from pyulog import ULog
-    except ImportError as err:
-        raise missing('pyulog', 'PX4 logs (.ulg)', err) from err
     if not is_ulg(path):
         raise InputError(f'{path} does not start as a ULog does, expected a PX4 log (.ulg)',
                          'check that this is the intended file')
