@@ -52,6 +52,24 @@ def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
                  np.full(3, 0.01), count, 50, {}, round(time))
 
 
+@pytest.mark.parametrize(('up', 'noise'), [
+    ((300.0, -200.0, 16500.0), 0.4), ((300.0, -200.0, 16500.0), 40.0),
+    ((2048.0, 2060.0, 2458.0), 3.0)])  # 12 bits with the zero in the middle
+@pytest.mark.parametrize('seed', range(3))
+def test_a_board_that_sends_counts_is_still_within_3_s(up: Any, noise: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    live, times = LiveCapture(CaptureSettings(), units_of('native')), np.arange(1200) / 84.0
+    samples = np.full((len(times), 9), np.nan)
+    samples[:, 0] = np.round(times, 3)
+    samples[:, 1:4] = np.round(np.array(up) + rng.normal(0.0, noise, (len(times), 3)))
+    still = []
+    for block in np.array_split(samples, 150):
+        list(live.push(block, True))
+        still.append((block[-1, 0], live.still))
+    assert all(found for time, found in still if time > 3.0)
+    assert len(live.book.poses()) == 1
+
+
 def test_rest_counts_before_it_ends_and_is_updated_later(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     changes = push_all(live, readings([[0, 0, 1]], dwell=9.0))

@@ -273,13 +273,19 @@ def test_a_board_on_a_serial_port_is_calibrated(tmp_path: Path) -> None:
         assert viewer.ask('fit')['success']
         wait(lambda: viewer.state['preview'] and viewer.state['rating'])
         assert viewer.state['rating']['rating'] == 'GOOD'
+        counts_per_g = viewer.state['counts_per_g']
+        said = [each['words'] for each in viewer.of('log')]
         assert viewer.ask('save')['success']
         viewer.close()
         run.send_signal(signal.SIGINT)
         assert run.wait(PATIENCE) == 0
     assert any(line.startswith("read as: ';'") for line in lines)
+    assert any(words.startswith('samples arrive from ') for words in said)
+    assert not any('Imu messages' in words or 'frame_id' in words for words in said)
     calibration = read_calibration(stored)
     assert calibration.units.name == 'native'
+    assert counts_per_g == pytest.approx(float(np.mean(np.linalg.norm(calibration.gain, axis=0))),
+                                         rel=1e-3)
     offset = calibration.units.to_g(calibration.offset)
     np.testing.assert_allclose(offset, (0.03, -0.02, 0.04), atol=0.002)
 

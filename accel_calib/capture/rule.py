@@ -102,6 +102,13 @@ TURN_G = 8.7e-3
 SURE = 2.33
 """Required margin to `TURN_G` in standard errors; 1 % of the turned dwells pass."""
 
+TURNED, TURNED_NOISE = 3e-3, 3.0
+"""
+Smallest half of the range of native readings at rest that is a turn, and not noise and drift: in
+lengths of the reading, which can be 100 g of counts without sign, and in standard deviations.
+
+"""
+
 SLOPE_NOISE = 0.1
 """Largest slope in standard deviations of the samples per second, while 1 g is not known."""
 
@@ -170,10 +177,9 @@ class Rule:
 
     @property
     def scale(self) -> float:
-        """Return the reading of 1 g; for native units half the range of the readings at rest."""
-        if self.known:
-            return self._per_g
-        return float(max(0.0, 0.5 * np.max(self._highest - self._lowest)))
+        """Return the reading of 1 g; for native units half the range at rest, 0 if not known."""
+        return self._per_g if self.known else float(_half_range(
+            self._lowest, self._highest, self._floor[:3]))
 
     def noise_of(self, mean: Floats) -> Floats:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
@@ -232,7 +238,7 @@ class Rule:
         seen = {length: stretch(columns, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
         noise = self._learn(seen[LONG], mean, chunks.step)
-        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0))
+        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0), noise)
         limit = self.limit_of(at_least_any(noise, scale))
         trending = self._trending(seen, mean, limit, scale)
         still = self._quiet(mean, recent, limit) & (trending == 0)
@@ -287,7 +293,7 @@ class Rule:
             quiet &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
         return np.asarray(quiet)
 
-    def _scales(self, mean: Floats, quiet: NDArray[np.bool_]) -> Floats:
+    def _scales(self, mean: Floats, quiet: NDArray[np.bool_], noise: Floats) -> Floats:
         if self.known:
             return np.asarray(self._per_g)
         at_rest = np.where(quiet, mean[:3], np.nan)
@@ -295,7 +301,7 @@ class Rule:
         high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
         if mean.shape[1]:
             self._lowest, self._highest = low[:, -1], high[:, -1]
-        return np.asarray(np.maximum(0.5 * np.max(high - low, axis=0), 0.0))
+        return _half_range(low, high, noise[:3])
 
     def _learn(self, seen: Stretch, mean: Floats, step: Floats) -> Floats:
         axes = len(mean)
@@ -307,6 +313,15 @@ class Rule:
         floor = np.fmin.accumulate(average, axis=1)
         self._floor[:axes], self._step = floor[:, -1], steps[:, -1]
         return at_least(floor, steps, mean)
+
+
+def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
+    """Return half the largest range of (3, ...) readings at rest; 0 before a turn."""
+    with np.errstate(invalid='ignore'):  # before the first rest
+        half = 0.5 * np.max(high - low, axis=0)
+        turned = half >= np.maximum(TURNED * 0.5 * np.linalg.norm(low + high, axis=0),
+                                    TURNED_NOISE * np.sqrt(np.max(noise, axis=0)))
+    return np.where(turned, half, 0.0)
 
 
 def _six(values: Floats, fill: float) -> Floats:

@@ -172,6 +172,7 @@ def state(session: Session, problem: str, *, busy: str, page: int) -> Message:
         'preview': sensor.offered is not None,
         'levelled': shown is not None and shown.is_levelled,
         'file': session.files.path, 'busy': busy,
+        'counts_per_g': None if shown is None else _counts_per_g(shown),
         'rating': None if shown is None or rating is None else {
             'rating': rating.name, 'reason': rating.reason},
         'result': None if shown is None else _result(shown),
@@ -197,6 +198,13 @@ def _result(calibration: Calibration) -> Message:
         'effects': list(calibration.model.effects), 'warnings': list(calibration.warnings),
         'offset': _rounded(calibration.offset), 'offset_sd': _rounded(calibration.offset_sd),
         'gain': _rounded(calibration.gain), 'gain_sd': _rounded(calibration.gain_sd)}
+
+
+def _counts_per_g(calibration: Calibration) -> float | None:
+    """Return the mean sensitivity of a sensor in native units; None in other units."""
+    if not calibration.units.is_native:
+        return None
+    return _number(float(np.mean(np.linalg.norm(calibration.gain, axis=0))))
 
 
 def _fixed(value: float) -> float | None:

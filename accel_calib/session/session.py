@@ -286,7 +286,8 @@ class Session:
     def _bind(self, frame_id: str) -> None:
         """Set the sensor from the first message."""
         self.frame_id = frame_id
-        self.log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}')
+        self.log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}' if frame_id
+                 else f'samples arrive from {self.topic}')
         self._show_frame()
         if self.files.store is None or self.sensor.owners - {self.name}:
             self._begin_again()

@@ -111,9 +111,16 @@ function guide(captured) {
 function showNumbers(now) {
   text(element('poses'), countOf(now.poses, now.total));
   text(element('coverage'), now.coverage === null ? '–' : `${Math.round(100 * now.coverage)} %`);
-  text(element('accuracy'), now.accuracy_mg === null ? '–' : `${figure(now.accuracy_mg)} mg`);
+  text(element('accuracy'), accuracyOf(now.accuracy_mg, state?.counts_per_g));
   text(element('length'), fixed(now.corrected ?? now.raw, 4, ' g'));
   text(element('temperature'), fixed(now.temperature, 1, ' °C'));
+}
+
+/** Return an accuracy in mg, and in counts if the readings are counts. */
+function accuracyOf(mg, countsPerG) {
+  if (mg === null) return '–';
+  const counts = countsPerG ? ` (${figure(mg / 1000 * countsPerG)} counts)` : '';
+  return `${figure(mg)} mg${counts}`;
 }
 
 function showConnection(name) {
