@@ -165,7 +165,7 @@ from accel_calib.refine.curves import (
     walk_beside,
 )
 from accel_calib.refine.linear import _RARE as RARE
-from accel_calib.refine.linear import Block, Linear, linearised, WORTH
+from accel_calib.refine.linear import Block, candidates, Linear, linearised, products_of, WORTH
 from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
 from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import _is_better as is_better_than_walk

@@ -10,6 +10,7 @@ from inside import (
     accepted,
     beginning,
     Block,
+    candidates,
     Curve,
     explored,
     fitted_state,
@@ -21,6 +22,7 @@ from inside import (
     Near,
     Process,
     process_of,
+    products_of,
     RARE,
     REFINE_LEVEL,
     SIGNIFICANT,
@@ -56,7 +58,7 @@ def poses_of(hidden, seed=1, count=COUNT, knocked=(), **context):
 def problem_of(poses, *names):
     """Return the fitted base and the linear problem with these candidates."""
     state = beginning(poses, Model({name: np.zeros(3) for name in BASE}))
-    return state, linearised(state.fit, BASE, names)
+    return state, linearised(state.fit, BASE, candidates(names, state.poses_g))
 
 
 def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1e6):
@@ -65,7 +67,8 @@ def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1
     blocks = tuple(Block(name, np.zeros(0), slice(k, k + 1), EFFECTS[name], 0, tried)
                    for k, name in enumerate(names))
     return Linear(np.zeros((count, 0)), residual, np.arange(count), blocks, columns,
-                  np.full(len(names), size), worth, count, float(residual @ residual),
+                  np.full(len(names), size), products_of(columns, residual), worth, count,
+                  float(residual @ residual),
                   np.zeros((count, 3)), choice)
 
 
@@ -101,7 +104,7 @@ def test_the_gain_beside_a_set_is_the_fall_that_the_larger_set_brings():
     for block in range(1, len(linear.blocks)):
         larger = linear.set_of((0, block), (5,))
         assert beside.rss - larger.rss == pytest.approx(gain[block], rel=1e-6)
-        assert larger.ranks[-1] == rank[block]
+        assert len(larger.across) - len(beside.across) == rank[block]
     assert (gain[0], rank[0]) == (pytest.approx(0.0, abs=1e-9), 0.0)
 
 
@@ -117,8 +120,10 @@ def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
     assert chosen.parameters == len(out) * (3 if known else 1)
     assert chosen.rss == pytest.approx(after.fit.chi2, rel=1e-3)
     kept = ~np.isin(linear.pose, out)
-    np.testing.assert_allclose(chosen.residual[kept], after.fit.residual, atol=0.02)
-    np.testing.assert_allclose(chosen.residual[~kept], 0.0, atol=1e-9)
+    onto, residual = linear.spanned(chosen)
+    np.testing.assert_allclose(onto.T @ onto, np.eye(onto.shape[1]), atol=1e-9)
+    np.testing.assert_allclose(residual[kept], after.fit.residual, atol=0.02)
+    np.testing.assert_allclose(residual[~kept], 0.0, atol=1e-9)
     assert linear.base_rss > 10.0 * chosen.rss
 
 
@@ -237,14 +242,16 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     variance = np.eye(20) + 50.0 * (process.axes * process.values) @ process.axes.T
     white = Walk(process, 50.0, 0.0, 0.0).whitened(linear)
     inverse = np.linalg.inv(variance)
-    assert white.residual @ white.residual == pytest.approx(residual @ inverse @ residual)
-    np.testing.assert_allclose(white.columns.T @ white.columns, columns.T @ inverse @ columns)
-    np.testing.assert_allclose(white.columns.T @ white.residual, columns.T @ inverse @ residual)
+    both = np.column_stack([columns, residual])
+    np.testing.assert_allclose(white.products, both.T @ inverse @ both)
+    onto, left = white.spanned(white.set_of())
+    assert onto.shape == (20, 0)
+    assert left @ left == pytest.approx(residual @ inverse @ residual)
     values = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ residual)
     found = white.values_of(white.set_of((0, 1)))
     np.testing.assert_allclose([found[0][0], found[1][0]], values)
     flat = Walk(process, 0.0, 0.0, 0.0).whitened(linear)
-    np.testing.assert_array_equal(flat.residual, residual)
+    np.testing.assert_array_equal(flat.spanned(flat.set_of())[1], residual)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+import math
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,19 @@ class Terms:
             found[k] = MONOMIALS[index].value(x, y, z)
         return found
 
+    def plain(self, u: Floats, direction: Floats | None = None) -> Floats:
+        """
+        Return the (t, n) terms for values and factors of 1, at (n, 3) forces.
+
+        With a `direction`, (n, 3), return their derivative along this direction of the force.
+
+        """
+        if direction is None:
+            monomials = self.monomials_at(u)
+        else:
+            monomials = np.einsum('mjn,nj->mn', self.gradients_at(u), direction)
+        return np.asarray(monomials[self.place] * self.weight[:, np.newaxis])
+
     def gradients_at(self, u: Floats) -> Floats:
         """Return the (m, 3, n) derivatives of the monomials by the force."""
         x, y, z = u.T
@@ -227,7 +241,12 @@ def _sums(index: Indices, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Basis:
-    """Derivative of the reading: (t, n) terms, the axis of each, and (p, t) sums by value."""
+    """
+    Derivative of the reading: (t, n) terms, the axis of each, and (p, t) sums by value.
+
+    The terms of s shapes of an effect are (s, t, n). The p values of each shape follow each other.
+
+    """
 
     terms: Floats
     axis: Indices
@@ -236,13 +255,15 @@ class Basis:
     @property
     def full(self) -> Floats:
         """(n, 3, p) array, the derivative."""
-        return np.stack([self.to_value[:, self.axis == axis] @ self.terms[self.axis == axis]
-                         for axis in range(3)]).T.swapaxes(1, 2)
+        by_axis = np.stack([self.to_value[:, self.axis == axis]
+                            @ self.terms[..., self.axis == axis, :] for axis in range(3)])
+        moved = np.moveaxis(by_axis, -1, 0)
+        return moved.reshape(*moved.shape[:2], math.prod(moved.shape[2:]))
 
     def along(self, rows: Floats) -> Floats:
         """Return the (n, p) product of the derivative with an (n, 3) row per pose."""
-        found: Floats = (self.to_value @ (self.terms * rows.T[self.axis])).T
-        return found
+        found = np.moveaxis(self.to_value @ (self.terms * rows.T[self.axis]), -1, 0)
+        return found.reshape(len(rows), math.prod(found.shape[1:]))
 
 
 @dataclass(frozen=True)
@@ -445,11 +466,7 @@ class Model(Record):
 
         """
         terms = self.terms
-        if direction is None:
-            monomials = terms.monomials_at(u)
-        else:
-            monomials = np.einsum('mjn,nj->mn', terms.gradients_at(u), direction)
-        plain = monomials[terms.place] * terms.weight[:, np.newaxis]
+        plain = terms.plain(u, direction)
         if terms.fixed:
             return Basis(plain, terms.axis, terms.to_value)
         found: list[Floats] = [plain * self._factors(context)]
@@ -473,6 +490,29 @@ class Model(Record):
                     change = difference(effect.factor, context, shape, place)
                     yield (plain[which] * values * np.nan_to_num(change), which,
                            part.stop - len(shape) + place)
+
+
+@dataclass(frozen=True)
+class EachShape:
+    """An effect with s shapes, by the (s, t or 1, n) factors of its terms at the poses."""
+
+    name: str
+    factors: Floats
+
+    def basis(self, u: Floats, context: Context, direction: Floats | None = None) -> Basis:
+        """Return the derivative of the reading by the parameters; see `Model.basis`."""
+        terms = terms_of((self.name,))
+        parameters = len(terms.effects[0].parameters)
+        return Basis(terms.plain(u, direction) * self.factors, terms.axis,
+                     terms.to_value[:parameters])
+
+
+def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:
+    """Return the (s, t or 1, n) factors of the terms of an effect with s shapes."""
+    factor = effect_named(name).factor
+    if factor is None:
+        return np.ones((1, 1, 1))
+    return np.nan_to_num([np.atleast_2d(factor(context, shape)) for shape in shapes])
 
 
 def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:

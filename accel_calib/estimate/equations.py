@@ -46,7 +46,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import AtContext, Context, Model, times
+from ..effects import AtContext, Context, EachShape, Model, times
 from ..geometry import unit
 from ..table import Floats, Poses
 
@@ -206,6 +206,17 @@ class Equations:
         """Return the (m, p) derivative of the prediction by the values of a model, per noise."""
         return np.concatenate([part.columns(model) for part in self.parts])
 
+    def columns_of(self, name: str, factors: Floats) -> Floats:
+        """
+        Return the (m, s p) derivative by the p parameters of an effect for each of s shapes.
+
+        `factors` (s, t or 1, n) are those of its terms at the poses, or (1, 1, 1).
+
+        """
+        return np.concatenate([part.columns(EachShape(
+            name, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
+            for part in self.parts])
+
     def of_poses(self, residual: Floats) -> Floats:
         """Return the (n,) residuals of poses [g]: signed for one equation each, else RMS."""
         sizes = residual * self.scale[self.pose]
@@ -217,14 +228,20 @@ class Equations:
 
 
 class _Part(Protocol):
-    """The equations of poses of one kind, in units of the noise, and `pose` of each equation."""
+    """
+    The equations of poses of one kind, in units of the noise.
+
+    `which` are the indices of the poses, `pose` that of each equation.
+
+    """
 
     residual: Any
+    which: Indices
     pose: Indices
     force: Floats
     scale: Floats
 
-    def columns(self, model: Model) -> Floats:
+    def columns(self, model: Model | EachShape) -> Floats:
         """Return the (m, p) derivative of the prediction by the values of a model."""
 
 
@@ -248,7 +265,8 @@ class _Alone:
     """Equations of poses of which only |force| = 1 g is known; symbols as in the module."""
 
     def __init__(self, model: Model, poses: _Kind) -> None:
-        self.pose, self._context = poses.which, poses.context
+        self.which = self.pose = poses.which
+        self._context = poses.context
         here = model.at(self._context)
         u = here.force(poses.reading)
         length = np.sqrt(np.sum(u * u, axis=1))[:, np.newaxis]
@@ -269,7 +287,7 @@ class _Alone:
         self._rows_along = weighted * e
         self._at, self._along = u, g
 
-    def columns(self, model: Model) -> Floats:
+    def columns(self, model: Model | EachShape) -> Floats:
         return (model.basis(self._at, self._context).along(self._rows)
                 - model.basis(self._at, self._context, self._along).along(self._rows_along))
 
@@ -279,12 +297,12 @@ class _Known:
 
     def __init__(self, model: Model, poses: _Kind) -> None:
         self._sigma, self._context = poses.s.ravel(), poses.context
-        self.pose = np.repeat(poses.which, 3)
+        self.which, self.pose = poses.which, np.repeat(poses.which, 3)
         self.force, self.scale = poses.context['reference'], np.sqrt(np.mean(poses.s ** 2, axis=1))
         reading = model.at(self._context).reading(self.force)
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
-    def columns(self, model: Model) -> Floats:
+    def columns(self, model: Model | EachShape) -> Floats:
         basis = model.basis(self.force, self._context).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
@@ -301,7 +319,8 @@ class _Shared:
 
     def __init__(self, model: Model, poses: _Kind) -> None:
         self._sigma, self._context, group = poses.s, poses.context, poses.group
-        self._group, self.pose = group, np.repeat(poses.which, 3)
+        self._group = group
+        self.which, self.pose = poses.which, np.repeat(poses.which, 3)
         self.scale = np.sqrt(np.mean(poses.s ** 2, axis=1))
         here = model.at(self._context)
         mean = np.array([np.bincount(group, column) for column in here.force(poses.reading).T]).T
@@ -336,7 +355,7 @@ class _Shared:
         onto = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ rows)
         return rows - self._turn @ onto[self._group]
 
-    def columns(self, model: Model) -> Floats:
+    def columns(self, model: Model | EachShape) -> Floats:
         basis = model.basis(self.force, self._context).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])

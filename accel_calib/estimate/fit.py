@@ -61,6 +61,9 @@ _NEAR_ENOUGH = 1e-5
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
 
+_HOPE = 3.0
+"""Largest ratio of the decrease of the cost to that which the next step predicts."""
+
 _SINGULAR_STEP = 1e-6
 """Relative square of a singular value below which the residuals do not determine a combination."""
 
@@ -223,14 +226,15 @@ NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
 
 
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
-          move: Callable[[Floats, Floats], Floats] = np.add) -> tuple[Floats, Point]:
+          move: Callable[[Floats, Floats], Floats] = np.add, most: float = np.inf
+          ) -> tuple[Floats, Point]:
     """
     Return the (q,) values that minimise the sum of squared residuals, and the point there.
 
     The values stay between `lower` and `upper`. `point_at` computes residuals and derivative at
     values; the step solves residual = columns · step. `move` returns the values after a step to
     first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
-    `_MOST_STEPS` steps.
+    `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
 
     """
     values = np.clip(start, lower, upper)
@@ -243,6 +247,8 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         full, fall = _step(now, free, 0.0)
         if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
             break
+        if now.cost - _HOPE * fall > most:
+            raise NotConvergedError
         step = full if damping == 0.0 else _step(now, free, damping)[0]
         tried_at = np.clip(move(values, step), lower, upper)
         tried = point_at(tried_at)
@@ -297,7 +303,7 @@ class Prior:
 
 
 def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
-             factor: float | None = None) -> Fit:
+             factor: float | None = None, most: float = np.inf) -> Fit:
     """
     Fit a model; raise `NotConvergedError` if the fit does not converge.
 
@@ -312,6 +318,8 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     factor : float, optional
         Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
         that of the residuals in the covariance.
+    most : float, optional
+        Cost above which the fit is not needed. It then ends early, as one that does not converge.
 
     """
     if not np.any(start.fitted):
@@ -336,7 +344,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
-                          np.add if prior is None else along_quadrics)
+                          np.add if prior is None else along_quadrics, most)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
     count = len(found.source.residual)
     own = None if prior is None else Point(found.residual[count:], found.columns[count:])

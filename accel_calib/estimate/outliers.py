@@ -268,26 +268,27 @@ def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Float
 
 def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
     """Remove the most extreme pose repeatedly, and update the fit to first order."""
-    spread, flat = data.spread, data.flat
-    count, rows = data.residual.shape
-    residual = data.residual - (flat @ (spread @ data.downhill)).reshape(count, rows)
-    own, left = data.own(spread), np.ones(count, bool)
+    flat, (count, rows) = data.flat, data.residual.shape
+    onto = flat @ data.spread
+    residual, left = data.residual.ravel() - onto @ data.downhill, np.ones(count, bool)
+    own = data.own(data.spread)
+    removed, solved = np.empty((2, len(flat), most * rows))  # columns of I - leverage
     poses, sizes = [], []
-    rss = [float(np.sum(residual ** 2))]
-    for _ in range(most):
-        size = _squared(own, residual) * left
+    rss = [float(residual @ residual)]
+    for k in range(0, most * rows, rows):
+        size = _squared(own, residual.reshape(count, rows)) * left
         at = int(np.argmax(size / data.rows))
         poses.append(at)
         sizes.append(float(size[at]))
         rss.append(max(rss[-1] - sizes[-1], 0.0))
+        part, now = slice(rows * at, rows * at + rows), slice(k, k + rows)
+        column = -onto @ flat[part].T - removed[:, :k] @ solved[part, :k].T
+        column[part] += np.eye(rows)
         inverse = 1.0 / own[at] if rows == 1 else np.linalg.pinv(own[at])
-        onto = spread @ data.columns[at].T
-        along = flat @ onto
-        residual = residual + (along @ (inverse @ residual[at])).reshape(count, rows)
-        spread = spread + onto @ inverse @ onto.T
-        along = along.reshape(count, rows, rows)
-        own = own - (along ** 2 * inverse if rows == 1
-                     else along @ inverse @ np.swapaxes(along, 1, 2))
+        removed[:, now], solved[:, now] = column, column @ inverse
+        residual = residual - solved[:, now] @ residual[part]
+        own -= (solved[:, now].reshape(count, rows, rows)
+                @ np.swapaxes(column.reshape(count, rows, rows), 1, 2))
         left[at] = False
     return _Removed(np.array(poses, np.intp), data.rows[poses], np.array(sizes), np.array(rss),
                     dof, len(left))
@@ -311,7 +312,7 @@ def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bo
     """Find outliers among many poses, all at once, relative to the median."""
     alone = _squared(data.own(data.spread), data.residual)
     size = alone / data.rows
-    usual = np.array([_MEDIAN_OF_CHI2[int(rows)] / rows for rows in data.rows])
+    usual = np.where(data.rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / data.rows
     belief = belief_in(noise_known)
     scale = float(np.median(size / usual))
     size = size * (belief + dof) / (belief + scale * dof)

@@ -34,7 +34,17 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes, State
-from .linear import Block, held_out, LEVEL, Linear, linearised, outside_of, Set
+from .linear import (
+    Block,
+    candidates,
+    held_out,
+    LEVEL,
+    Linear,
+    linearised,
+    outside_of,
+    products_of,
+    Set,
+)
 from ..effects import (
     CARRIERS,
     curve_pairs,
@@ -93,7 +103,7 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
     best, tried = None, 0
     for carrier, variable in _pairs(poses_g):
         for problem in _problems(plain, fit, carrier, variable):
-            chosen, tried = _grown(_compressed(problem, out)), tried + 1
+            chosen, tried = _grown(_kept(problem, out)), tried + 1
             if chosen.blocks and (best is None or chosen.score > best[0]):
                 best = chosen.score, problem, chosen
     if best is None:
@@ -120,24 +130,23 @@ def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[
     count, parts = len(effect.parameters), CARRIERS[carrier]
     model = Model({name: np.concatenate([np.zeros(count), shapes[0]])})
     columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
+    products = products_of(columns, plain.residual)
     whole = [(carrier, slice(None), len(parts))]
     alone = [(f'{carrier}.{part}', slice(k, None, len(parts)), 1) for k, part in enumerate(parts)]
     for own, which, width in whole + alone if len(parts) > 1 else whole:
+        index = [*np.arange(len(sizes))[which], -1]
+        blocks = tuple(Block(empirical_name(own, variable, (mode,)), shapes[0],
+                             slice(width * (mode - 1), width * mode), effect, 0, float(mode))
+                       for mode in _ALL_MODES)
         yield replace(plain, columns=columns[:, which], sizes=sizes[which], choice=0.0,
-                      blocks=tuple(Block(empirical_name(own, variable, (mode,)), shapes[0],
-                                         slice(width * (mode - 1), width * mode), effect, 0,
-                                         float(mode)) for mode in _ALL_MODES))
+                      products=products[np.ix_(index, index)], blocks=blocks)
 
 
-def _compressed(problem: Linear, out: tuple[int, ...]) -> Linear:
-    """Return a problem with the same products of its columns, but with few rows."""
+def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
+    """Return the problem of the other poses, for its products alone."""
     nothing = problem.set_of((), out)
-    columns = problem.columns - nothing.onto @ (nothing.onto.T @ problem.columns)
-    rows = np.linalg.qr(np.column_stack([columns, nothing.residual]))[1]
-    count = len(rows)
-    return replace(problem, onto=np.zeros((count, 0)), residual=rows[:, -1],
-                   pose=np.arange(count), columns=rows[:, :-1], base_rss=nothing.rss,
-                   dof=problem.dof - int(nothing.parameters))
+    return replace(problem, products=problem.products - nothing.across.T @ nothing.across,
+                   base_rss=nothing.rss, dof=problem.dof - int(nothing.parameters))
 
 
 def _grown(problem: Linear) -> Set:
@@ -146,7 +155,7 @@ def _grown(problem: Linear) -> Set:
     for _ in range(_MOST_MODES):
         scores = problem.scores_beside(now)
         scores[list(now.blocks)] = -np.inf
-        now = problem.set_of((*now.blocks, int(np.argmax(scores))))
+        now = problem.extended(now, int(np.argmax(scores)))
         if now.parameters > _LARGEST_SHARE * problem.dof:
             break
         if now.score > best.score:
@@ -179,9 +188,10 @@ def _accepted(score: float, problem: Linear, chosen: Set, tried: int) -> Curve |
 
 def _held_out(problem: Linear, chosen: Set) -> float:
     """Return the sum of squares of the residuals, each predicted from the other equations."""
-    own = 1.0 - np.sum(problem.onto ** 2, axis=1) - np.sum(chosen.onto ** 2, axis=1)
+    onto, residual = problem.spanned(chosen)
+    own = 1.0 - np.sum(problem.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
-    return float(np.sum(held_out(chosen.residual[kept], own[kept]) ** 2))
+    return float(np.sum(held_out(residual[kept], own[kept]) ** 2))
 
 
 def is_curve(name: str) -> bool:
@@ -196,13 +206,14 @@ _NEAREST = 2
 def nearest_effects(before: State) -> dict[str, float]:
     """Return the known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
-    linear = linearised(before.fit, before.model.effects, names)
+    linear = linearised(before.fit, before.model.effects, candidates(names, before.poses_g))
     gain, rank = linear.gains(linear.set_of())
     left_mg: dict[str, float] = {}
     for number in np.argsort(-gain):
         effect = linear.blocks[number].effect
         if rank[number] and effect not in left_mg and len(left_mg) < _NEAREST:
-            left_mg[effect] = before.gap_mg(linear.set_of((int(number),)).residual)
+            _, left = linear.spanned(linear.set_of((int(number),)))
+            left_mg[effect] = before.gap_mg(left)
     return left_mg
 
 
@@ -256,20 +267,23 @@ class Walk:
     def whitened(self, linear: Linear) -> Linear:
         """Return the equations whitened for the walk and the noise."""
         spread = 1.0 + self.ratio * self.process.values
-        white = replace(linear, white=(self.process.axes, 1.0 - 1.0 / np.sqrt(spread)))
-        return replace(white, residual=white.whitened(linear.residual),
-                       columns=white.whitened(linear.columns),
+        axes = self.process.axes
+        across = np.column_stack([axes.T @ linear.columns, axes.T @ linear.residual])
+        taken = (1.0 - 1.0 / spread)[:, np.newaxis]
+        return replace(linear, white=(axes, 1.0 - 1.0 / np.sqrt(spread)),
+                       products=linear.products - across.T @ (taken * across),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
     def residuals(self, linear: Linear, chosen: Set) -> tuple[Floats, Floats]:
         """Return the residual without the walk, and the same with each equation held out."""
         spread = 1.0 + self.ratio * self.process.values
-        left = self.process.axes - chosen.onto @ (chosen.onto.T @ self.process.axes)
+        onto, residual = linear.spanned(chosen)
+        left = self.process.axes - onto @ (onto.T @ self.process.axes)
         precision = np.diag(1.0 / np.maximum(spread - 1.0, 1e-12)) + left.T @ left
         smooth = np.linalg.solve(precision, left.T)
-        residual = chosen.residual - left @ (smooth @ chosen.residual)
+        residual = residual - left @ (smooth @ residual)
         # Without its own equation each residual is P z over the diagonal of P.
-        own = (1.0 - np.sum(linear.onto ** 2, axis=1) - np.sum(chosen.onto ** 2, axis=1)
+        own = (1.0 - np.sum(linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
                - np.sum(left * smooth.T, axis=1))
         return residual, held_out(residual, own)
 
@@ -299,14 +313,16 @@ def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
     """Return the most likely walk beside a set."""
     spread = 1.0 + _RATIOS[:, np.newaxis] * process.values
     taken = 1.0 - 1.0 / spread
-    onto = process.axes.T @ chosen.onto
-    along, own = process.axes.T @ linear.residual, chosen.onto.T @ linear.residual
-    normal = np.eye(onto.shape[1]) - np.einsum('ri,lr,rj->lij', onto, taken, onto)
+    spanned, residual = linear.spanned(chosen)
+    onto, own = process.axes.T @ spanned, chosen.across[:, -1]
+    along, count = process.axes.T @ linear.residual, onto.shape[1]
+    squares = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), count ** 2)
+    normal = np.eye(count) - (taken @ squares).reshape(len(taken), count, count)
     side = own - (taken * along) @ onto
     explained = np.einsum('li,li->l', side,
                           np.linalg.solve(normal, side[:, :, np.newaxis])[:, :, 0])
     rss = float(linear.residual @ linear.residual) - taken @ along ** 2 - explained
-    dof = linear.dof - chosen.onto.shape[1]
+    dof = linear.dof - count
     allowed = (rss >= _LEAST_WHITE * dof if linear.worth else _RATIOS <= _LARGEST_RATIO)
     allowed[0] = True
     weight = linear.worth + linear.dof
@@ -315,10 +331,10 @@ def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
     best = int(np.argmin(np.where(allowed, deviance, np.inf)))
     fall = float(-deviance[best])
     return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear),
-                fall - _fall_by_scatter(linear, chosen))
+                fall - _fall_by_scatter(linear, residual, chosen.rss))
 
 
-def _fall_by_scatter(linear: Linear, chosen: Set) -> float:
+def _fall_by_scatter(linear: Linear, residual: Floats, white: float) -> float:
     """
     Return twice the log of the likelihood ratio of an offset that scatters, which is no walk.
 
@@ -328,9 +344,9 @@ def _fall_by_scatter(linear: Linear, chosen: Set) -> float:
     """
     size = np.sum(linear.offset ** 2, axis=1)
     spread = 1.0 + _RATIOS[:, np.newaxis] * size / max(float(np.max(size)), 1e-300)
-    rss = np.sum(chosen.residual ** 2 / spread, axis=1)
+    rss = (1.0 / spread) @ residual ** 2
     deviance = np.sum(np.log(spread), axis=1) + (linear.worth + linear.dof) * np.log(
-        (linear.worth + rss + 1e-300) / (linear.worth + chosen.rss + 1e-300))
+        (linear.worth + rss + 1e-300) / (linear.worth + white + 1e-300))
     return max(float(-np.min(deviance)), 0.0)
 
 

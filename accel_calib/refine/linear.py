@@ -10,8 +10,10 @@ With the model of the base projected out, the equations are
 
 One block of columns belongs to one effect with one shape. A set is a choice of blocks, with
 poses that are left out; leaving a pose out is a further column, 1 at the pose and 0 elsewhere.
-To first order, the gain of a set is that of the joint fit of all its values, at the cost of one
-projection. The gain of every block beside a set is computed at once, by one matrix product.
+To first order, the gain of a set is that of the joint fit of all its values. It depends only on
+the products of the columns with each other and with the residual. They are computed once. A set is
+then a part of their Cholesky factor, at a cost that does not depend on the number of poses, and
+the gains of all blocks beside a set are computed at once.
 
 **Moderated variance.** The measured noise says λ = 1, and the residuals say what λ is. The noise
 is a prior worth ν = 4 degrees of freedom (Smyth 2004, with ν fixed). In F tests, the variance is
@@ -38,18 +40,18 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context, Effect, effect_named, kind_of, Model
+from ..effects import Context, Effect, effect_named, factors_of, kind_of, Model
 from ..estimate import by_pose, Equations, Fit, outliers_among
-from ..table import Floats
+from ..table import Floats, Poses
 
 WORTH = 4.0
 """ν, degrees of freedom that the measured noise counts as."""
@@ -59,6 +61,12 @@ LEVEL = 0.01
 
 _SEEN = 0.02
 """Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
+
+_DETERMINED = 1e-12
+"""Smallest square of a relative singular value of the columns of values that are determined."""
+
+_LARGEST_LOG = 100.0
+"""Largest logarithm of a ratio, against overflow."""
 
 _LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
@@ -96,6 +104,66 @@ class Block(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """
+    An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
+
+    `factors` (shapes, t or 1, n) are those of its terms at the poses. They do not depend on a
+    model.
+
+    """
+
+    name: str
+    shapes: tuple[Floats, ...]
+    tried: float
+    factors: Floats
+
+    @property
+    def entry(self) -> Effect:
+        """Return the effect."""
+        return effect_named(self.name)
+
+    def beside(self, present: Floats | None, context: Context) -> Candidate:
+        """Return the candidate with the shape of its values in a model, too."""
+        if present is None or len(self.shapes) < 2:
+            return self
+        shape = self.entry.split(present)[1]
+        return replace(self, shapes=(*self.shapes, shape), factors=np.concatenate(
+            [self.factors, factors_of(self.name, [shape], context)]))
+
+    def blocks(self, start: int, alike: int) -> Iterator[Block]:
+        """Yield a block for each shape, from a column on; `alike` candidates are of one kind."""
+        count, entry, searched = len(self.entry.parameters), self.entry, len(self.shapes) > 1
+        for shape in self.shapes:
+            new = searched and not np.array_equal(shape, entry.usual)
+            yield Block(self.name, shape, slice(start, start + count), entry, int(new),
+                        (self.tried if new else 1.0) * alike)
+            start += count
+
+
+def candidates(names: Iterable[str], poses_g: Poses) -> tuple[Candidate, ...]:
+    """Return the effects of these names that the context of the poses allows."""
+    found, context = [], poses_g.columns
+    for name in names:
+        effect = effect_named(name)
+        if effect.output is None and all(key in context for key in effect.needs):
+            shapes, tried = _shapes(effect, context, len(poses_g))
+            if shapes:
+                found.append(Candidate(name, shapes, tried, factors_of(name, shapes, context)))
+    return tuple(found)
+
+
+def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats, ...], float]:
+    """Return the shapes of an effect to try, and the number that they count as."""
+    if effect.shapes is None:
+        return (np.zeros(0),), 1.0
+    shapes = tuple(effect.shapes(context))
+    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
+    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
+    return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
+
+
+@dataclass(frozen=True)
 class Linear:
     """
     The equations of all poses near a model, with the base projected out.
@@ -109,6 +177,8 @@ class Linear:
     columns, sizes : (m, c) array, (c,) array
         Columns of all blocks outside of the base, and their norms before it was projected out, to
         which they are relative.
+    products : (c + 1, c + 1) array
+        Products of the columns and, last, of the residual with each other, after whitening.
     worth : float
         ν; 0 if the noise is not known.
     dof : int
@@ -121,8 +191,8 @@ class Linear:
         What the choice of one effect among the candidates, or of a walk, costs; subtracted from
         all scores.
     white : (m, r) array, (r,) array, or None
-        Orthonormal directions along which the equations were whitened, and the part of each that
-        was taken away.
+        Orthonormal directions along which the equations are whitened, and the part of each that
+        is taken away.
 
     """
 
@@ -132,6 +202,7 @@ class Linear:
     blocks: tuple[Block, ...]
     columns: Floats
     sizes: Floats
+    products: Floats
     worth: float
     dof: int
     base_rss: float
@@ -146,68 +217,108 @@ class Linear:
         return int(self.pose.max()) + 1
 
     @cached_property
-    def along(self) -> Floats:
-        """(c,) array, products of the columns with the residual."""
-        return self.columns.T @ self.residual
+    def kinds(self) -> int:
+        """Return the number of effects tried; the covariates of all quantities count as one."""
+        return len({kind_of(block.effect) for block in self.blocks})
+
+    @cached_property
+    def numbers_of(self) -> dict[str, NDArray[np.intp]]:
+        """Return the blocks of each effect."""
+        numbers: dict[str, list[int]] = {}
+        for number, block in enumerate(self.blocks):
+            numbers.setdefault(block.effect, []).append(number)
+        return {effect: np.array(each) for effect, each in numbers.items()}
 
     @cached_property
     def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
         """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
-        numbers_of: dict[int, list[int]] = {}
-        for number, block in enumerate(self.blocks):
-            numbers_of.setdefault(block.columns.stop - block.columns.start, []).append(number)
-        groups: list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]] = []
-        for width, numbers in numbers_of.items():
-            starts = np.array([self.blocks[number].columns.start for number in numbers], np.intp)
-            index = starts[:, np.newaxis] + np.arange(width)
-            products = np.empty((len(numbers), width, width))
-            for i in range(width):
-                for j in range(i, width):
-                    pair = self.columns[:, index[:, i]], self.columns[:, index[:, j]]
-                    products[:, i, j] = np.einsum('mk,mk->k', *pair)
-                    products[:, j, i] = products[:, i, j]
-            groups.append((np.array(numbers, np.intp), index, products))
-        return groups
+        return list(self._grouped(np.arange(len(self.blocks))))
+
+    def _grouped(self, numbers: NDArray[np.intp]
+                 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+        ends = np.array([(block.columns.start, block.columns.stop) for block in self.blocks],
+                        np.intp).reshape(-1, 2)[numbers]
+        widths = ends[:, 1] - ends[:, 0]
+        for width in np.unique(widths):
+            index = ends[widths == width, :1] + np.arange(width)
+            yield (numbers[widths == width], index,
+                   self.products[index[:, :, np.newaxis], index[:, np.newaxis, :]])
 
     def effects_of(self, chosen: Set) -> tuple[str, ...]:
         """Return the names of the effects of a set."""
         return tuple(self.blocks[block].effect for block in chosen.blocks)
 
-    def score(self, rss: float, parameters: float, charge: float) -> float:
-        """Return the score of a set from its RSS, number of values and other charges."""
-        fall = (self.worth + self.dof) * math.log(
-            (self.worth + self.base_rss + 1e-300) / (self.worth + max(rss, 1e-12 * self.base_rss)
-                                                     + 1e-300))
+    def score(self, rss: Any, parameters: Any, charge: Any) -> Any:
+        """Return the score of sets from their RSS, number of values and other charges."""
         whole = self.worth + self.dof
-        few = whole / max(whole - parameters - 1.0, 1e-9)
+        fall = whole * np.log((self.worth + self.base_rss + 1e-300) / (
+            self.worth + np.maximum(rss, 1e-12 * self.base_rss) + 1e-300))
+        few = whole / np.maximum(whole - parameters - 1.0, 1e-9)
         return fall - few * parameters * math.log(max(self.dof, 2)) - charge - self.penalty
+
+    def rss_of(self, score: float, chosen: Set) -> float:
+        """Return the RSS with which a set has a score."""
+        room = float(self.score(self.base_rss, chosen.parameters, chosen.charge)) - score
+        ratio = math.exp(min(room / (self.worth + self.dof), _LARGEST_LOG))
+        return (self.worth + self.base_rss) * ratio - self.worth
 
     def set_of(self, blocks: Sequence[int] = (), out: Iterable[int] = ()) -> Set:
         """Return the set of these blocks, with these poses left out."""
         out = tuple(sorted(out))
+        if out not in self._of_poses:
+            self._of_poses[out] = self._span_of(out)
+        return self._grown(self._of_poses[out], blocks)
+
+    @cached_property
+    def _of_poses(self) -> dict[tuple[int, ...], _Span]:
+        """Return the bases of the poses that were left out so far."""
+        return {}
+
+    def _span_of(self, out: tuple[int, ...]) -> _Span:
         rows = np.flatnonzero(np.isin(self.pose, out)) if out else np.zeros(0, np.intp)
         units: Floats = np.zeros((len(self.pose), len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
-        units = self.whitened(units - self.onto @ self.onto[rows].T)
-        onto, ranks = np.linalg.qr(units)[0], [float(len(rows))]
-        raw = [self.columns[:, self.blocks[block].columns] for block in blocks]
-        for columns in raw:
-            new = _outside(columns, onto)
-            onto, ranks = np.hstack([onto, new]), [*ranks, float(new.shape[1])]
-        residual = self.residual - onto @ (onto.T @ self.residual)
-        searched = sum(self.blocks[block].searched for block in blocks)
-        charge = 2.0 * sum(math.log(self.blocks[block].tried) for block in blocks)
-        charge += self._unusual(blocks, raw, onto[:, :len(rows)])
-        charge += len(blocks) * self.choice
-        charge += len(out) * (2.0 * math.log(max(self.poses, 2)) + _RARE)
-        parameters = sum(ranks) + searched
-        rss = float(residual @ residual)
-        return Set(tuple(blocks), out, onto, residual, rss, tuple(ranks[1:]), parameters,
-                   charge, self.score(rss, parameters, charge))
+        if out:
+            units = np.linalg.qr(self.whitened(units - self.onto @ self.onto[rows].T))[0]
+        white = self.whitened(units)
+        across = np.column_stack([white.T @ self.columns, white.T @ self.residual])
+        return _Span((), out, units, across, np.eye(len(rows)))
+
+    def extended(self, before: Set, block: int) -> Set:
+        """Return a set with one more block."""
+        return self._grown(before.span, (block,))
+
+    def instead(self, chosen: Set, blocks: Sequence[int]) -> Set:
+        """Return the set of other blocks, with the same poses left out."""
+        return self.set_of(blocks, chosen.out)
 
     def without(self, chosen: Set, block: int) -> Set:
         """Return a set without one of its blocks."""
-        return self.set_of([other for other in chosen.blocks if other != block], chosen.out)
+        return self.instead(chosen, [other for other in chosen.blocks if other != block])
+
+    def _grown(self, span: _Span, blocks: Sequence[int]) -> Set:
+        """Return the set that spans these blocks, too."""
+        for block in blocks:
+            part = self.blocks[block].columns
+            along = span.across[:, part]
+            left = self.products[part] - along.T @ span.across
+            size, axes = np.linalg.eigh(left[:, part])
+            kept = _is_seen(size)
+            span = span.beside(block, along, left, axes[:, kept] / np.sqrt(size[kept]))
+        searched, cost = self._costs
+        own = list(span.blocks)
+        charge = float(np.sum(cost[own])) + self._unusual(span)
+        charge += len(span.out) * (2.0 * math.log(max(self.poses, 2)) + _RARE)
+        parameters = float(len(span.across) + np.sum(searched[own]))
+        gain = span.across[:, -1] @ span.across[:, -1]
+        rss = max(float(self.products[-1, -1] - gain), 0.0)
+        return Set(span, rss, parameters, charge, float(self.score(rss, parameters, charge)))
+
+    def spanned(self, chosen: Set) -> tuple[Floats, Floats]:
+        """Return (m, q) orthonormal columns that span a set, and the (m,) residual beside it."""
+        columns = self.whitened(self.columns[:, self._index(chosen.blocks)])
+        onto = np.hstack([chosen.span.units, columns]) @ chosen.span.mix
+        return onto, self.whitened(self.residual) - onto @ chosen.across[:, -1]
 
     def fewer(self, chosen: Set) -> list[Set]:
         """Return a set of several blocks without each of them."""
@@ -216,81 +327,101 @@ class Linear:
 
     def with_outliers(self, chosen: Set) -> list[Set]:
         """Return a set as it is, and with the outliers that it leaves, if they differ."""
-        plain = self.set_of(chosen.blocks) if chosen.out else chosen
-        onto = np.hstack([self.onto, plain.onto])
-        outliers = outliers_among(
-            by_pose(plain.residual, onto, self.pose), plain.rss,
-            self.dof - int(plain.parameters), self.poses, noise_known=self.worth > 0.0)
-        out = outliers.poses.tolist()
-        return [chosen] if tuple(out) == chosen.out else [chosen, self.set_of(chosen.blocks, out)]
+        key = frozenset(chosen.blocks)
+        if key not in self._outliers:
+            self._outliers[key] = self._outliers_beside(
+                self.set_of(chosen.blocks) if chosen.out else chosen)
+        out = self._outliers[key]
+        return [chosen] if out == chosen.out else [chosen, self.set_of(chosen.blocks, out)]
 
-    def _unusual(self, blocks: Sequence[int], raw: list[Floats], units: Floats) -> float:
+    @cached_property
+    def _outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
+        """Return the outliers that were found so far, by the blocks beside them."""
+        return {}
+
+    def _outliers_beside(self, plain: Set) -> tuple[int, ...]:
+        onto, residual = self.spanned(plain)
+        return tuple(outliers_among(
+            by_pose(residual, np.hstack([self.onto, onto]), self.pose), plain.rss,
+            self.dof - int(plain.parameters), self.poses, noise_known=self.worth > 0.0
+        ).poses.tolist())
+
+    def _unusual(self, span: _Span) -> float:
         """Return the penalty for the sizes of the effects."""
         penalty = 0.0
-        for block, values in self._values(blocks, raw, units).items():
+        for block, values in self._values(span).items():
             size = float(np.max(np.abs(values))) / self.blocks[block].entry.typical
             penalty += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
         return penalty
 
     def values_of(self, chosen: Set) -> dict[int, Floats]:
         """Return the (p,) values of the effect of each block of a set."""
-        raw = [self.columns[:, self.blocks[block].columns] for block in chosen.blocks]
-        rows = int(chosen.onto.shape[1] - sum(chosen.ranks))
-        return self._values(chosen.blocks, raw, chosen.onto[:, :rows])
+        return self._values(chosen.span)
 
-    def _values(self, blocks: Sequence[int], raw: list[Floats], units: Floats
-                ) -> dict[int, Floats]:
-        if not blocks:
+    def _values(self, span: _Span) -> dict[int, Floats]:
+        if not span.blocks:
             return {}
-        columns = np.hstack(raw)
-        columns = columns - units @ (units.T @ columns)
-        values = np.linalg.lstsq(columns, self.residual, rcond=1e-7)[0]
-        by_block: dict[int, Floats] = {}
+        index = self._index(span.blocks)
+        left, right = self.products[index][:, index], self.products[-1, index]
+        if span.out:
+            across = span.across[:span.units.shape[1]]
+            left = left - across[:, index].T @ across[:, index]
+            right = right - across[:, index].T @ across[:, -1]
+        values = np.linalg.lstsq(left, right, rcond=_DETERMINED)[0] / self.sizes[index]
+        found: dict[int, Floats] = {}
         start = 0
-        for block in blocks:
+        for block in span.blocks:
             part = self.blocks[block].columns
-            end = start + part.stop - part.start
-            by_block[block] = values[start:end] / self.sizes[part]
-            start = end
-        return by_block
+            count = part.stop - part.start
+            found[block] = values[start:start + count]
+            start += count
+        return found
 
-    def visible(self) -> dict[str, float]:
-        """Return the effect on the residuals of each candidate of typical size, per noise."""
-        largest: dict[str, float] = {}
-        for block in self.blocks:
-            left = _outside(self.columns[:, block.columns], self.onto[:, :0])
-            if left.shape[1]:
-                own = self.columns[:, block.columns] * self.sizes[block.columns]
-                size = float(np.linalg.norm(own, 2)) * block.entry.typical
-                largest[block.effect] = max(size, largest.get(block.effect, 0.0))
-        return largest
+    def _index(self, blocks: Iterable[int]) -> list[int]:
+        """Return the columns of these blocks."""
+        return [column for block in blocks for column in range(
+            self.blocks[block].columns.start, self.blocks[block].columns.stop)]
 
-    def gains(self, beside: Set) -> tuple[Floats, Floats]:
-        """Return the (b,) gain of each block in addition to a set, and its (b,) rank."""
-        across = beside.onto.T @ self.columns
-        along = self.along - across.T @ (beside.onto.T @ self.residual)
+    def gains(self, beside: Set, effect: str = '') -> tuple[Floats, Floats]:
+        """
+        Return the (b,) gain of each block in addition to a set, and its (b,) rank.
+
+        Both are 0 for the blocks of other effects, if one is given.
+
+        """
+        across = beside.across
+        along = self.products[-1, :-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
-        for numbers, index, products in self.by_width:
+        groups = self._grouped(self.numbers_of[effect]) if effect else self.by_width
+        for numbers, index, products in groups:
             parts = np.moveaxis(across[:, index], 0, 2)
-            left = products - parts @ np.swapaxes(parts, 1, 2)
-            size, axes = np.linalg.eigh(left)
-            kept = (size > _SEEN ** 2) & (size > _SEEN ** 2 * size[:, -1:])
-            towards = (np.swapaxes(axes, 1, 2) @ along[index][:, :, np.newaxis])[:, :, 0]
-            squares = np.where(kept, towards ** 2 / np.where(kept, size, 1.0), 0.0)
-            gain[numbers], rank[numbers] = np.sum(squares, axis=1), np.sum(kept, axis=1)
+            gain[numbers], rank[numbers] = _explained(
+                products - parts @ np.swapaxes(parts, 1, 2), along[index])
         return gain, rank
 
-    def score_with(self, before: Set, block: int, gain: float, rank: float) -> float:
-        """Return the score of a set with one more block, without the penalty for its size."""
-        entry = self.blocks[block]
-        return self.score(before.rss - gain, before.parameters + rank + entry.searched,
-                          before.charge + self.choice + 2.0 * math.log(entry.tried))
+    def best_of(self, effect: str, beside: Set) -> int:
+        """Return the block of an effect with the largest gain in addition to a set."""
+        own = self.numbers_of[effect]
+        return int(own[np.argmax(self.gains(beside, effect)[0][own])])
+
+    @cached_property
+    def _costs(self) -> tuple[Floats, Floats]:
+        """(b,) arrays, values searched of each block, and what its choice costs."""
+        return (np.array([block.searched for block in self.blocks], float),
+                self.choice + 2.0 * np.log(np.array([block.tried for block in self.blocks])))
 
     def scores_beside(self, before: Set) -> Floats:
-        """Return the (b,) scores with one more block; -inf for one that determines nothing."""
+        """
+        Return the (b,) scores with one more block, without the penalty for its size.
+
+        They are -inf for a block that determines nothing.
+
+        """
         gain, rank = self.gains(before)
-        return np.array([self.score_with(before, k, gain[k], rank[k]) if rank[k] else -np.inf
-                         for k in range(len(self.blocks))])
+        searched, cost = self._costs
+        scores = self.score(before.rss - gain, before.parameters + rank + searched,
+                            before.charge + cost)
+        return np.where(rank > 0.0, scores, -np.inf)
 
     def whitened(self, columns: Floats) -> Floats:
         """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
@@ -303,7 +434,7 @@ class Linear:
     def probability(self, chosen: Set, block: int) -> float:
         """Return the probability that noise alone makes a block this good beside the others."""
         chance = self.chance(self.without(chosen, block), chosen)
-        return min(1.0, chance * _kinds(self.blocks) * self.blocks[block].tried)
+        return min(1.0, chance * self.kinds * self.blocks[block].tried)
 
     def is_significant(self, chosen: Set) -> bool:
         """Return whether each effect of a set is significant beside the others."""
@@ -322,35 +453,102 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class Set:
+class _Span:
     """
-    Effects that are added to the base, and poses that are left out.
+    An orthonormal basis of blocks and of poses that are left out, by its products.
 
-    `blocks` are the indices of the blocks of the effects, and `out` those of the poses. The
-    orthonormal columns `onto` (m, q) span both, those of the poses first, and leave `residual`
-    (m,) with the sum of squares `rss`. `ranks` are the numbers of values that each block
-    determines beside the blocks before it. `parameters` is the number of values, with searched
-    shapes and equations left out. `charge` is subtracted from the score apart from these values.
-    `score` is the criterion, 0 for the base.
+    The columns `units` (m, k) span the poses. With those of the blocks, they are k' columns; times
+    `mix` (k', q) they are the basis. `across` (q, c + 1) are the products of the basis with the
+    columns of the problem and, last, with its residual.
 
     """
 
     blocks: tuple[int, ...]
     out: tuple[int, ...]
-    onto: Floats = field(repr=False)
-    residual: Floats = field(repr=False)
+    units: Floats
+    across: Floats
+    mix: Floats
+
+    def beside(self, block: int, along: Floats, left: Floats, new: Floats) -> _Span:
+        """
+        Return the span with a block of w columns.
+
+        `along` (q, w) are the products of the basis with them, `left` (w, c + 1) those of their
+        part outside of the basis with all columns, and `new` (w, r) makes this part orthonormal.
+
+        """
+        rows, count = self.mix.shape
+        mix = np.zeros((rows + len(left), count + new.shape[1]))
+        mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
+        mix[rows:, count:] = new
+        return _Span((*self.blocks, block), self.out, self.units,
+                     np.concatenate([self.across, new.T @ left]), mix)
+
+
+@dataclass(frozen=True)
+class Set:
+    """
+    Effects that are added to the base, and poses that are left out.
+
+    Beside the `span` of both, the sum of squares `rss` is left. `parameters` is the number of
+    values, with searched shapes and equations left out. `charge` is subtracted from the score
+    apart from these values. `score` is the criterion, 0 for the base.
+
+    """
+
+    span: _Span = field(repr=False)
     rss: float
-    ranks: tuple[float, ...]
     parameters: float
     charge: float
     score: float
 
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Return the indices of the blocks of the effects."""
+        return self.span.blocks
 
-def _outside(columns: Floats, onto: Floats) -> Floats:
-    """Return the part of (m, w) columns outside of an orthonormal basis, orthonormal (m, r)."""
-    left = columns - onto @ (onto.T @ columns)
-    vectors, scales, _ = np.linalg.svd(left, full_matrices=False)
-    return vectors[:, (scales > _SEEN) & (scales > _SEEN * scales[:1])]
+    @property
+    def out(self) -> tuple[int, ...]:
+        """Return the indices of the poses that are left out."""
+        return self.span.out
+
+    @property
+    def across(self) -> Floats:
+        """(q, c + 1) array, products of a basis of the set with the columns and the residual."""
+        return self.span.across
+
+
+def _is_seen(squares: Floats) -> NDArray[np.bool_]:
+    """Return which directions of columns are outside of a basis, by their increasing squares."""
+    return (squares > _SEEN ** 2) & (squares > _SEEN ** 2 * squares[..., -1:])
+
+
+def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
+    """Return what k blocks explain, and their ranks, from their products (k, w, w) and (k, w)."""
+    width, size = along.shape[1], np.trace(products, axis1=1, axis2=2)
+    # No eigenvalue is below this, as the others are at most `size` together.
+    least = np.linalg.det(products) * (max(width - 1, 1) / np.maximum(size, _SEEN ** 2)) ** (
+        width - 1)
+    whole = least > _SEEN ** 2 * np.maximum(size, 1.0)
+    gain, rank = np.zeros(len(size)), np.full(len(size), width)
+    solved = np.linalg.solve(products[whole], along[whole][:, :, np.newaxis])[:, :, 0]
+    gain[whole] = np.sum(along[whole] * solved, axis=1)
+    squares, axes = np.linalg.eigh(products[~whole])
+    kept = _is_seen(squares)
+    towards = (along[~whole][:, np.newaxis] @ axes)[:, 0]
+    gain[~whole] = np.sum(towards ** 2 * kept / np.where(kept, squares, 1.0), axis=1)
+    rank[~whole] = np.sum(kept, axis=1)
+    return gain, rank
+
+
+def products_of(columns: Floats, residual: Floats) -> Floats:
+    """Return the products of (m, c) columns and, last, an (m,) residual, (c + 1, c + 1)."""
+    count = columns.shape[1]
+    found = np.empty((count + 1, count + 1))
+    np.matmul(columns.T, columns, out=found[:count, :count])
+    found[count, :count] = found[:count, count] = columns.T @ residual
+    found[count, count] = residual @ residual
+    return found
 
 
 def held_out(residual: Floats, own: Floats) -> Floats:
@@ -359,8 +557,8 @@ def held_out(residual: Floats, own: Floats) -> Floats:
     return predicted
 
 
-def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str] = ()) -> Linear:
-    """Return the linear problem at a fit, given the names of the base and of the candidates."""
+def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ()) -> Linear:
+    """Return the linear problem at a fit, given the names of the base, and the candidates."""
     near, model = fit.equations, fit.model
     held = Model({name: values for name, values in model.values.items() if name in base})
     further = Model({name: values for name, values in model.values.items() if name not in base})
@@ -369,30 +567,41 @@ def linearised(fit: Fit, base: tuple[str, ...], names: Iterable[str] = ()) -> Li
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = _orthonormal(near.columns(held)[:, held.fitted])
     residual = residual - onto @ (onto.T @ residual)
-    candidates = {name: effect_named(name) for name in names}
-    blocks, raw = _blocks(near, fit.poses_g.columns, further, candidates, len(fit.poses_g))
+    blocks, raw = _blocks(near, fit.poses_g.columns, further, tried)
     columns, sizes = outside_of(onto, raw)
+    kinds = len({kind_of(block.effect) for block in blocks})
     return Linear(onto, residual, near.pose, blocks, columns, sizes,
-                  WORTH if near.noise_known else 0.0, near.count - onto.shape[1],
-                  float(residual @ residual), near.columns(_OFFSET),
-                  2.0 * math.log(1.0 + _kinds(blocks)))
+                  products_of(columns, residual), WORTH if near.noise_known else 0.0,
+                  near.count - onto.shape[1], float(residual @ residual), near.columns(_OFFSET),
+                  2.0 * math.log(1.0 + kinds))
 
 
-def _kinds(blocks: Iterable[Block]) -> int:
-    """Return the number of effects tried; the covariates of all quantities count as one."""
-    return len({kind_of(block.effect) for block in blocks})
+def visible(fit: Fit, tried: Sequence[Candidate]) -> dict[str, float]:
+    """Return the effect on the residuals of candidates of typical size beside a fit, per noise."""
+    near, found = fit.equations, {}
+    onto = _orthonormal(fit.columns)
+    for each in tried:
+        columns, sizes = outside_of(onto, near.columns_of(each.name, each.factors))
+        own = columns.reshape(len(columns), len(each.shapes), -1).swapaxes(0, 1)
+        sized = own * sizes.reshape(len(own), 1, -1)
+        seen = _is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
+        if np.any(seen):
+            squares = np.linalg.eigvalsh(sized.swapaxes(1, 2) @ sized)[seen, -1]
+            found[each.name] = math.sqrt(np.max(squares)) * each.entry.typical
+    return found
 
 
 def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
     sizes = _norms(columns)
     columns = columns / sizes
-    return columns - onto @ (onto.T @ columns), sizes
+    columns -= onto @ (onto.T @ columns)
+    return columns, sizes
 
 
 def _norms(columns: Floats) -> Floats:
     """Return the norms of columns, 1 for a column of zeros."""
-    sizes: Floats = np.linalg.norm(columns, axis=0)
+    sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
     sizes[sizes == 0.0] = 1.0
     return sizes
 
@@ -411,38 +620,15 @@ def _orthonormal(columns: Floats) -> Floats:
     return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
 
 
-def _blocks(near: Equations, context: Context, present: Model, candidates: dict[str, Effect],
-            poses: int) -> tuple[tuple[Block, ...], Floats]:
-    """Return the blocks of the candidates that the context allows, and their columns."""
+def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
+            ) -> tuple[tuple[Block, ...], Floats]:
+    """Return the blocks of the candidates, and their columns."""
+    alike = Counter(kind_of(each.name) for each in tried)
+    tried = [each.beside(present.values.get(each.name), context) for each in tried]
+    widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
+    columns = np.empty((len(near.pose), sum(widths)), order='F')
     blocks: list[Block] = []
-    columns: list[Floats] = [np.zeros((len(near.pose), 0))]
-    start = 0
-    usable = {name: effect for name, effect in candidates.items() if effect.output is None
-              and all(key in context for key in effect.needs)}
-    alike = Counter(map(kind_of, usable))
-    for name, effect in usable.items():
-        count = len(effect.parameters)
-        for shape, searched, tried in _shapes(effect, context, present.values.get(name), poses):
-            model = Model({name: np.concatenate([np.zeros(count), shape])})
-            columns.append(near.columns(model)[:, :count])
-            blocks.append(Block(name, shape, slice(start, start + count), effect, searched,
-                                tried * alike[kind_of(name)]))
-            start += count
-    return tuple(blocks), np.hstack(columns)
-
-
-def _shapes(effect: Effect, context: Context, present: Floats | None, poses: int
-            ) -> list[tuple[Floats, int, float]]:
-    """Return the shapes of an effect to try, with the values searched and the number tried."""
-    if effect.shapes is None:
-        return [(np.zeros(0), 0, 1.0)]
-    shapes = list(effect.shapes(context))
-    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
-    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
-    if len(shapes) == 1:
-        return [(shapes[0], 0, 1.0)]
-    tried = max(len(shapes) / _SHAPES_ALIKE, 1.0)
-    if present is not None:
-        shapes = [*shapes, effect.split(present)[1]]
-    return [(shape, 0, 1.0) if np.array_equal(shape, effect.usual) else (shape, 1, tried)
-            for shape in shapes]
+    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
+        columns[:, start:start + width] = near.columns_of(each.name, each.factors)
+        blocks += each.blocks(start, alike[kind_of(each.name)])
+    return tuple(blocks), columns

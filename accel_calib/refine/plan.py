@@ -276,10 +276,8 @@ def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
     near = found.near
     own = near.chosen.blocks[near.names.index(name)]
     others = near.linear.without(near.chosen, own)
-    gain, _ = near.linear.gains(others)
-    best = max((number for number, block in enumerate(near.linear.blocks)
-                if block.effect == rival), key=lambda number: float(gain[number]))
-    chosen = near.linear.set_of((*others.blocks, best), others.out)
+    best = near.linear.best_of(rival, others)
+    chosen = near.linear.extended(others, best)
     unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
     block = near.linear.blocks[best]
     values = with_effect(unchanged, rival, np.concatenate(

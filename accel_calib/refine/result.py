@@ -24,7 +24,7 @@ import numpy as np
 
 from .base import fitted_state, is_noise, State, with_effect
 from .curves import is_curve, nearest_effects, steepest
-from .linear import linearised
+from .linear import candidates, linearised, visible
 from .plan import PosePlan
 from .search import Found
 from .sets import LEAST, probabilities
@@ -312,7 +312,7 @@ def _p_value(name: str, before: State, found: Found) -> float:
         return found.curve.p_value
     if name in near.names:
         return near.linear.probability(near.chosen, near.chosen.blocks[near.names.index(name)])
-    linear = linearised(before.fit, before.model.effects, LADDER)
+    linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
     own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
     return linear.probability(linear.set_of(own), own[0]) if own else 1.0
 
@@ -410,8 +410,7 @@ def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ..
     final = found.final
     names = tuple(name for name in EFFECTS if name not in final.model.effects)
     rivals = tuple(rival for step in steps for rival in step.rivals)
-    return not_testable(final.poses_g,
-                        linearised(final.fit, final.model.effects, names).visible(),
+    return not_testable(final.poses_g, visible(final.fit, candidates(names, final.poses_g)),
                         (*final.model.effects, *rivals))
 
 

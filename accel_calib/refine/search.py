@@ -39,8 +39,8 @@ from .base import (
     with_effect,
 )
 from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, walk_beside
-from .linear import LEVEL, Linear, linearised, Set
-from .sets import accepted, explored, Near, simpler
+from .linear import Candidate, candidates, LEVEL, Linear, linearised, Set
+from .sets import accepted, explored, Near, NOTHING, simpler
 from ..calibrate import with_previous
 from ..effects import (
     CHANGES,
@@ -72,6 +72,9 @@ _TIMED = 30.0
 _SEVERAL = 10.0
 """Each further slow offset must raise the score by this: one unknown cause is more likely than
 several that act at once (Kass and Raftery 1995: very strong)."""
+
+_EXACT = 0.05
+"""Largest error of a predicted sum of squares, in variances, after which a search ends."""
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
@@ -151,11 +154,12 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
         return found
     near = found.near
     beside = near.plain.set_of(near.chosen.blocks, near.chosen.out)
-    own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(beside.onto ** 2, axis=1)
+    onto, residual = near.plain.spanned(beside)
+    own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     new, factor = poses_g['new'] > 0.0, np.ones(len(poses_g))
     for group in (new, ~new):
         rows = group[near.plain.pose]
-        factor[group] = max(np.sum(beside.residual[rows] ** 2) / max(np.sum(own[rows]), 1.0), 1.0)
+        factor[group] = max(np.sum(residual[rows] ** 2) / max(np.sum(own[rows]), 1.0), 1.0)
     if np.ptp(factor) == 0.0:
         return found
     scaled = poses_g.with_columns(std=poses_g['std'] * np.sqrt(factor)[:, np.newaxis])
@@ -287,12 +291,13 @@ def _is_better(curve: Curve, near: Near) -> bool:
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
              walks: bool = True) -> tuple[State, Near]:
     """Search and fit in turn until the set remains; return the state, and the set near it."""
-    names = tuple(name for name in names if name not in fixed)
+    tried = candidates((name for name in names if name not in fixed), poses_g)
     settled: Near | None = None
-    seen: list[tuple[frozenset[str], tuple[int, ...], bool]] = []
+    begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
+    seen = [NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
     for _ in range(_ROUNDS):
-        linear = linearised(judge(state.model, poses_g), fixed, names)
+        linear = linearised(judge(state.model, poses_g), fixed, tried)
         near = _best_near(linear, poses_g, refused, walks=walks)
         if near.key in seen:
             break
@@ -302,14 +307,24 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         else:
             state, settled = after, near
             seen.append(near.key)
+            if _is_predicted(near, after):
+                linear = linearised(judge(state.model, poses_g), fixed, tried)
+                break
     else:
-        linear = linearised(judge(state.model, poses_g), fixed, names)
+        linear = linearised(judge(state.model, poses_g), fixed, tried)
     near = _at(linear, settled or Near(linear, linear.set_of(), None, linear, None), poses_g)
-    return _significant(state, near, poses_g, fixed, names)
+    return _significant(state, near, poses_g, fixed, tried)
+
+
+def _is_predicted(near: Near, fitted: State) -> bool:
+    """Return whether the equations were linear enough: near the fit, the same would be found."""
+    plain = near.plain.set_of(near.chosen.blocks, near.chosen.out)
+    error, variance = abs(plain.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
+    return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
 
 
 def _significant(state: State, near: Near, poses_g: Poses, fixed: tuple[str, ...],
-                 names: tuple[str, ...]) -> tuple[State, Near]:
+                 tried: tuple[Candidate, ...]) -> tuple[State, Near]:
     """Remove the effects that are not significant near the fit, one by one."""
     while True:
         weak = [near.linear.without(near.chosen, block) for block in near.chosen.blocks
@@ -321,7 +336,7 @@ def _significant(state: State, near: Near, poses_g: Poses, fixed: tuple[str, ...
         if after is None:
             break
         state = after
-        near = _at(linearised(judge(state.model, poses_g), fixed, names), fewer, poses_g)
+        near = _at(linearised(judge(state.model, poses_g), fixed, tried), fewer, poses_g)
     return state, near
 
 
@@ -330,9 +345,9 @@ def _best_fit(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]
     """Return the fit of a set, or of a simpler one whose fit has a better score."""
     best, after = near, _fitted(near, state, poses_g, fixed)
     most = -np.inf if after is None else _score_of(near, after)
-    for other in simpler(near.linear, near.chosen):
+    for other in sorted(simpler(near.linear, near.chosen), key=lambda other: -other.score):
         instead = replace(near, chosen=other)
-        tried = _fitted(instead, state, poses_g, fixed)
+        tried = _fitted(instead, state, poses_g, fixed, near.plain.rss_of(most, other))
         if tried is not None and _score_of(instead, tried) > most:
             best, after, most = instead, tried, _score_of(instead, tried)
     return best, after
@@ -389,13 +404,15 @@ def _is_all_noise(linear: Linear, chosen: Set) -> bool:
     return is_noise(chosen.rss, linear.dof - chosen.parameters)
 
 
-def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]) -> State | None:
+def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...],
+            most: float = np.inf) -> State | None:
+    """Return the fit of a set; None without a sound fit below `most`."""
     model = {name: part for name, part in state.model.values.items() if name in fixed}
     for number, values in near.linear.values_of(near.chosen).items():
         block = near.linear.blocks[number]
         model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
     kept = np.delete(np.arange(len(poses_g)), near.chosen.out)
-    after = fitted_state(Model(model), poses_g.take(kept))
+    after = fitted_state(Model(model), poses_g.take(kept), most)
     if after is None or (near.chosen.blocks and after.fit.at_bound):
         return None
     return after

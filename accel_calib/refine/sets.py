@@ -95,8 +95,9 @@ def simpler(linear: Linear, chosen: Set) -> list[Set]:
             others = [block for block in less.blocks if linear.blocks[block].effect != effect]
             if _is_barred(linear.blocks[own[0]], [linear.blocks[block] for block in others]):
                 continue
-            gain, _ = linear.gains(linear.set_of(others, chosen.out))
-            new = linear.set_of([*others, max(own, key=lambda number: gain[number])], chosen.out)
+            gain, _ = linear.gains(linear.instead(chosen, others), effect)
+            best = max(own, key=lambda number: gain[number])
+            new = linear.instead(chosen, [*others, best])
             if new.score > _NEARLY * chosen.score:
                 sets.append(new)
     return sets
@@ -125,11 +126,12 @@ def _extended(linear: Linear, before: Set) -> list[Set]:
     """Return the set with one more effect, for the effects with the best scores."""
     present = [linear.blocks[block] for block in before.blocks]
     best: dict[str, tuple[float, int]] = {}
-    for number, score in enumerate(linear.scores_beside(before).tolist()):
-        block = linear.blocks[number]
-        if score > best.get(block.effect, (-np.inf, 0))[0] and not _is_barred(block, present):
-            best[block.effect] = score, number
-    return [linear.set_of((*before.blocks, number), before.out)
+    scores = linear.scores_beside(before)
+    for effect, numbers in linear.numbers_of.items():
+        number = int(numbers[np.argmax(scores[numbers])])
+        if scores[number] > -np.inf and not _is_barred(linear.blocks[number], present):
+            best[effect] = float(scores[number]), number
+    return [linear.extended(before, number)
             for _, number in sorted(best.values(), reverse=True)[:_BRANCHES]]
 
 
@@ -142,15 +144,13 @@ def _is_barred(block: Block, present: Iterable[Block]) -> bool:
 def _with_best_shapes(linear: Linear, chosen: Set) -> Set:
     """Choose the shape of each effect again, with the others as they are."""
     for place, number in enumerate(chosen.blocks[:-1]):
-        same = [other for other, block in enumerate(linear.blocks)
-                if block.effect == linear.blocks[number].effect]
-        if len(same) == 1:
+        effect = linear.blocks[number].effect
+        if len(linear.numbers_of[effect]) == 1:
             continue
         before, after = chosen.blocks[:place], chosen.blocks[place + 1:]
-        gain, _ = linear.gains(linear.set_of((*before, *after), chosen.out))
-        best = max(same, key=lambda other: gain[other])
+        best = linear.best_of(effect, linear.instead(chosen, (*before, *after)))
         if best != number:
-            new = linear.set_of((*before, best, *after), chosen.out)
+            new = linear.instead(chosen, (*before, best, *after))
             chosen = max(chosen, new, key=lambda either: either.score)
     return chosen
 
@@ -191,6 +191,10 @@ class Near:
         return frozenset(self.names), self.chosen.out, self.walk is not None
 
 
+NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
+"""The key of a choice without effects, outliers and a walk."""
+
+
 def probabilities(name: str, near: Near) -> dict[str, float]:
     """Return the probabilities of an effect or `WANDER` and those in its place, largest first."""
     if name != WANDER and name not in near.names:
@@ -219,7 +223,7 @@ def _scores(name: str, near: Near, least: float) -> dict[str, float]:
         effect = problem.blocks[number].effect
         if (likely > least and effect not in names
                 and (effect in LADDER or name not in LADDER)):
-            score = problem.set_of((*others.blocks, number), others.out).score
+            score = problem.extended(others, number).score
             scores[effect] = max(score, scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
         scores[WANDER] = walk_beside(near.plain, others, near.process).score

@@ -29,6 +29,7 @@ from accel_calib.units import Units
 from inside import (
     carried,
     kinds,
+    Linear,
     Model,
     probabilities,
     rotation_free,
@@ -139,19 +140,40 @@ def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     gain, rank = linear.gains(chosen)
     best: dict[str, tuple[float, ...]] = {}
     for k, block in enumerate(linear.blocks):
-        each = (float(gain[k]), float(rank[k]), block.tried, linear.score_with(
-            chosen, k, gain[k], rank[k]))
+        each = (float(gain[k]), float(rank[k]), block.tried, float(linear.score(
+            chosen.rss - gain[k], chosen.parameters + rank[k] + block.searched,
+            chosen.charge + linear.choice + 2.0 * np.log(block.tried))))
         best[block.effect] = max(each, best.get(block.effect, each))
     return {
         **those(found, 'added outliers taken_back grid_g clipped curve'), 'candidates': best,
         'walk': found.walk and those(found.walk, 'ratio score likelihood_ratio'),
         'states': [those(each, 'rss dof floor_mg is_noise residual held_out')
                    for each in (found.base, found.final)],
-        'chosen': {**those(chosen, 'out rss ranks parameters charge score'), 'names': near.names,
+        'chosen': {**those(chosen, 'out rss parameters charge score'), 'names': near.names,
+                   'ranks': _ranks(linear, chosen),
                    'shapes': [linear.blocks[k].shape for k in chosen.blocks]},
         'linear': {**those(linear, 'worth dof base_rss choice penalty poses'),
-                   'visible': linear.visible()},
+                   'visible': _visible(linear)},
         'probabilities': {name: probabilities(name, near) for name in near.names}}
+
+
+def _ranks(linear: Linear, chosen: Any) -> tuple[float, ...]:
+    """Return the number of values that each block of a set determines beside those before it."""
+    sizes = [len(linear.set_of(chosen.blocks[:count], chosen.out).across)
+             for count in range(len(chosen.blocks) + 1)]
+    return tuple(np.diff(sizes).astype(float).tolist())
+
+
+def _visible(linear: Linear) -> dict[str, float]:
+    """Return the effect on the residuals of each candidate of typical size that shows."""
+    found: dict[str, float] = {}
+    for block in linear.blocks:
+        own, sizes = linear.products[block.columns, block.columns], linear.sizes[block.columns]
+        if np.linalg.eigvalsh(own)[-1] > 0.02 ** 2:
+            square = np.linalg.eigvalsh(own * np.outer(sizes, sizes))[-1]
+            found[block.effect] = max(float(np.sqrt(square)) * block.entry.typical,
+                                      found.get(block.effect, 0.0))
+    return found
 
 
 def solved(poses: Poses, units: Units, *effects: str) -> dict[str, Any]:
