@@ -100,14 +100,8 @@ def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
     values = np.column_stack([np.arange(count) / 100.0, rng.normal((0.1, 0.2, 9.8), 0.02,
                                                                    (count, 3))])
     np.savetxt(path, values, fmt='%.4f', delimiter=',', header='time,ax,ay,az', comments='')
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen([*RUN, 'capture', str(path), '-o', str(tmp_path / 'p.csv')],
-                               stdout=subprocess.PIPE, stderr=theirs,
-                               env={**os.environ, 'TERM': 'xterm'})
-    os.close(theirs)
-    process.communicate()
-    shown_text = os.read(ours, 1 << 16).decode()
-    os.close(ours)
+    status, shown_text = on_a_terminal(['capture', path, '-o', tmp_path / 'p.csv'])
+    assert status == 0
     assert 'samples' in shown_text
 
 

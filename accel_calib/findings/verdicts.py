@@ -16,13 +16,13 @@ from .rules import degrees, findings_of, mg, number, step_after
 from ..calibrate import Calibration, Verification
 from ..estimate import coverage
 from ..finding import Finding, Level, NextStep, ranked
-from ..noise import duration, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..table import Poses
 from ..text import counted
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..compare import Comparison
+    from ..noise import NoiseFigures
     from ..refine import Refinement
 
 
@@ -236,6 +236,8 @@ def rate_noise(found: NoiseFigures) -> Rating:
         seen or the noise is larger than that of common parts, BAD without white noise.
 
     """
+    from ..noise import duration, shown_unit, TYPICAL, WORDS  # a fit alone does not load it
+
     findings, shown = list[Finding](), [f'rest of {duration(found.seconds)}']
     for kind in found.kinds:
         axes, density = found.of(kind), found.common(kind, 'noise_density')[0]

@@ -22,7 +22,6 @@ from inside import MOST_STEPS
 
 _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
 _FEWEST = 4
-_UNCHANGED = 'offset by (+0.00, +0.00, +0.00) mg, gain by up to 0.000 %, mounting by 0.00°'
 _OFF = 'correction switched off'  # this state hides that of the calibration
 _DATE_S = 1.0  # resolution of the date of a calibration
 
@@ -40,12 +39,13 @@ class Call:
 
 @dataclass(frozen=True)
 class Made:
-    """A calibration: number and end of the call that made it, and what the call made of it."""
+    """A calibration: number, end and words of the call that made it, and what it made of it."""
 
     number: int
     ended: float
     levelled: bool
     full: bool
+    words: str
 
 
 @dataclass(frozen=True)
@@ -84,20 +84,17 @@ def _undo_pose(state: State, call: Call, number: int) -> Iterator[State]:
 
 
 def _new(state: State, call: Call, number: int) -> Iterator[State]:
-    """Yield the state after a new calibration, if the response tells of the one before."""
+    """Yield the states that a new calibration can leave."""
     if not call.good:
         yield state
         return
     before, fits = state.used, call.name in ('fit', 'refine')
     kept = before is not None and before.levelled
-    if ('changes offset' in call.words) is (before is None) or (
-            fits and (state.poses < _FEWEST
-                      or ('mounting of the sensor' in call.words) is not kept)) or (
-            call.name == 'set_heading' and not kept):
+    if (fits and state.poses < _FEWEST) or (call.name == 'set_heading' and not kept):
         return
-    full = fits or (before is not None and before.full)
-    yield _with_step(state, Made(number, call.ended, kept or not fits, full))
-    if state.used == state.stored is not None and _UNCHANGED in call.words and not (
+    full, words = fits or (before is not None and before.full), call.words.partition('; next: ')[0]
+    yield _with_step(state, Made(number, call.ended, kept or not fits, full, words))
+    if state.used == state.stored is not None and state.stored.words == words and not (
             fits and call.begun - state.stored.ended > _DATE_S):
         yield state  # the same rest or poses again: an equal file is not a step
 
