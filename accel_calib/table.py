@@ -14,9 +14,9 @@ letters and digits.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import re
-from typing import Any, Literal, TypeVar
+from typing import Any, get_args, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,12 @@ from .errors import InputError, needing
 from .text import counted, table
 from .units import Floats, STANDARD_GRAVITY, UnitName, Units
 
-__all__ = ['COLUMNS', 'Column', 'Floats', 'Poses', 'Record', 'Recording', 'Table',
-           'check_values', 'column_of', 'columns_from', 'data_frame', 'is_quantity', 'numbered',
-           'present', 'quantity_key']
+__all__ = ['ABOUT', 'COLUMNS', 'Autopilot', 'Column', 'Firmware', 'Floats', 'Poses', 'Record',
+           'Recording', 'Table', 'check_values', 'column_of', 'columns_from', 'data_frame',
+           'is_quantity', 'numbered', 'present', 'quantity_key']
+
+ABOUT = ('units', 'sensor', 'autopilot')
+"""What a table states beside its columns."""
 
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
@@ -133,6 +136,42 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other or (one != one and other != other))
 
 
+Firmware = Literal['px4', 'ardupilot']
+
+
+@dataclass(frozen=True)
+class Autopilot:
+    """
+    The accelerometer of an autopilot that readings come from.
+
+    Parameters
+    ----------
+    firmware : {'px4', 'ardupilot'}
+        The firmware, as the formats of an export are named.
+    instance : int or None
+        Number in the names of its parameters; None if it has none yet.
+    device_id : int or None
+        Its device id; None if the log does not state it.
+    thermal : int or None
+        Number in the names of its thermal calibration; None if the vehicle has none in use.
+    corrected : str
+        Why the readings are still those that old parameters correct; empty: they are raw.
+
+    """
+
+    firmware: Firmware
+    instance: int | None = None
+    device_id: int | None = None
+    thermal: int | None = None
+    corrected: str = ''
+
+    def __post_init__(self) -> None:
+        numbers = (self.instance, self.device_id, self.thermal)
+        if (self.firmware not in get_args(Firmware) or not isinstance(self.corrected, str)
+                or any(each is not None and type(each) is not int for each in numbers)):
+            raise ValueError(f'autopilot is {self}, expected px4 or ardupilot, and whole numbers')
+
+
 _Self = TypeVar('_Self', bound='Table')
 
 _PREVIEW_ROWS = 20
@@ -154,6 +193,8 @@ class Table(Record):
         Unit of the readings; empty if the source does not state it.
     sensor : str
         Name of the sensor; empty if the source does not state it.
+    autopilot : Autopilot or None
+        Its place in an autopilot, for readings of a flight log.
 
     """
 
@@ -161,6 +202,7 @@ class Table(Record):
     row: NDArray[np.int64]
     units: UnitName | Literal[''] = ''
     sensor: str = ''
+    autopilot: Autopilot | None = None
 
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
@@ -206,7 +248,7 @@ class Table(Record):
         """
         Return the rows as a pandas DataFrame, with the column names of a file.
 
-        The index is `row`; ``attrs`` holds the unit of the readings and the sensor.
+        The index is `row`; ``attrs`` holds `about`: the unit of the readings, the sensor.
 
         Raises
         ------
@@ -217,8 +259,15 @@ class Table(Record):
         parts = ((name, values) for key in self._in_order for name, values in zip(
             column_of(key).names, np.atleast_2d(self[key].T), strict=True))
         made = data_frame(dict(parts), self.row)
-        made.attrs |= {'units': self.units, 'sensor': self.sensor}
+        made.attrs |= self.about
         return made
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Return what the table states beside its columns, as plain values by name."""
+        stated = {name: getattr(self, name) for name in ABOUT}
+        return {name: value if isinstance(value, str) else asdict(value)
+                for name, value in stated.items() if value}
 
     @property
     def reading(self) -> Floats:

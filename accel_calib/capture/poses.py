@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,8 @@ from .chunks import CaptureSettings, CONTEXT, Interruption, MOTION
 from .detector import StillDetector
 from .dwell import Dwell
 from ..errors import InputError
-from ..table import Floats, numbered, Poses, Recording
-from ..units import UnitName, Units
+from ..table import ABOUT, Floats, numbered, Poses, Recording
+from ..units import Units
 
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
@@ -92,7 +92,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     detector = StillDetector(settings, units, keep=None, context=context)
     spans: list[tuple[float, float]] = []
     recorded = 0
-    about: tuple[Literal[UnitName, ''], str] = ('', '')
+    about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
         for start in range(0, len(part), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(part))
@@ -100,12 +100,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                          for begin in range(start, stop, _BLOCK))
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
-            recorded, about = recorded + len(part), (part.units, part.sensor)
+            recorded += len(part)
+            about = {name: getattr(part, name) for name in ABOUT}
     detector.close()
     dwells = select(detector.dwells(), settings, units)
     interruptions = detector.interruptions
     seconds = spans[-1][1] - spans[0][0] if spans else 0.0
-    poses = replace(poses_from(dwells, settings), units=about[0], sensor=about[1])
+    poses = replace(poses_from(dwells, settings), **about)
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
                     interruptions, recorded, detector.quietest)

@@ -120,7 +120,7 @@ def corrected(table: Poses | Recording, calibration: Calibration, known: Context
         columns['rate'] = table['rate'] @ calibration.model.rotation
     if 'std' in table:
         columns['std'] = calibration.units.to_g(table['std']) * calibration.force_per_g
-    return replace(table.with_columns(**columns), units=units)
+    return replace(table.with_columns(**columns), units=units, autopilot=None)
 
 
 def run_simulate(args: argparse.Namespace) -> Done:

@@ -10,6 +10,7 @@ the fields in serialized messages, and `tables` writes our own tables.
 
 """
 
+from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import Bag, damage_as_input_error, is_bag, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
@@ -44,10 +45,11 @@ from .serialized import (
 from .tables import read_poses, write_blocks, write_table
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
-           'ANGULAR_VELOCITY_COVARIANCE', 'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT',
-           'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE', 'STAMP', 'STAMP_AT', 'THREE', 'Bag',
-           'ContextTopics', 'Frame', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages',
-           'OpenLog', 'Piped', 'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
+           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'IMU_DOUBLES',
+           'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
+           'PER_MILLION', 'STAMP', 'STAMP_AT', 'THREE', 'Bag', 'ByAxis', 'ContextTopics',
+           'Frame', 'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
+           'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
            'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of', 'layout_with',
            'open_bag', 'open_log', 'put_doubles', 'read_log', 'read_poses', 'read_recording',
            'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -25,6 +25,7 @@ The text log has the same messages, one per line.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import math
 from pathlib import Path
 import re
 from typing import Any, Literal
@@ -32,7 +33,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .autopilot import ardupilot_correction, Parameters, Stated
 from .flight import (
+    as_sensed,
     at,
     AXES,
     choose,
@@ -45,7 +48,7 @@ from .flight import (
     taken,
 )
 from ..errors import InputError, needing
-from ..table import Floats
+from ..table import Autopilot, Floats
 from ..text import counted
 
 PREFERRED = ('IMU', 'ACC')
@@ -54,11 +57,11 @@ _RATES = ('GyrX', 'GyrY', 'GyrZ')
 _MAGIC = b'\xa3\x95\x80'
 """First bytes of a binary log: the head of a message FMT."""
 
+_ADVICE = 'take the log from the vehicle whole: it begins with all parameters'
 _TEXT = re.compile(r'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
 _HEAD = 8192
 _MOST_SENSORS = 255
 _NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
-_CALIBRATED = re.compile(r'INS_ACC\d?(OFFS|SCAL)_[XYZ]')
 _STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
 """Fields with the time of a sample, the best first, and their factors to seconds."""
 
@@ -109,8 +112,12 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
     columns |= choice.rates(columns['time'], sources, _RATES)
     columns |= _temperature(chosen, columns['time'], found)
-    return choice.log('ArduPilot log', columns, 'temperature T',
-                      (*notes, *dropped, *choice.others(), *_corrected(tables)))
+    parameters = _parameters(tables.get('PARM', {}))
+    sensed = as_sensed(columns, parameters, _autopilot(parameters, chosen.instance + 1),
+                       lambda: ardupilot_correction(parameters, chosen.instance + 1),
+                       _ADVICE)
+    return choice.log('ArduPilot log', sensed, 'temperature T',
+                      (*notes, *dropped, *choice.others()))
 
 
 def _messages(tables: Mapping[str, _Table]) -> list[Message]:
@@ -149,29 +156,31 @@ def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dic
     return {}
 
 
-def _corrected(tables: Mapping[str, _Table]) -> list[str]:
-    """Return a note on the calibration that the readings hold already."""
-    values = _parameters(tables.get('PARM', {}))
-    if not values:
-        return ['readings are corrected by the INS_ACC parameters that the vehicle had']
-    stored = {name: value for name, value in values.items() if _CALIBRATED.fullmatch(name)
-              and value != (1.0 if 'SCAL' in name else 0.0)}
-    if not stored:
-        return []
-    shown = ', '.join(f'{name} {value:.4g}' for name, value in sorted(stored.items())[:3])
-    more = f' and {len(stored) - 3} more' if len(stored) > 3 else ''
-    return [f'readings are corrected by the parameters of the vehicle: {shown}{more}']
+def _autopilot(parameters: Parameters, instance: int) -> Autopilot:
+    """Return the place of an accelerometer, numbered from 1."""
+    *_, (_, values) = parameters.spans()
+    device = values.get(f'INS_ACC{"" if instance == 1 else instance}_ID', 0.0)
+    warm = values.get(f'INS_TCAL{instance}_ENABLE', 0.0) != 0.0
+    return Autopilot('ardupilot', instance, int(device) or None, instance if warm else None)
 
 
-def _parameters(table: _Table) -> dict[str, float]:
-    if 'Name' not in table or 'Value' not in table:
-        return {}
-    names = [name.decode('latin-1') if isinstance(name, bytes) else str(name)
-             for name in table['Name'].tolist()]
+def _parameters(table: _Table) -> Parameters:
+    """Return the messages PARM, in order; damaged ones are left out."""
+    stamp = next((key for key in _STAMPS if key in table), '')
+    if not stamp or not {'Name', 'Value'} <= set(table):
+        return Parameters([])
+    rows = zip(*(table[key].tolist() for key in (stamp, 'Name', 'Value')))
+    return Parameters([
+        Stated(float(time) * _STAMPS[stamp],
+               name.decode('latin-1') if isinstance(name, bytes) else str(name), float(value))
+        for time, name, value in rows if _is_number(time) and _is_number(value)])
+
+
+def _is_number(value: float | str) -> bool:
     try:
-        return dict(zip(names, table['Value'].astype(float).tolist()))
-    except ValueError:  # a damaged line of text; only a note depends on the parameters
-        return {}
+        return math.isfinite(float(value))
+    except ValueError:  # a damaged line of text
+        return False
 
 
 def _wanted(name: str) -> bool:

@@ -35,12 +35,13 @@ import zlib
 import numpy as np
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
-from .dialect import ABOUT, shown
+from .dialect import shown
 from .flight import sound_log
 from .formats import record_instead
 from .names import meaning, READING
 from .text import open_text, TextTable
 from ..errors import InputError, needing
+from ..table import ABOUT
 
 _ZIP, _OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
 _MATLAB, _MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
@@ -378,8 +379,8 @@ class Frame:
     A DataFrame that is read as a log; the text of it is its name in messages.
 
     Its index is a column if it has a name, or holds dates or fractions, which are then times. The
-    unit and the sensor are read from ``attrs``, where `accel_calib.table.Table.to_dataframe` puts
-    them.
+    unit, the sensor and the autopilot are read from ``attrs``, where
+    `accel_calib.table.Table.to_dataframe` puts them.
 
     """
 

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..table import Floats
+from ..table import ABOUT, Autopilot, Floats
 from ..text import counted, some
 from ..units import UNIT_NAMES
 
@@ -65,7 +65,6 @@ _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
-ABOUT = ('units', 'sensor')
 
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
@@ -456,8 +455,9 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
         name, colon, text = line[1:].partition(':')
         if colon and name.strip() in ABOUT:
             try:
-                about[name.strip()] = json.loads(text)
-            except ValueError:
+                value = json.loads(text)
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else value
+            except (TypeError, ValueError):
                 continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):
         raise InputError(f'{path} has the units {about["units"]!r}, expected one of '

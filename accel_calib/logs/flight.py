@@ -26,9 +26,9 @@ The default profile of PX4 logs `sensor_accel` once a second. It is read if it i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import errno
 import io
 import os
@@ -38,9 +38,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .autopilot import (
+    Correction,
+    Parameters,
+    px4_correction,
+    px4_slot,
+    px4_thermal_slot,
+    raw_columns,
+    Stated,
+)
 from .formats import PX4_FIELDS, PX4_SPANS
 from ..errors import InputError, needing
-from ..table import COLUMNS, columns_from, Floats, numbered, Recording
+from ..table import Autopilot, COLUMNS, columns_from, Floats, numbered, Recording
 from ..text import counted, some
 
 AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
@@ -85,12 +94,36 @@ class FlightLog:
     columns: Mapping[str, Floats]
     sensor: str
     read_as: str
+    autopilot: Autopilot
     notes: tuple[str, ...] = ()
 
     def recording(self, source: str) -> Recording:
         """Return the samples as a recording; a number that is not finite is an InputError."""
         columns = columns_from(self.columns, ('time', 'reading'), source)
-        return Recording(columns, numbered(columns), 'm/s2', self.sensor)
+        return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
+
+
+@dataclass(frozen=True)
+class AsSensed:
+    """Columns of a flight log without the correction of the vehicle, if that is known."""
+
+    columns: Mapping[str, Floats]
+    autopilot: Autopilot
+    turned: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: Autopilot,
+              correction: Callable[[], Correction], advice: str) -> AsSensed:
+    """Return columns without the correction, or as they are with a note why that is not known."""
+    try:
+        raw = raw_columns(columns, parameters, correction())
+    except InputError as err:
+        return AsSensed(columns, replace(autopilot, corrected=err.message), notes=(
+            f'readings are left as the vehicle corrected them ({err.message}), so do not load an '
+            f'export of their calibration into it; {advice}',))
+    undone = (f'the correction by the vehicle is undone: {parameters.words}',)
+    return AsSensed(raw, autopilot, parameters.turned, undone if parameters.words else ())
 
 
 @dataclass(frozen=True)
@@ -108,14 +141,17 @@ class Choice:
     preferred: Sequence[str]
     name: str
 
-    def log(self, kind: str, columns: Mapping[str, Floats], temperature: str,
-            notes: Iterable[str]) -> FlightLog:
+    def log(self, kind: str, found: AsSensed, temperature: str, notes: Iterable[str]
+            ) -> FlightLog:
         """Return the log; `temperature` describes that column, if there is one."""
         chosen = self.message
-        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, x forward, y right, z down'
-        if 'temperature' in columns:
+        axes = ('axes of the sensor, before the rotation of the board' if found.turned else
+                'x forward, y right, z down')
+        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
+        if 'temperature' in found.columns:
             read_as += f', {temperature}'
-        return FlightLog(columns, self.name or str(chosen), read_as, tuple(notes))
+        return FlightLog(found.columns, self.name or str(chosen), read_as, found.autopilot,
+                         (*notes, *found.notes))
 
     def others(self) -> list[str]:
         """Return notes on the other sensors of the same message, and on other messages."""
@@ -245,9 +281,12 @@ MAGIC = b'ULog\x01\x12\x35'
 _INVALID = 0x7fffffff
 """Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
 
+_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 to SDLOG_PROFILE to '
+           'log it at 10 Hz)')
 _RELATIVE = 'accelerometer_timestamp_relative'
 _XYZ = ('x', 'y', 'z')
 PREFERRED = tuple(PX4_FIELDS)
+_FILTERED = 'vehicle_acceleration'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
 _NEEDED = {name: {*fields, *_MORE.get(name, ())} for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
@@ -287,7 +326,7 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     installed, or the file is damaged or has no such message.
 
     """
-    found, notes = _messages(path)
+    found, parameters, release, notes = _messages(path)
     known = [message for message in found
              if message.name in _NEEDED and _NEEDED[message.name] <= set(message.fields)]
     choice = choose(known, PREFERRED, topic, sensor, str(path))
@@ -301,17 +340,30 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         gyros = (message for message in found
                  if (message.name, message.instance) == ('sensor_gyro', chosen.instance))
         columns |= choice.rates(time, gyros, _XYZ)
-        corrected = []
-    else:
-        corrected = [f'{chosen.name} is corrected by the stored CAL_ACC parameters; sensor_accel '
-                     'is not (add 4 or 64 to SDLOG_PROFILE to log it at 10 Hz)']
     columns |= _temperature(chosen, time, found)
-    return choice.log('PX4 log', columns, 'temperature of the sensor',
-                      (*notes, *invalid, *choice.others(), *corrected))
+    device = _device(chosen, found)
+    autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
+                          px4_thermal_slot(parameters, device))
+    if chosen.name == PREFERRED[0]:
+        sensed = AsSensed(columns, autopilot)
+    else:
+        sensed = as_sensed(columns, parameters, autopilot, lambda: _correction(
+            chosen, parameters, device, release), _ADVICE)
+    return choice.log('PX4 log', sensed, 'temperature of the sensor',
+                      (*notes, *invalid, *choice.others()))
 
 
-def _messages(path: Path) -> tuple[list[Message], list[str]]:
-    """Return the messages that matter, and notes on a log that is damaged in part."""
+def _correction(chosen: Message, parameters: Parameters, device: int,
+                release: tuple[int, int] | None) -> Correction:
+    """Return the correction of a message; raise InputError if it is not known."""
+    if chosen.name == _FILTERED:
+        raise InputError(f'{chosen.name} lacks the bias that PX4 estimates',
+                         'name another message with --topic')
+    return px4_correction(parameters, device, release)
+
+
+def _messages(path: Path) -> tuple[list[Message], Parameters, tuple[int, int] | None, list[str]]:
+    """Return the messages and parameters that matter, the release of PX4, and notes on damage."""
     with needing('pyulog', 'a PX4 log (.ulg)'):
         from pyulog import ULog
     if not is_ulg(path):
@@ -327,7 +379,12 @@ def _messages(path: Path) -> tuple[list[Message], list[str]]:
     if log.dropouts:
         lost = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f'PX4 reports {counted(len(log.dropouts), "dropout")} of the log, {lost} ms')
-    return found, notes
+    release = log.msg_info_dict.get('ver_sw_release')
+    return found, Parameters([
+        *(Stated(-np.inf, name, float(value)) for name, value in log.initial_parameters.items()),
+        *(Stated(stamp * MICRO, name, float(value))
+          for stamp, name, value in log.changed_parameters)]), (
+        (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
 
 
 def _time(fields: Mapping[str, NDArray[Any]]) -> Floats:
@@ -356,14 +413,12 @@ def _samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
 
 
 def _device(chosen: Message, found: Sequence[Message] = ()) -> int:
-    """Return the device id of the accelerometer of a message; 0 if it is not known."""
-    for name in ('device_id', 'accel_device_id'):
-        if name in chosen.fields:
-            return int(chosen.fields[name][-1])
-    for message in found:
-        if message.name == 'sensor_selection' and 'accel_device_id' in message.fields:
-            return int(message.fields['accel_device_id'][-1])
-    return 0
+    """Return the device id of the accelerometer of a message; 0 if it is not known, or changes."""
+    stated = [chosen.fields[name] for name in ('device_id', 'accel_device_id')
+              if name in chosen.fields]
+    stated += [message.fields['accel_device_id'] for message in found
+               if message.name == 'sensor_selection' and 'accel_device_id' in message.fields]
+    return int(stated[0][-1]) if stated and np.ptp(stated[0]) == 0 else 0
 
 
 def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:

@@ -211,15 +211,18 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
     """Return a text log whose columns and units are known."""
     blocks = _timed(converted(path, cells, quantities), quantities.rate_hz)
     head = next(blocks)
-    units, sensor = quantities.units, str(text.layout.about.get('sensor', ''))
+    units, about = quantities.units, text.layout.about
+    sensor, autopilot = str(about.get('sensor', '')), about.get('autopilot')
     check_units(Poses(*head), units, str(path))
     poses = None
     samples: Iterator[Recording]
     if are_samples(head[0]):
-        samples = (Recording(*block, units.name, sensor) for block in chain((head,), blocks))
+        samples = (Recording(*block, units.name, sensor, autopilot)
+                   for block in chain((head,), blocks))
         count = _estimated(text, head)
     else:
-        poses = Poses(*whole(joined([head, *blocks]), quantities.notes), units.name, sensor)
+        poses = Poses(*whole(joined([head, *blocks]), quantities.notes), units.name, sensor,
+                      autopilot)
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
@@ -278,7 +281,7 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     if 'time' not in poses:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
-    yield Recording(poses.columns, poses.row, poses.units, poses.sensor)
+    yield Recording(poses.columns, poses.row, poses.units, poses.sensor, poses.autopilot)
 
 
 # ----------------------------------------------------------------------------- serial ports

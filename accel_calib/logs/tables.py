@@ -5,8 +5,9 @@
 Tables with our own names: ``#`` comments, one header line, columns by name.
 
 The column names are those of `accel_calib.table.COLUMNS`; other columns of numbers are quantities.
-Two kinds of comments are read, with values in JSON: ``# units: "m/s2"`` and
-``# sensor: "imu_link"``. Tables are written as CSV, and read in any dialect (`accel_calib.logs`).
+Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
+``# sensor: "imu_link"`` and ``# autopilot: {…}``. Tables are written as CSV, and read in any
+dialect (`accel_calib.logs`).
 
 """
 
@@ -22,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import check_once, Source, with_indices
-from .dialect import ABOUT
 from .names import OURS, READING
 from .quantities import Quantities
 from .read import converted, joined, whole
@@ -98,9 +98,8 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
 
 
 def _write_head(file: TextIO, table: Table) -> None:
-    for name in ABOUT:
-        if getattr(table, name):
-            file.write(f'# {name}: {json.dumps(getattr(table, name), ensure_ascii=False)}\n')
+    for name, value in table.about.items():
+        file.write(f'# {name}: {json.dumps(value, ensure_ascii=False)}\n')
 
 
 def _as_text(values: NDArray[Any]) -> list[list[str]]:

@@ -140,7 +140,7 @@ def with_stored(poses: Poses, calibration: Calibration) -> Poses:
     stored = calibration.used_poses
     columns = {key: np.concatenate([poses[key], stored[key]]) for key in poses.columns
                if key in stored}
-    return Poses(columns, _rows(poses, stored))
+    return replace(poses, columns=columns, row=_rows(poses, stored))
 
 
 def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:

@@ -62,7 +62,16 @@ from ..errors import (
 )
 from ..estimate import judge
 from ..finding import Finding, KINDS, LEVELS, without
-from ..table import check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses
+from ..table import (
+    Autopilot,
+    check_values,
+    column_of,
+    COLUMNS,
+    Floats,
+    is_quantity,
+    LARGEST,
+    Poses,
+)
 from ..units import UNIT_NAMES, Units
 
 _FORMAT = 'accel_calib calibration'
@@ -104,7 +113,7 @@ _MOST_LETTERS = MOST_BYTES
 """Most characters of all labels, of which each takes as much memory as the longest one."""
 
 _MAPPINGS = ('units', 'quality', 'gyro_bias', 'noise', 'correction', 'poses')
-_NOT_ALWAYS = ('mounting', 'gyro_bias', 'noise', 'checksum')
+_NOT_ALWAYS = ('autopilot', 'mounting', 'gyro_bias', 'noise', 'checksum')
 """Keys of mappings with known keys, and keys that not every file has."""
 
 
@@ -146,6 +155,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'format': _FORMAT, 'version': _VERSION, 'package_version': __version__,
         'equation': _EQUATION, 'sensor': calibration.sensor, 'stream': calibration.stream,
         'date': calibration.date,
+        **({} if poses.autopilot is None else {'autopilot': asdict(poses.autopilot)}),
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
         'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values),
@@ -350,7 +360,7 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         frame=choice_at(content, 'frame', FRAMES), date=name_at(content, 'date', _LONGEST_NAME),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(value_at(content, 'quality', dict)),
-        poses=_poses(value_at(content, 'poses', dict)), rejected=rejected,
+        poses=_poses(value_at(content, 'poses', dict), _autopilot(content)), rejected=rejected,
         reason=value_at(content, 'reason', str),
         noted=tuple(map(_finding, values_at(content, 'findings', dict))),
         gyro=_gyro_bias(content), noise=_sample_noise(content))
@@ -424,7 +434,7 @@ def _sample_noise(content: Mapping[str, Any]) -> SampleNoise | None:
     return SampleNoise(*(array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
-def _poses(stated: Mapping[str, Any]) -> Poses:
+def _poses(stated: Mapping[str, Any], autopilot: Autopilot | None) -> Poses:
     rows = np.array(values_at(stated, 'row', int), np.int64)
     columns: dict[str, Any] = {}
     for key, column in COLUMNS.items():
@@ -437,7 +447,14 @@ def _poses(stated: Mapping[str, Any]) -> Poses:
             raise ValueError(f'the key {shown(key)} of quantities is not that of a quantity')
         columns[key] = array_at(stated['quantities'], key, (len(rows),))
     check_values(columns, 'poses')
-    return Poses(columns, rows)
+    return Poses(columns, rows, autopilot=autopilot)
+
+
+def _autopilot(content: Mapping[str, Any]) -> Autopilot | None:
+    """Return the place in an autopilot; None for readings that are not from a flight log."""
+    if content.get('autopilot') is None:
+        return None
+    return Autopilot(**value_at(content, 'autopilot', dict))
 
 
 def _labels(stated: Mapping[str, Any]) -> NDArray[Any]:

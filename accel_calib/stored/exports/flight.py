@@ -13,8 +13,10 @@ Betaflight  (raw - acc_calibration) / acc_1G, by axis                      count
 =========== ============================================================== ====================
 
 T is limited to the range of the polynomial. The values are the least-squares fit over the sphere
-and the range of the temperature. They are applied before the rotation of the board, in the axes
-of the logged readings. ROS drivers turn these readings to x forward, y left, z up;
+and the range of the temperature. They are applied before the rotation of the board. Readings of a
+flight log have the axes of the sensor (`accel_calib.logs.autopilot`), so that the values replace
+those of the vehicle; the log also states the place of the sensor in the parameters. ROS drivers
+turn readings to x forward, y left, z up;
 ``axes='flu'`` turns them back by 180° about x, which changes the sign of the offsets of y and z.
 
 Sources: [1]_ PX4, [2]_ its temperature compensation, [3]_ ArduPilot, [4]_ its temperature
@@ -32,7 +34,7 @@ calibration, [5]_ Betaflight, [6]_ the parameter file of QGroundControl.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -50,7 +52,8 @@ from .made import (
 )
 from ...calibrate import Calibration
 from ...errors import InputError
-from ...table import Floats
+from ...logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
+from ...table import Autopilot, Firmware, Floats
 from ...units import STANDARD_GRAVITY
 
 _PX4_URL = ('https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/'
@@ -63,8 +66,6 @@ _BETAFLIGHT_URL = ('https://github.com/betaflight/betaflight/blob/master/src/mai
 _INT32, _REAL32 = 6, 9
 """MAV_PARAM_TYPE of MAVLink."""
 
-_ARDUPILOT_REFERENCE = 35.0
-_PER_MILLION = 1e6
 _COUNTS_PER_G = 2048.0
 """Counts per g of Betaflight's drivers at the range of 16 g."""
 
@@ -78,46 +79,11 @@ _AXES = {'flu': 'the calibration is in x forward, y left, z up; these values are
          'same': 'axes: those of the readings of the calibration, which are taken to be those '
                  'of the firmware'}
 
-_DEGREE = 3
-"""Degree of the polynomials of the offset in the temperature."""
-
 _EXACT_G = 1e-7
 """A polynomial of a smaller degree is used if it is exact to this [g]."""
 
 Parameters = dict[str, float]
 """Parameters of a firmware by name; whole numbers are of type int."""
-
-
-@dataclass(frozen=True)
-class ByAxis:
-    """
-    A correction by axis: (raw - offset - Σ thermal[k] (T - reference)^(k+1)) scale.
-
-    `offset` (3,) is in m/s², `thermal` (3, 3) in m/s²/°C^(k+1), and `scale` (3,) has no unit. T is
-    limited to `limits` [°C]; without temperature `thermal` is zero.
-
-    """
-
-    offset: Floats
-    scale: Floats
-    thermal: Floats
-    reference: float
-    limits: tuple[float, float]
-
-    def correct(self, reading: Floats, temperature: Floats) -> Floats:
-        """Return the (n, 3) corrected readings [m/s²]."""
-        return (reading - self.moved(temperature) - self.offset) * self.scale
-
-    def moved(self, temperature: Floats | float) -> Floats:
-        """Return the change of the offset at temperatures (n,), (n, 3) [m/s²]."""
-        change = np.clip(temperature, *self.limits) - self.reference
-        return sum((np.multiply.outer(change ** (k + 1), part)
-                    for k, part in enumerate(self.thermal)), np.zeros(3))
-
-    @property
-    def of_temperature(self) -> bool:
-        """Whether the correction depends on the temperature."""
-        return bool(np.any(self.thermal))
 
 
 def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> ByAxis:
@@ -138,7 +104,7 @@ def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> By
         found = np.linalg.lstsq(np.column_stack([grid.reading[:, axis], columns]),
                                 grid.force[:, axis] * calibration.units.per_g, rcond=None)[0]
         scale[axis], offset[:, axis] = found[0], -found[1:] / found[0]
-    shifted = np.zeros((_DEGREE + 1, 3))
+    shifted = np.zeros((DEGREE + 1, 3))
     inner = Polynomial([(reference - middle) / half, 1.0 / half] if degree else [0.0])
     for axis in range(3):  # from a polynomial in s to one in T - reference
         parts = Polynomial(offset[:, axis])(inner).coef
@@ -152,27 +118,30 @@ def _degree(calibration: Calibration) -> int:
     if high <= low:
         return 0
     vec_v = np.broadcast_to(steady_at(calibration, np.linspace(low, high, 9)).vec_v, (9, 3))
-    return len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, _DEGREE)) - 1
+    return len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
 
 
 def _make_px4(calibration: Calibration, options: Options) -> Made:
     """Return a parameter file of QGroundControl for PX4."""
+    place, options = _place(calibration, options, 'px4')
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
     metric = _in_metric(calibration, 'PX4')
     found = _turned(_fit_by_axis(metric), options)
-    prefix, thermal = f'CAL_ACC{instance}_', f'TC_A{instance}_'
+    prefix = f'CAL_ACC{instance}_'
+    thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
     rows = {**_device(options, prefix), **_three(prefix, 'OFF', found.offset),
             **_three(prefix, 'SCALE', found.scale)}
-    if found.of_temperature:
+    if found.of_temperature or place.thermal is not None:
         rows |= {'TC_A_ENABLE': 1, **_device(options, thermal), f'{thermal}TREF': found.reference,
                  f'{thermal}TMIN': found.limits[0], f'{thermal}TMAX': found.limits[1]}
         for order, part in enumerate([np.zeros(3), *found.thermal]):
             rows |= {f'{thermal}X{order}_{axis}': value for axis, value in enumerate(part)}
     ids = f'{prefix}ID' + (f' and {thermal}ID' if found.of_temperature else '')
-    notes = () if options.device_id is not None else (
-        f'PX4 uses these values for the accelerometer whose device id is in {ids}; check it in '
-        'QGroundControl, or use --device-id (device_id of sensor_accel)',)
-    comment = [_AXES[options.axes], f'source: {_PX4_URL}',
+    notes = _notes(place)
+    if options.device_id is None:
+        notes += (f'PX4 uses these values for the accelerometer whose device id is in {ids}; '
+                  'check it in QGroundControl, or use --device-id (device_id of sensor_accel)',)
+    comment = [*_notes(place), _AXES[options.axes], f'source: {_PX4_URL}',
                'equation: (raw - thermal(T - TREF) - OFF) * SCALE, by axis, in m/s^2, before the '
                'rotation of the board', 'Vehicle-Id Component-Id Name Value Type']
     lines = [f'1\t1\t{name}\t{_number(value)}\t'
@@ -183,26 +152,48 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
 
 def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
     """Return a parameter file of Mission Planner and MAVProxy for ArduPilot."""
+    place, options = _place(calibration, options, 'ardupilot')
     instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
     metric = _in_metric(calibration, 'ArduPilot')
-    found = _turned(_fit_by_axis(metric, _ARDUPILOT_REFERENCE), options)
+    found = _turned(_fit_by_axis(metric, ARDUPILOT_REFERENCE), options)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
-    offset = found.offset + found.moved(_ARDUPILOT_REFERENCE)
+    offset = found.offset + found.moved(ARDUPILOT_REFERENCE)
     rows = {**_device(options, f'{prefix}_'), **_three(f'{prefix}OFFS_', '', offset),
             **_three(f'{prefix}SCAL_', '', found.scale)}
+    thermal = f'INS_TCAL{instance}_'
     if found.of_temperature:
-        thermal = f'INS_TCAL{instance}_'
-        reference = float(np.clip(_ARDUPILOT_REFERENCE, *found.limits))
+        reference = float(np.clip(ARDUPILOT_REFERENCE, *found.limits))
         rows |= {f'INS_ACC{instance}_CALTEMP': reference, f'{thermal}ENABLE': 1,
                  f'{thermal}TMIN': found.limits[0], f'{thermal}TMAX': found.limits[1]}
+    if found.of_temperature or place.thermal is not None:  # zeros replace those of the vehicle
         for order, part in enumerate(found.thermal, 1):
-            rows |= _three(f'{thermal}ACC{order}_', '', part * _PER_MILLION)
-    comment = [_AXES[options.axes], f'source: {_ARDUPILOT_URL}',
+            rows |= _three(f'{thermal}ACC{order}_', '', part * PER_MILLION)
+    comment = [*_notes(place), _AXES[options.axes], f'source: {_ARDUPILOT_URL}',
                'equation: (raw - p(T - 35) + p(CALTEMP - 35) - OFFS) * SCAL, by axis, in m/s^2, '
                'before the rotation of the board; p has the coefficients INS_TCAL / 1e6']
     lines = [f'{name},{_number(value)}' for name, value in rows.items()]
-    return _made(commented(calibration, comment, lines), found, metric, calibration, options, ())
+    return _made(commented(calibration, comment, lines), found, metric, calibration, options,
+                 _notes(place))
+
+
+def _place(calibration: Calibration, options: Options, firmware: Firmware
+           ) -> tuple[Autopilot, Options]:
+    """Return the place that the log states, and the options with what they leave open from it."""
+    stated = calibration.poses.autopilot
+    if stated is None or stated.firmware != firmware:
+        return Autopilot(firmware), options
+    if options.instance not in (None, stated.instance):
+        return Autopilot(firmware, corrected=stated.corrected), options
+    return stated, replace(
+        options, instance=stated.instance,
+        device_id=stated.device_id if options.device_id is None else options.device_id)
+
+
+def _notes(place: Autopilot) -> tuple[str, ...]:
+    """Return a note on readings that the old parameters still correct."""
+    return (f'do not load this file: the readings were corrected already, and by what is not '
+            f'known ({place.corrected})',) if place.corrected else ()
 
 
 def _made(text: str, found: ByAxis, metric: Calibration, calibration: Calibration,

@@ -11,7 +11,7 @@ compare a fit with them. `README.md` has the source of each layout.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import struct
 from typing import Any
@@ -130,8 +130,14 @@ def imu_fields(samples: Recording, device: int) -> Fields:
             'gyro_calibration_count': ('uint8_t', [1] * n)}
 
 
-def ulog_bytes(messages: Sequence[tuple[str, int, Fields]]) -> bytes:
-    """Return a ULog with these messages (name, number of the sensor, fields), in order of time."""
+def ulog_bytes(messages: Sequence[tuple[str, int, Fields]],
+               parameters: Mapping[str, float] = {}) -> bytes:
+    """
+    Return a ULog with these messages (name, number of the sensor, fields), in order of time.
+
+    Whole numbers are parameters of type int32.
+
+    """
     def block(kind: bytes, data: bytes) -> bytes:
         return struct.pack('<Hc', len(data), kind) + data
 
@@ -149,6 +155,10 @@ def ulog_bytes(messages: Sequence[tuple[str, int, Fields]]) -> bytes:
     out += b''.join(block(b'F', f'{name}:{text}'.encode()) for name, text in formats.items())
     key, value = b'char[3] sys_name', b'PX4'
     out += block(b'I', bytes([len(key)]) + key + value)
+    for name, number in parameters.items():
+        kind, letter = ('int32_t', 'i') if isinstance(number, int) else ('float', 'f')
+        key = f'{kind} {name}'.encode()
+        out += block(b'P', bytes([len(key)]) + key + struct.pack(f'<{letter}', number))
     rows: list[tuple[int, bytes]] = []
     for number, (name, instance, fields) in enumerate(messages):
         out += block(b'A', struct.pack('<BH', instance, number) + name.encode())

@@ -1,0 +1,332 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What PX4 and ArduPilot do to the readings of an accelerometer, by their parameters.
+
+Both correct in the axes of the sensor, and then rotate to those of the vehicle ([1]_, [2]_):
+
+    logged = R ((raw - thermal(T) - offset) scale),   by axis, in m/s²
+
+=========  ======================================================  ================================
+           PX4                                                     ArduPilot
+=========  ======================================================  ================================
+R          level adjustment (SENS_BOARD_X_OFF, …) times the board  AHRS_ORIENTATION, when booted
+           (SENS_BOARD_ROT), or CAL_ACCn_ROT of an external one
+offset     CAL_ACCn_XOFF, …                                        INS_ACCOFFS_X, …
+scale      CAL_ACCn_XSCALE, …                                      INS_ACCSCAL_X, …
+thermal    TC_An_X0_0, … about TC_An_TREF, if TC_A_ENABLE is 1     INS_TCALn_ACC1_X, … in 10⁻⁶
+                                                                   about 35 °C, less its value at
+                                                                   INS_ACCn_CALTEMP
+=========  ======================================================  ================================
+
+T is limited to the range of the polynomial. Rotations are numbered as in MAVLink [3]_, and
+ArduPilot has three more; a rotation is roll, then pitch, then yaw about fixed axes. `raw_columns`
+undoes all of this, so that readings, and the parameters made from them, are those of the sensor.
+
+.. [1] https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp
+.. [2] https://github.com/ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/
+   AP_InertialSensor_Backend.cpp
+.. [3] https://mavlink.io/en/messages/common.html#MAV_SENSOR_ORIENTATION
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import rotation_from_rpy
+from ..table import COLUMNS, Floats
+
+ARDUPILOT_REFERENCE = 35.0
+"""Temperature about which the polynomial of ArduPilot is [°C]."""
+
+PER_MILLION = 1e6
+"""Factor of the stored coefficients of ArduPilot."""
+
+DEGREE = 3
+"""Degree of the polynomials of the offset in the temperature."""
+
+_ROTATIONS = (
+    *((0, 0, yaw) for yaw in range(0, 360, 45)), (180, 0, 0), (180, 0, 45), (180, 0, 90),
+    (180, 0, 135), (0, 180, 0), (180, 0, 225), (180, 0, 270), (180, 0, 315), (90, 0, 0),
+    (90, 0, 45), (90, 0, 90), (90, 0, 135), (270, 0, 0), (270, 0, 45), (270, 0, 90),
+    (270, 0, 135), (0, 90, 0), (0, 270, 0), (0, 180, 90), (0, 180, 270), (90, 90, 0),
+    (180, 90, 0), (270, 90, 0), (90, 180, 0), (270, 180, 0), (90, 270, 0), (180, 270, 0),
+    (270, 270, 0), (90, 180, 90), (90, 0, 270), (90, 68, 293), (0, 315, 0), (90, 315, 0))
+"""Roll, pitch and yaw [deg] of the rotations by number, as PX4 has them."""
+
+_OF_ARDUPILOT = {38: (90, 68.8, 293.3), 41: (0, 7, 0), 42: (45, 0, 0), 43: (315, 0, 0)}
+"""Roll, pitch and yaw [deg] where ArduPilot has others."""
+
+_CUSTOM = {100: ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW'),
+           101: ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW'),
+           102: ('CUST_ROT2_ROLL', 'CUST_ROT2_PITCH', 'CUST_ROT2_YAW')}
+"""Parameters of the custom rotations of ArduPilot [deg]; 100 is that of releases before 4.2."""
+
+_BEFORE_MAVLINK, _FIRST_OTHER = (1, 11), 26
+"""PX4 before this release numbers the rotations from this one on in another way."""
+
+_MATTER = re.compile(r'INS\d?_(ACC|TCAL)|AHRS_(ORIENTATION|CUSTOM)|CUST_ROT|CAL_ACC|SENS_BOARD|'
+                     r'TC_A')
+_AT_BOOT = re.compile(r'AHRS_|CUST_ROT')
+"""Parameters that take effect when the vehicle is booted again."""
+
+_TURNS = re.compile('ROT|ORIENTATION|BOARD')
+_SLOTS = range(4)
+_ARDUPILOT_INSTANCES = (1, 2, 3)
+_NAMED = 3
+
+Values = Mapping[str, float]
+"""Parameters by name."""
+
+
+@dataclass(frozen=True)
+class ByAxis:
+    """
+    A correction: R ((raw - offset - Σ thermal[k] (T - reference)^(k+1)) scale), by axis.
+
+    `offset` (3,) is in m/s², `thermal` (3, 3) in m/s²/°C^(k+1), and `scale` (3,) has no unit. T is
+    limited to `limits` [°C]; without temperature `thermal` is zero. R is `rotation` (3, 3).
+
+    """
+
+    offset: Floats
+    scale: Floats
+    thermal: Floats
+    reference: float
+    limits: tuple[float, float]
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+
+    def correct(self, reading: Floats, temperature: Floats) -> Floats:
+        """Return the (n, 3) corrected readings [m/s²]."""
+        return (reading - self.moved(temperature) - self.offset) * self.scale @ self.rotation.T
+
+    def raw(self, corrected: Floats, temperature: Floats) -> Floats:
+        """Return the (n, 3) readings of the sensor [m/s²]; the inverse of `correct`."""
+        return corrected @ self.rotation / self.scale + self.offset + self.moved(temperature)
+
+    def moved(self, temperature: Floats | float) -> Floats:
+        """Return the change of the offset at temperatures (n,), (n, 3) [m/s²]."""
+        change = np.clip(temperature, *self.limits) - self.reference
+        return sum((np.multiply.outer(change ** (k + 1), part)
+                    for k, part in enumerate(self.thermal)), np.zeros(3))
+
+    @property
+    def of_temperature(self) -> bool:
+        """Whether the correction depends on the temperature."""
+        return bool(np.any(self.thermal))
+
+
+class Stated(NamedTuple):
+    """A value of a parameter, from a time [s] on."""
+
+    time: float
+    name: str
+    value: float
+
+
+class Parameters:
+    """The parameters of a vehicle that matter here, in order of time; `lookup` finds a value."""
+
+    def __init__(self, stated: Sequence[Stated]) -> None:
+        self._stated = [each for each in stated if _MATTER.match(each.name)]
+        self.used: dict[str, float] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._stated)
+
+    def spans(self) -> Iterator[tuple[float, Values]]:
+        """Yield from when on which values hold; the first value of each holds from the start."""
+        values: dict[str, float] = {}
+        for each in self._stated:
+            values.setdefault(each.name, each.value)
+        yield -np.inf, dict(values)
+        for each in self._stated:
+            if values[each.name] != each.value and not _AT_BOOT.match(each.name):
+                values[each.name] = each.value
+                yield each.time, dict(values)
+
+    def lookup(self, values: Values, name: str, usual: float) -> float:
+        """Return a value, or the usual one; others than the usual one are named in a note."""
+        value = float(values.get(name, usual))
+        if not np.isfinite(value):
+            raise _unknown(f'{name} is not a number')
+        if value != usual:
+            self.used[name] = value
+        return value
+
+    def three(self, values: Values, pattern: str, usual: float) -> Floats:
+        """Return the values of the axes, (3,); ``{}`` in the pattern is the axis."""
+        return np.array([self.lookup(values, pattern.format(axis), usual) for axis in 'XYZ'])
+
+    @property
+    def turned(self) -> bool:
+        """Whether a rotation was used."""
+        return any(_TURNS.search(name) for name in self.used)
+
+    @property
+    def words(self) -> str:
+        """Return the values that are not the usual ones, in words."""
+        shown = ', '.join(f'{name} {value:.4g}' for name, value in sorted(
+            self.used.items(), key=lambda each: 'ACC' in each[0])[:_NAMED])
+        more = len(self.used) - _NAMED
+        return f'{shown} and {more} more' if more > 0 else shown
+
+
+Correction = Callable[[Values], ByAxis]
+"""Function that returns the correction of some values; InputError if it is not known."""
+
+
+def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
+                ) -> dict[str, Floats]:
+    """
+    Return columns (names of a recording) with the readings of the sensor, in its own axes.
+
+    Angular rates are turned back, and not corrected. Raise InputError if the correction is not
+    known.
+
+    """
+    if not parameters:
+        raise _unknown('its parameters are not in the log')
+    time, found = columns['time'], dict(columns)
+    triples = [COLUMNS[key].names for key in ('reading', 'rate') if COLUMNS[key].names[0] in found]
+    reading, *rates = (np.column_stack([found[name] for name in names]) for names in triples)
+    temperature = found.get('temperature', np.zeros(len(time)))
+    spans = list(parameters.spans())
+    for (start, values), (stop, _) in zip(spans, [*spans[1:], (np.inf, {})]):
+        which = (time >= start) & (time < stop)
+        if not np.any(which):
+            continue
+        old = correction(values)
+        if old.of_temperature and 'temperature' not in found:
+            raise _unknown('it depends on the temperature, which the log lacks')
+        reading[which] = old.raw(reading[which], temperature[which])
+        for rate in rates:
+            rate[which] = rate[which] @ old.rotation
+    for names, vectors in zip(triples, (reading, *rates)):
+        found.update(zip(names, vectors.T))
+    return found
+
+
+def px4_slot(parameters: Parameters, device: int) -> int | None:
+    """Return n of CAL_ACCn of a device; None if PX4 has no calibration of it."""
+    for _, values in parameters.spans():
+        for slot in _SLOTS:
+            if device and values.get(f'CAL_ACC{slot}_ID') == device:
+                return slot
+    return None
+
+
+def px4_thermal_slot(parameters: Parameters, device: int) -> int | None:
+    """Return n of TC_An of a device; None if PX4 has no thermal calibration of it in use."""
+    for _, values in parameters.spans():
+        for slot in _SLOTS if values.get('TC_A_ENABLE') == 1 else ():
+            if device and values.get(f'TC_A{slot}_ID') == device:
+                return slot
+    return None
+
+
+def px4_correction(parameters: Parameters, device: int, release: tuple[int, int] | None
+                   ) -> Correction:
+    """Return the correction of PX4 for the accelerometer with this id, of a known release."""
+    if not device:
+        raise _unknown('the log does not state the device id of the accelerometer')
+    slot = px4_slot(parameters, device)
+
+    def correction(values: Values) -> ByAxis:
+        start = 'uncalibrated ' if slot is None else f'CAL_ACC{slot}_'
+        offset = parameters.three(values, f'{start}{{}}OFF', 0.0)
+        scale = _scale(parameters.three(values, f'{start}{{}}SCALE', 1.0))
+        number = parameters.lookup(values, f'{start}ROT', -1.0)
+        if number < 0.0:  # internal: it follows the board
+            number = parameters.lookup(values, 'SENS_BOARD_ROT', 0.0)
+        if number >= _FIRST_OTHER and release is not None and release < _BEFORE_MAVLINK:
+            raise _unknown(f'PX4 {release[0]}.{release[1]} numbers rotation {number:.0f} in '
+                           'another way')
+        level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
+        rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number)
+        constant, thermal, reference, limits = _px4_thermal(parameters, values, device)
+        return ByAxis(offset + constant, scale, thermal, reference, limits, rotation)
+
+    return correction
+
+
+def _px4_thermal(parameters: Parameters, values: Values, device: int
+                 ) -> tuple[Floats, Floats, float, tuple[float, float]]:
+    slots = [slot for slot in _SLOTS if values.get(f'TC_A{slot}_ID') == device]
+    if not slots or values.get('TC_A_ENABLE') != 1:
+        return np.zeros(3), np.zeros((DEGREE, 3)), 0.0, (0.0, 0.0)
+    start = f'TC_A{slots[0]}_'
+    constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
+                                    for axis in range(3)]) for order in range(DEGREE + 1))
+    return (constant, np.array(thermal), float(values.get(f'{start}TREF', 25.0)),
+            (float(values.get(f'{start}TMIN', 0.0)), float(values.get(f'{start}TMAX', 100.0))))
+
+
+def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
+    """Return the correction of ArduPilot for an accelerometer, numbered from 1."""
+    if instance not in _ARDUPILOT_INSTANCES:
+        raise _unknown(f'parameters of accelerometer {instance} are not read')
+    start = f'INS_ACC{"" if instance == 1 else instance}'
+    thermal_start = f'INS_TCAL{instance}_'
+
+    def correction(values: Values) -> ByAxis:
+        offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)
+        scale = _scale(parameters.three(values, f'{start}SCAL_{{}}', 1.0))
+        thermal, limits = np.zeros((DEGREE, 3)), (0.0, 0.0)
+        if values.get(f'{thermal_start}ENABLE') == 1:
+            thermal = np.array([parameters.three(values, f'{thermal_start}ACC{order}_{{}}', 0.0)
+                                for order in range(1, DEGREE + 1)]) / PER_MILLION
+            limits = (float(values.get(f'{thermal_start}TMIN', 0.0)),
+                      float(values.get(f'{thermal_start}TMAX', 70.0)))
+        found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits,
+                       _ardupilot_rotation(parameters, values))
+        # The firmware adds the polynomial at CALTEMP, so that it is zero there.
+        at_offset = float(values.get(f'INS_ACC{instance}_CALTEMP', -300.0))
+        return ByAxis(offset - found.moved(at_offset), scale, thermal, ARDUPILOT_REFERENCE,
+                      limits, found.rotation)
+
+    return correction
+
+
+def _ardupilot_rotation(parameters: Parameters, values: Values) -> Floats:
+    number = parameters.lookup(values, 'AHRS_ORIENTATION', 0.0)
+    names = _CUSTOM.get(int(number))
+    if names is None:
+        return _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT)
+    lacking = [name for name in names if name not in values]
+    if lacking:
+        raise _unknown(f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
+    return _rotation([parameters.lookup(values, name, 0.0) for name in names])
+
+
+def _numbered(name: str, number: float, others: Mapping[int, Sequence[float]] = {}) -> Floats:
+    """Return the rotation with a number; raise InputError if there is none."""
+    found = others.get(int(number))
+    if found is None and 0.0 <= number < len(_ROTATIONS):
+        found = _ROTATIONS[int(number)]
+    if found is None:
+        raise _unknown(f'{name} is {number:.0f}, a rotation that is not known')
+    return _rotation(found)
+
+
+def _rotation(degrees: Sequence[float] | Floats) -> Floats:
+    roll, pitch, yaw = np.radians(degrees)
+    return rotation_from_rpy(roll, pitch, yaw)
+
+
+def _scale(scale: Floats) -> Floats:
+    if np.any(scale <= 0.0):
+        raise _unknown(f'a scale is {np.min(scale):g}')
+    return scale
+
+
+def _unknown(why: str) -> InputError:
+    return InputError(why, 'record a log with all parameters')
