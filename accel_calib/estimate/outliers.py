@@ -276,15 +276,15 @@ def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
     poses, sizes = [], []
     rss = [float(residual @ residual)]
     for k in range(0, most * rows, rows):
-        size = _squared(own, residual.reshape(count, rows)) * left
-        at = int(np.argmax(size / data.rows))
+        size = _squared(own, residual.reshape(count, rows))
+        at = int(np.argmax(np.where(left, size / data.rows, -1.0)))
         poses.append(at)
         sizes.append(float(size[at]))
         rss.append(max(rss[-1] - sizes[-1], 0.0))
         part, now = slice(rows * at, rows * at + rows), slice(k, k + rows)
         column = -onto @ flat[part].T - removed[:, :k] @ solved[part, :k].T
         column[part] += np.eye(rows)
-        inverse = 1.0 / own[at] if rows == 1 else np.linalg.pinv(own[at])
+        inverse = 1.0 / own[at] if rows == 1 and own[at] > 0.0 else np.linalg.pinv(own[at])
         removed[:, now], solved[:, now] = column, column @ inverse
         residual = residual - solved[:, now] @ residual[part]
         own -= (solved[:, now].reshape(count, rows, rows)
