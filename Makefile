@@ -45,6 +45,7 @@ test: $(VENV)/extra-test $(VENV)/package $(VENV)/tf2_msgs
 
 lint: $(VENV)/extra-dev
 	@$(BIN)/ruff check --quiet $(PYTHON_SOURCES)
+	@$(BIN)/isort --quiet --check-only $(PYTHON_SOURCES)
 	@$(BIN)/flake8 $(PYTHON_SOURCES)
 	@$(BIN)/pydocstyle --property-decorators= $(PYTHON_SOURCES)
 	@$(BIN)/mypy

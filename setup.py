@@ -84,12 +84,14 @@ setup(
         # What changes operators, and which tests execute a line: make mutants.
         'mutants': ['cosmic-ray>=8.4.1,<9', 'pytest-cov>=5,<8'],
         'dev': [
+            'aiohttp>=3.9.1,<4',
             'build',
             'flake8',
             'flake8-builtins',
             'flake8-comprehensions',
             'flake8-import-order',
             'flake8-quotes',
+            'isort>=8,<10',
             'matplotlib>=3.6,<3.12',
             'mypy~=2.4',
             'pydocstyle',

@@ -60,21 +60,11 @@ from types import ModuleType
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .api import calibrate as calibrate
-    from .api import Calibration as Calibration
-    from .api import capture as capture
-    from .api import compare as compare
-    from .api import Effect as Effect
-    from .api import fit as fit
-    from .api import load as load
-    from .api import Poses as Poses
-    from .api import read_poses as read_poses
-    from .api import read_recording as read_recording
-    from .api import Recording as Recording
-    from .api import refine as refine
-    from .api import Refinement as Refinement
-    from .api import simulate as simulate
-    from .api import verify as verify
+    from .api import (
+        calibrate as calibrate, Calibration as Calibration, capture as capture, compare as compare,
+        Effect as Effect, fit as fit, load as load, Poses as Poses, read_poses as read_poses,
+        read_recording as read_recording, Recording as Recording, refine as refine,
+        Refinement as Refinement, simulate as simulate, verify as verify)
 
     __version__: str
 

@@ -16,35 +16,24 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .calibrate import Calibration as _Calibration
-from .calibrate import FrameName, Method, mounting_of, Verification
-from .calibrate import verify as verify_calibration
-from .compare import compare as compare_calibrations
-from .compare import Comparison
-from .effects import know, model_with, simulate_poses, simulate_recording
-from .effects import OwnEffect as Effect
+from .calibrate import (
+    Calibration as _Calibration, FrameName, Method, mounting_of, Verification,
+    verify as verify_calibration)
+from .compare import compare as compare_calibrations, Comparison
+from .effects import know, model_with, OwnEffect as Effect, simulate_poses, simulate_recording
 from .errors import InputError
 from .finding import Finding
 from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .intake import poses_of, samples_again, still_poses
-from .logs import are_untimed_samples, Frame, LogOptions, open_log, read_log
-from .logs import read_recording as read_whole_recording
+from .logs import (
+    are_untimed_samples, Frame, LogOptions, open_log, read_log,
+    read_recording as read_whole_recording)
 from .pipeline import calibrated, Flat, Plan
-from .refine import refine as find_effects
-from .refine import Refinement
+from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
-    check_units,
-    check_values,
-    data_frame,
-    Floats,
-    LARGEST,
-    numbered,
-    Poses,
-    Recording,
-    Table,
-)
+    check_units, check_values, data_frame, Floats, LARGEST, numbered, Poses, Recording, Table)
 from .text import counted, now
 from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
 

@@ -10,14 +10,7 @@ from functools import cached_property
 from typing import Literal, TYPE_CHECKING
 
 from .calibrate import (
-    Calibration,
-    fit_poses,
-    fit_with_fleet,
-    FleetPrior,
-    FrameName,
-    level_by_rows,
-    Method,
-)
+    Calibration, fit_poses, fit_with_fleet, FleetPrior, FrameName, level_by_rows, Method)
 from .effects import PROCESSES
 from .errors import RefusedFitError
 from .findings import rate, Rating

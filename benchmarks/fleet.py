@@ -41,11 +41,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 import accel_calib as ac  # noqa: E402
-from accel_calib import fleet, pipeline  # noqa: E402
-from accel_calib.fleet import Input, Options, Store, Summary  # noqa: E402
+from accel_calib.fleet import (  # noqa: E402
+    cluster, Input, Options, recordings, run, Store, Summary)
 from accel_calib.fleet.overview import not_agreeing  # noqa: E402
 from accel_calib.fleet.task import Row  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
+import accel_calib.pipeline as pipeline  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -267,10 +268,10 @@ def ratio_lines(found: Sequence[Input], options: Options, folder: Path) -> Itera
 
 def speed(found: Sequence[Input], options: Options, workers: int, folder: Path) -> float:
     """Return recordings per second."""
-    with TemporaryDirectory(dir=folder) as out, fleet.cluster(workers=workers) as client:
+    with TemporaryDirectory(dir=folder) as out, cluster(workers=workers) as client:
         client.wait_for_workers(workers)
         watch = Watch(client)
-        fleet.run(client, found, options, Store(Path(out)), watch)
+        run(client, found, options, Store(Path(out)), watch)
     return watch.per_s()
 
 
@@ -358,13 +359,13 @@ class Whole:
 def whole(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Whole:
     """Calibrate all recordings, or those that are left."""
     spent: dict[str, float] = Counter()
-    with fleet.cluster(workers=workers) as client:
+    with cluster(workers=workers) as client:
         client.wait_for_workers(workers)
         begin, program_s = time.perf_counter(), time.process_time()
         watch = Watch(client, folder / 'memory.jsonl')
         with timed(spent, {MERGED: (RUN, '_merge'), DIGESTED: (RUN, 'overview'),
                            **{stage: (RUN, name) for stage, name in ALONE.items()}}):
-            summary = fleet.run(client, found, options, Store(folder / 'results'), watch)
+            summary = run(client, found, options, Store(folder / 'results'), watch)
         return Whole(summary, watch.per_s(), time.perf_counter() - begin,
                      time.process_time() - program_s, memory_mb(), spent)
 
@@ -478,7 +479,7 @@ def measured(given: argparse.Namespace, folder: Path) -> str:
     machine = f'{processor()} before; Python {platform.python_version()}, numpy {np.__version__}'
     options = Options(model_from='^([AB])-', refined=not given.no_refine)
     write_inputs(folder / 'in', given)
-    found = list(fleet.recordings([str(folder / 'in')]))
+    found = list(recordings([str(folder / 'in')]))
     mixed = np.random.default_rng(given.seed).permutation(len(found)).tolist()
     some = [found[k] for k in mixed[:max(TIMED.values())]]
     ratios = list(ratio_lines(some, options, folder))

@@ -39,16 +39,7 @@ from directions import random_directions  # noqa: E402
 from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import (  # noqa: E402
-    Case,
-    draw,
-    draw_sensor,
-    error_mg,
-    knock,
-    misplaced,
-    NOISE,
-    spread,
-    without_noise,
-)
+    Case, draw, draw_sensor, error_mg, knock, misplaced, NOISE, spread, without_noise)
 from scipy.signal import lfilter  # noqa: E402
 
 G = units_of('g')

@@ -34,16 +34,16 @@ from figures import Line, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.signal import butter, lfilter  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
-import stillness_case as cases  # noqa: E402
-from stillness_case import Case, case_of, KINDS, Pose, Sensor  # noqa: E402
+from stillness_case import (  # noqa: E402
+    Case, case_of, gyro, KINDS, ours, Pose, Sensor, swinging, variance)
 
 DATA = ROOT.parent / 'shared' / 'data'
 
 RULES: dict[str, Callable[[Case], list[Pose]]] = {
-    'ours': lambda case: cases.ours(case, gyro=False),
-    'ours, gyro': lambda case: cases.ours(case, gyro=True),
-    'variance': cases.variance,
-    'gyro': cases.gyro}
+    'ours': lambda case: ours(case, gyro=False),
+    'ours, gyro': lambda case: ours(case, gyro=True),
+    'variance': variance,
+    'gyro': gyro}
 
 RECORDINGS = (('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
               ('xsens_mti_counts', 'native', 38))
@@ -252,8 +252,8 @@ def _captured(each: Disturbance, rng: np.random.Generator) -> bool:
         own = lfilter(*butter(2, frequency, fs=rate), own, axis=0)
     own = own[count:] * (FIRST_NOISE if each.kind == 'swing' else size) / own[count:].std()
     if each.kind == 'swing':
-        own += cases.swinging(rng, count, rate, size, (frequency, frequency),
-                              min(0.05 * frequency, 0.5))
+        own += swinging(rng, count, rate, size, (frequency, frequency),
+                        min(0.05 * frequency, 0.5))
     samples = np.full((count, 9), np.nan)
     samples[:, 0], samples[:, 1:4] = np.arange(count) / rate, force + own
     detector = StillDetector(CaptureSettings(), units_of('g'))

@@ -9,15 +9,7 @@ from collections.abc import Generator
 from typing import Any
 
 from accel_calib.session import (
-    CalibratorSettings,
-    checks,
-    columns_of,
-    Log,
-    Result,
-    Session,
-    state,
-    Task,
-)
+    CalibratorSettings, checks, columns_of, Log, Result, Session, state, Task)
 from inside import next_action
 import numpy as np
 from shared import answer_of

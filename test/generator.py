@@ -33,20 +33,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from generator_effects import (
-    Around,
-    basis_of,
-    EFFECTS,
-    Floats,
-    HOUR,
-    NOMINAL_SUPPLY,
-    ON_OUTPUT,
-    OUTSIDE,
-    PAIRS,
-    plain_reading,
-    STANDARD_GRAVITY,
-    Traits,
-    unit,
-)
+    Around, basis_of, EFFECTS, Floats, HOUR, NOMINAL_SUPPLY, ON_OUTPUT, OUTSIDE, PAIRS,
+    plain_reading, STANDARD_GRAVITY, Traits, unit)
 import numpy as np
 
 __all__ = ['again', 'Around', 'basis_of', 'EFFECTS', 'Floats', 'LEAST_CLIPPED', 'noise_in_norm',

@@ -17,64 +17,29 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from accel_calib.calibrate import (
-    Calibration,
-    determines,
-    mounting_figures,
-    posterior,
-    refuse_if_unfit,
-    sound_rows,
-    words_of,
-)
+    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows, words_of)
 from accel_calib.calibrate.known_orientation import axes_of, fault_of
 from accel_calib.calibrate.mounting import (
-    doubts_about_flat,
-    mounting,
-    with_heading,
-    with_heading_of,
-)
+    doubts_about_flat, mounting, with_heading, with_heading_of)
 from accel_calib.calibrate.partial import carried
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
 from accel_calib.calibrate.prior import common_sensors, typical_spread, without_knocked
 from accel_calib.capture import rounding_left
-from accel_calib.capture.trend import _long_run as long_run
-from accel_calib.capture.trend import lines_through
-from accel_calib.cli.commands import COMMANDS, parser
-from accel_calib.cli.commands import HIDDEN as DEMO_CHOICES
+from accel_calib.capture.trend import _long_run as long_run, lines_through
+from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.terminal import in_one_line
 from accel_calib.cli.watch import changes, screen, state
-from accel_calib.compare import NAMES as PARAMETER_NAMES
-from accel_calib.compare import rotation_free
+from accel_calib.compare import NAMES as PARAMETER_NAMES, rotation_free
 from accel_calib.compare.agreement import (
-    on_one_scale,
-    outlier,
-    p_values,
-    Runs,
-    Scatter,
-    scatter_of,
-)
-from accel_calib.compare.drift import change, is_over
-from accel_calib.compare.drift import MEMORY as DRIFT_MEMORY
+    on_one_scale, outlier, p_values, Runs, Scatter, scatter_of)
+from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
-    acting_temperature,
-    correct,
-    force_slope,
-    Model,
-    model_with,
-    MODELS,
-    parameter_basis,
-    parse_effect,
-    predict,
-    reading_of,
-    sensor_force,
-    simulate_poses,
-    simulate_recording,
-    ThermalStream,
-    with_linear_part,
-    with_vector,
-)
+    acting_temperature, correct, force_slope, Model, model_with, MODELS, parameter_basis,
+    parse_effect, predict, reading_of, sensor_force, simulate_poses, simulate_recording,
+    ThermalStream, with_linear_part, with_vector)
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, distinct, kinds, originals, unseen_mistakes
@@ -82,123 +47,67 @@ from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
 from accel_calib.fleet.overview import (
-    digest,
-    digest_of,
-    Months,
-    not_agreeing,
-    odd_sensors,
-    overview,
-    shared_effects,
-)
+    digest, digest_of, Months, not_agreeing, odd_sensors, overview, shared_effects)
 from accel_calib.fleet.page import write_fleet_page
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import (
-    alike,
-    drift_of,
-    estimated,
-    merge_sensor,
-    priors_of,
-    typical_of,
-)
+    alike, drift_of, estimated, merge_sensor, priors_of, typical_of)
 from accel_calib.fleet.task import schema, write_parquet
 from accel_calib.geometry import (
-    OVER_THE_SPHERE,
-    quaternion_of,
-    rotation_from_rpy,
-    spread_directions,
-    unit,
-)
+    OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit)
 from accel_calib.intake import poses_of
 from accel_calib.live import sources
-from accel_calib.live.messages import CALIBRATION_ALONE
-from accel_calib.live.messages import COMMANDS as LIVE_COMMANDS
-from accel_calib.live.messages import LARGEST as LARGEST_LIVE_MESSAGE
-from accel_calib.live.messages import log as live_log
-from accel_calib.live.messages import PERIOD as LIVE_PERIOD
+from accel_calib.live.messages import (
+    CALIBRATION_ALONE, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE, log as live_log,
+    PERIOD as LIVE_PERIOD)
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.logs import (
-    are_samples,
-    bag_samples,
-    bounded_bags,
-    layout_with,
-    open_bag,
-    text,
-)
+from accel_calib.logs import are_samples, bag_samples, bounded_bags, layout_with, open_bag, text
 from accel_calib.logs.ardupilot import read_dataflash
 from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
-from accel_calib.logs.flight import MAGIC as ULG_MAGIC
-from accel_calib.logs.flight import read_ulg
-from accel_calib.logs.formats import named as format_named
-from accel_calib.logs.formats import record_instead
+from accel_calib.logs.flight import MAGIC as ULG_MAGIC, read_ulg
+from accel_calib.logs.formats import named as format_named, record_instead
 from accel_calib.logs.names import meaning, unit_of
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
-from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS
-from accel_calib.noise.components import fit_components
-from accel_calib.noise.curve import (
-    allan_variances,
-    longest_rest,
-    octaves,
-    shares,
-    spread_of,
-)
+from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
+from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import (
-    beginning,
-    clipped,
-    fitted_state,
-    grid_step,
-    off_grid,
-    sampled,
-    unclipped,
-)
-from accel_calib.refine.curves import _grown as grown_curve
+    beginning, clipped, fitted_state, grid_step, off_grid, sampled, unclipped)
 from accel_calib.refine.curves import (
-    best_curve,
-    Curve,
-    is_curve,
-    Process,
-    process_of,
-    SIGNIFICANT,
-    Walk,
-    walk_beside,
-)
-from accel_calib.refine.linear import _RARE as RARE
-from accel_calib.refine.linear import Block, candidates, Linear, linearised, products_of, WORTH
-from accel_calib.refine.linear import LEVEL as REFINE_LEVEL
+    _grown as grown_curve, best_curve, Curve, is_curve, Process, process_of, SIGNIFICANT, Walk,
+    walk_beside)
+from accel_calib.refine.linear import (
+    _RARE as RARE, Block, candidates, LEVEL as REFINE_LEVEL, Linear, linearised, products_of,
+    WORTH)
 from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
-from accel_calib.refine.search import _is_better as is_better_than_walk
-from accel_calib.refine.search import search as search_effects
+from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
 from accel_calib.refine.sets import accepted, explored, Near, probabilities
 from accel_calib.refine.words import advice_for, attitude_words, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
-from accel_calib.report.page import calibration_page, linear_figures
-from accel_calib.report.page import page as refinement_page
+from accel_calib.report.page import calibration_page, linear_figures, page as refinement_page
 from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import sheet, snippets
 from accel_calib.ros.run import own_domain
-from accel_calib.session import store as session_store
-from accel_calib.session import worker
+from accel_calib.session import store as session_store, worker
 from accel_calib.session.guidance import Guide, next_action, Plan
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
-from accel_calib.session.sensor_files import load as load_store
-from accel_calib.session.sensor_files import Lock
+from accel_calib.session.sensor_files import load as load_store, Lock
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
 from accel_calib.session.state import figures
-from accel_calib.session.store import aside, Identity, MOST_STEPS, store_of, writing_advice
-from accel_calib.session.store import Store as SensorStore
+from accel_calib.session.store import (
+    aside, Identity, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics
 from accel_calib.session.work import fitted, is_partial, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
-from accel_calib.stored.calibration_yaml import _values_in as values_in
-from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
-from accel_calib.stored.exports import export, identifier
-from accel_calib.stored.exports import FORMATS as EXPORT_FORMATS
-from accel_calib.stored.exports import Options as ExportOptions
+from accel_calib.stored.calibration_yaml import (
+    _values_in as values_in, calibration_bytes, calibration_from)
+from accel_calib.stored.exports import (
+    export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
 
 COMMAND = ('-m', 'accel_calib.cli.main')

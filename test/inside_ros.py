@@ -8,9 +8,4 @@ from accel_calib.ros.calibrator_node import in_executor, serve
 from accel_calib.ros.display import pose_markers
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
 from accel_calib.ros.transforms import (
-    MountingBroadcaster,
-    needs_tf2,
-    StaticTransforms,
-    watch_static,
-)
-from accel_calib.ros.transforms import TOPIC as TF_TOPIC
+    MountingBroadcaster, needs_tf2, StaticTransforms, TOPIC as TF_TOPIC, watch_static)

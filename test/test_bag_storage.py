@@ -13,12 +13,7 @@ from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
 from bag_files import a_calibration, header, IMU, imu, STRING, TEMPERATURE
 from inside import (
-    BLOCK_OF_A_BAG,
-    rotation_from_rpy,
-    ROWS_OF_A_BAG,
-    simulate_recording,
-    spread_directions,
-)
+    BLOCK_OF_A_BAG, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording, spread_directions)
 from mcap_file import McapFile, STORE
 import numpy as np
 import pytest

@@ -20,8 +20,7 @@ from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from bag_files import a_calibration, copied, COUNT, execute, messages, TOPICS
-from bag_files import rosbag2 as folder_of
+from bag_files import a_calibration, copied, COUNT, execute, messages, rosbag2 as folder_of, TOPICS
 from inside import check_regular, DECOMPRESSED, decompressed, largest, main, open_bag
 from mcap_file import COMPRESS, McapFile, STORE
 import pytest

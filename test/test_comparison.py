@@ -10,15 +10,8 @@ from accel_calib.compare import compare, history_of
 from accel_calib.estimate import estimate
 from accel_calib.units import units_of
 from inside import (
-    Model,
-    model_with,
-    PARAMETER_NAMES,
-    rotation_free,
-    rotation_from_rpy,
-    Runs,
-    simulate_poses,
-    spread_directions,
-)
+    Model, model_with, PARAMETER_NAMES, rotation_free, rotation_from_rpy, Runs, simulate_poses,
+    spread_directions)
 import numpy as np
 import pytest
 from shared import random_directions, sensor

@@ -5,28 +5,12 @@
 
 
 from accel_calib.effects import (
-    CARRIERS,
-    effect_named,
-    empirical_name,
-    empirical_parts,
-    is_effect,
-    MODES,
-    VARIABLES,
-)
+    CARRIERS, effect_named, empirical_name, empirical_parts, is_effect, MODES, VARIABLES)
 from accel_calib.refine import refine
 from accel_calib.units import units_of
 from inside import (
-    beginning,
-    best_curve,
-    fitted_state,
-    format_calibration,
-    is_curve,
-    Model,
-    parameter_basis,
-    parse_calibration,
-    predict,
-    simulate_poses,
-)
+    beginning, best_curve, fitted_state, format_calibration, is_curve, Model, parameter_basis,
+    parse_calibration, predict, simulate_poses)
 import numpy as np
 import pytest
 from shared import random_directions, sensor

@@ -15,19 +15,8 @@ from accel_calib.errors import InputError
 from accel_calib.finding import has
 from accel_calib.units import Units, units_of
 from inside import (
-    export,
-    EXPORT_FORMATS,
-    ExportOptions,
-    format_calibration,
-    identifier,
-    Model,
-    model_with,
-    parse_calibration,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-    terms_of,
-)
+    export, EXPORT_FORMATS, ExportOptions, format_calibration, identifier, Model, model_with,
+    parse_calibration, rotation_from_rpy, simulate_poses, spread_directions, terms_of)
 import numpy as np
 import pytest
 from shared import run

@@ -12,13 +12,7 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from accel_calib.units import units_of
 from inside import (
-    format_calibration,
-    Model,
-    parse_calibration,
-    previous,
-    simulate_poses,
-    spread_directions,
-)
+    format_calibration, Model, parse_calibration, previous, simulate_poses, spread_directions)
 import numpy as np
 import pytest
 from shared import sensor

@@ -7,13 +7,7 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    lower_triangular,
-    NotConvergedError,
-    Point,
-    sensing_axes,
-    solve,
-    variance_factor,
-)
+    lower_triangular, NotConvergedError, Point, sensing_axes, solve, variance_factor)
 from accel_calib.finding import has
 from accel_calib.table import numbered, Poses
 from accel_calib.units import Units, units_of

@@ -34,17 +34,7 @@ from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
 from fleet_case import found_in, OFFSET, QUICK, rows_of, state_of, write_fleet, write_poses
 from inside import (
-    alike,
-    as_folder,
-    COMMAND,
-    content_hash,
-    date_of,
-    export,
-    main,
-    mapped,
-    on_disk,
-    sensor_of,
-)
+    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, sensor_of)
 import numpy as np
 import pytest
 from shared import run_on_small_disk

@@ -19,20 +19,8 @@ from accel_calib.fleet import Store
 from accel_calib.stored import write_calibration
 from accel_calib.units import Units
 from inside import (
-    as_folder,
-    digest,
-    digest_of,
-    drift_of,
-    merge_sensor,
-    Months,
-    not_agreeing,
-    odd_sensors,
-    overview,
-    schema,
-    shared_effects,
-    write_fleet_page,
-    write_parquet,
-)
+    as_folder, digest, digest_of, drift_of, merge_sensor, Months, not_agreeing, odd_sensors,
+    overview, schema, shared_effects, write_fleet_page, write_parquet)
 import numpy as np
 import pytest
 

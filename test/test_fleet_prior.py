@@ -17,19 +17,8 @@ from accel_calib.stored import read_calibration, read_prior, write_calibration, 
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    estimated,
-    main,
-    Model,
-    MODELS,
-    OVER_THE_SPHERE,
-    priors_of,
-    sensor_force,
-    simulate_poses,
-    spread_directions,
-    typical_of,
-    unit,
-    with_vector,
-)
+    estimated, main, Model, MODELS, OVER_THE_SPHERE, priors_of, sensor_force, simulate_poses,
+    spread_directions, typical_of, unit, with_vector)
 import numpy as np
 import pytest
 

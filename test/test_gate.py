@@ -14,13 +14,7 @@ from accel_calib.finding import has
 from accel_calib.stored import read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
-from inside import (
-    format_calibration,
-    Model,
-    parse_calibration,
-    simulate_poses,
-    spread_directions,
-)
+from inside import format_calibration, Model, parse_calibration, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import sensor

@@ -10,16 +10,8 @@ from accel_calib.estimate import dilution, error_left_in, identifiability, poses
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
-    determines,
-    missing_poses,
-    model_with,
-    predict,
-    refuse_if_unfit,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-    unit,
-)
+    determines, missing_poses, model_with, predict, refuse_if_unfit, rotation_from_rpy,
+    simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
 from shared import random_directions, sensor

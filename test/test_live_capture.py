@@ -16,16 +16,8 @@ from accel_calib.session import CalibratorSettings
 from accel_calib.stored import read_calibration
 from accel_calib.units import units_of
 from inside import (
-    dwells_of,
-    LiveCapture,
-    model_with,
-    PoseBook,
-    rest_after,
-    Sensor,
-    simulate_recording,
-    spread_directions,
-    with_temperature,
-)
+    dwells_of, LiveCapture, model_with, PoseBook, rest_after, Sensor, simulate_recording,
+    spread_directions, with_temperature)
 import numpy as np
 import pytest
 

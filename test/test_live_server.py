@@ -20,25 +20,9 @@ from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings, Log
 from accel_calib.table import Floats
 from inside import (
-    CALIBRATION_ALONE,
-    Host,
-    LARGEST_LIVE_MESSAGE,
-    LIVE_COMMANDS,
-    live_log,
-    LIVE_PERIOD,
-    main,
-    model_with,
-    PAGE_FOLDER,
-    PageServer,
-    PATIENCE_FOR_A_HELLO,
-    PATIENCE_FOR_A_REQUEST,
-    PERIOD_OF_A_COMPLAINT,
-    qr_code,
-    reachable,
-    simulate_recording,
-    spread_directions,
-    STUCK,
-)
+    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD, main,
+    model_with, PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST,
+    PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
 from viewer import fetch, Viewer, wait

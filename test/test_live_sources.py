@@ -23,15 +23,8 @@ from accel_calib.logs import LogOptions, read_log
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
-    announce,
-    CLOCK_OF_A_SOURCE,
-    COMMAND,
-    HEAD_OF_A_PORT,
-    is_port,
-    main,
-    open_source,
-    PATIENCE_OF_A_PORT,
-)
+    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, main, open_source,
+    PATIENCE_OF_A_PORT)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest

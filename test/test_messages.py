@@ -9,28 +9,12 @@ import struct
 from accel_calib.calibrate import fit_poses, level, thermal_stream
 from accel_calib.errors import InputError
 from accel_calib.logs import (
-    ACCELERATION,
-    ACCELERATION_COVARIANCE,
-    ANGULAR_VELOCITY,
-    ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at,
-    IMU_DOUBLES,
-    joined,
-    layout_of,
-    ORIENTATION,
-    ORIENTATION_COVARIANCE,
-    renamed,
-    samples_of,
-)
+    ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
+    doubles_at, IMU_DOUBLES, joined, layout_of, ORIENTATION, ORIENTATION_COVARIANCE, renamed,
+    samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
-from inside import (
-    frame_ids,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-    stamps_of,
-)
+from inside import frame_ids, rotation_from_rpy, simulate_poses, spread_directions, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

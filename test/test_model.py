@@ -6,16 +6,8 @@
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
 from inside import (
-    correct,
-    force_slope,
-    Model,
-    parameter_basis,
-    parse_effect,
-    predict,
-    reading_of,
-    rotation_from_rpy,
-    with_linear_part,
-)
+    correct, force_slope, Model, parameter_basis, parse_effect, predict, reading_of,
+    rotation_from_rpy, with_linear_part)
 import numpy as np
 import pytest
 from shared import random_directions

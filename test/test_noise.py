@@ -18,16 +18,8 @@ from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
-    ALLAN_COMPONENTS,
-    allan_variances,
-    fit_components,
-    longest_rest,
-    main,
-    octaves,
-    shares,
-    spread_directions,
-    spread_of,
-)
+    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, main, octaves, shares,
+    spread_directions, spread_of)
 import numpy as np
 import pytest
 

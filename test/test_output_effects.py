@@ -11,14 +11,7 @@ from accel_calib.logs import read_recording
 from accel_calib.table import Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, Units, units_of
 from inside import (
-    clipped,
-    grid_step,
-    Model,
-    off_grid,
-    simulate_recording,
-    spread_directions,
-    unclipped,
-)
+    clipped, grid_step, Model, off_grid, simulate_recording, spread_directions, unclipped)
 import numpy as np
 import pytest
 from shared import data, random_directions, sensor

@@ -17,13 +17,7 @@ from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from bag_files import write_bag
 from inside import (
-    main,
-    model_with,
-    ROWS_OF_A_TEXT,
-    simulate_poses,
-    simulate_recording,
-    spread_directions,
-)
+    main, model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
 import numpy as np
 import pytest
 from shared import sensor, with_effects

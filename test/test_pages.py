@@ -16,15 +16,8 @@ from accel_calib.findings import rate, rate_verification, Rating
 from accel_calib.report import write_history_page
 from accel_calib.text import milli
 from inside import (
-    calibration_page,
-    comparison_page,
-    linear_figures,
-    refinement_page,
-    residuals_of,
-    residuals_of_refinement,
-    sheet,
-    snippets,
-)
+    calibration_page, comparison_page, linear_figures, refinement_page, residuals_of,
+    residuals_of_refinement, sheet, snippets)
 from live_bench import chromium, PATIENCE
 import numpy as np
 from page_parser import parsed

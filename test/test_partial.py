@@ -6,34 +6,16 @@
 from dataclasses import replace
 
 from accel_calib.calibrate import (
-    directions_of,
-    fit_partial,
-    fit_poses,
-    gated,
-    level,
-    lies_in_cone,
-    mounting_only,
-    PRIOR,
-    verify,
-)
+    directions_of, fit_partial, fit_poses, gated, level, lies_in_cone, mounting_only, PRIOR,
+    verify)
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import estimate
 from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
-    carried,
-    common_sensors,
-    Model,
-    MODELS,
-    predict,
-    sensor_force,
-    simulate_poses,
-    spread_directions,
-    typical_spread,
-    unit,
-    with_vector,
-)
+    carried, common_sensors, Model, MODELS, predict, sensor_force, simulate_poses,
+    spread_directions, typical_spread, unit, with_vector)
 import numpy as np
 import pytest
 

@@ -11,14 +11,7 @@ from accel_calib.calibrate import NextPose
 from accel_calib.refine import PlannedPose, refine
 from accel_calib.units import units_of
 from generator import Setup, simulate, write_csv
-from inside import (
-    attitude_words,
-    Guide,
-    model_with,
-    NOTHING_TO_PLAN,
-    Plan,
-    simulate_poses,
-)
+from inside import attitude_words, Guide, model_with, NOTHING_TO_PLAN, Plan, simulate_poses
 import numpy as np
 import pytest
 from shared import random_directions, run

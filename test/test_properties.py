@@ -13,15 +13,8 @@ from accel_calib.findings import rate
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
 from inside import (
-    correct,
-    Model,
-    model_with,
-    OVER_THE_SPHERE,
-    predict,
-    rotation_from_rpy,
-    simulate_poses,
-    spread_directions,
-)
+    correct, Model, model_with, OVER_THE_SPHERE, predict, rotation_from_rpy, simulate_poses,
+    spread_directions)
 import numpy as np
 import pytest
 from shared import random_directions

@@ -9,13 +9,7 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_partial, mounting_only
 from accel_calib.finding import NextStep
 from accel_calib.findings import (
-    Expected,
-    GOOD_MG,
-    rate,
-    rate_comparison,
-    rate_refinement,
-    rate_verification,
-)
+    Expected, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
 from accel_calib.units import units_of
 from inside import number, spread_directions
 import numpy as np

@@ -8,12 +8,7 @@ from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
-from inside import (
-    LARGEST_SAMPLE,
-    model_with,
-    simulate_poses,
-    spread_directions,
-)
+from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from shared import random_directions, sensor

@@ -16,14 +16,7 @@ from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
 from inside import (
-    advice_for,
-    main,
-    Model,
-    model_with,
-    search_effects,
-    simulate_poses,
-    verdict_words,
-)
+    advice_for, main, Model, model_with, search_effects, simulate_poses, verdict_words)
 import numpy as np
 import pandas as pd
 import pytest

@@ -15,13 +15,8 @@ from accel_calib.refine import refine
 from accel_calib.table import Poses, Recording
 from accel_calib.units import units_of
 from inside import (
-    format_calibration,
-    Model,
-    parse_calibration,
-    simulate_poses,
-    simulate_recording,
-    spread_directions,
-)
+    format_calibration, Model, parse_calibration, simulate_poses, simulate_recording,
+    spread_directions)
 import numpy as np
 import pytest
 from shared import data, sensor

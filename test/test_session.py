@@ -21,18 +21,8 @@ from accel_calib.session import CalibratorSettings, changed, Level, state
 from accel_calib.stored import read_calibration, write_calibration
 from driven import Driver, RATE
 from inside import (
-    Identity,
-    LARGEST_NUMBER_OF_STEPS,
-    load_store,
-    Model,
-    next_action,
-    rotation_from_rpy,
-    SensorStore,
-    spread_directions,
-    store_of,
-    StreamStatistics,
-    writing_advice,
-)
+    Identity, LARGEST_NUMBER_OF_STEPS, load_store, Model, next_action, rotation_from_rpy,
+    SensorStore, spread_directions, store_of, StreamStatistics, writing_advice)
 import numpy as np
 import pytest
 from shared import with_effects

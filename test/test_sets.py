@@ -7,30 +7,9 @@ import math
 
 from accel_calib.effects import EFFECTS
 from inside import (
-    accepted,
-    beginning,
-    Block,
-    candidates,
-    Curve,
-    explored,
-    fitted_state,
-    grown_curve,
-    is_better_than_walk,
-    Linear,
-    linearised,
-    Model,
-    Near,
-    Process,
-    process_of,
-    products_of,
-    RARE,
-    REFINE_LEVEL,
-    SIGNIFICANT,
-    simulate_poses,
-    Walk,
-    walk_beside,
-    WORTH,
-)
+    accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
+    is_better_than_walk, Linear, linearised, Model, Near, Process, process_of, products_of, RARE,
+    REFINE_LEVEL, SIGNIFICANT, simulate_poses, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from shared import random_directions, sensor

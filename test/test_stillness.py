@@ -7,14 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from accel_calib.capture import (
-    capture,
-    Captured,
-    CaptureSettings,
-    Dwell,
-    select,
-    StillDetector,
-)
+from accel_calib.capture import capture, Captured, CaptureSettings, Dwell, select, StillDetector
 from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.table import Recording

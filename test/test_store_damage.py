@@ -20,17 +20,8 @@ from accel_calib.session import Level
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.units import units_of
 from inside import (
-    aside,
-    Identity,
-    load_store,
-    Lock,
-    model_with,
-    MOST_BYTES,
-    SensorStore,
-    simulate_poses,
-    spread_directions,
-    store_of,
-)
+    aside, Identity, load_store, Lock, model_with, MOST_BYTES, SensorStore, simulate_poses,
+    spread_directions, store_of)
 import numpy as np
 import pytest
 from test_session import Driver

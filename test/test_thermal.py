@@ -7,16 +7,8 @@ from accel_calib.calibrate import with_history
 from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from inside import (
-    acting_temperature,
-    Lag,
-    low_passed,
-    Model,
-    predict,
-    rate_of,
-    simulate_poses,
-    TemperatureHistory,
-    ThermalStream,
-)
+    acting_temperature, Lag, low_passed, Model, predict, rate_of, simulate_poses,
+    TemperatureHistory, ThermalStream)
 import numpy as np
 import pytest
 from shared import random_directions

@@ -18,20 +18,9 @@ from accel_calib.units import units_of
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
 from inside import (
-    format_calibration,
-    Model,
-    MOST_BYTES,
-    MOST_BYTES_WRITTEN,
-    MOST_LETTERS_OF_LABELS,
-    MOST_VALUES,
-    MOST_VALUES_READ,
-    MOST_VALUES_WRITTEN,
-    parse_calibration,
-    read_plain,
-    simulate_poses,
-    spread_directions,
-    values_in,
-)
+    format_calibration, Model, MOST_BYTES, MOST_BYTES_WRITTEN, MOST_LETTERS_OF_LABELS, MOST_VALUES,
+    MOST_VALUES_READ, MOST_VALUES_WRITTEN, parse_calibration, read_plain, simulate_poses,
+    spread_directions, values_in)
 import numpy as np
 import pytest
 import yaml

@@ -14,77 +14,23 @@ compares samples with the range of a calibration.
 """
 
 from .calibration import (
-    BASES,
-    Calibration,
-    check_sensor,
-    converted,
-    FLEET,
-    FrameName,
-    FRAMES,
-    Method,
-    METHODS,
-    MODEL_NAMES,
-    PRIOR,
-    Quality,
-    Rejected,
-    RejectedKind,
-    STORED_METHODS,
-)
+    BASES, Calibration, check_sensor, converted, FLEET, FrameName, FRAMES, Method, METHODS,
+    MODEL_NAMES, PRIOR, Quality, Rejected, RejectedKind, STORED_METHODS)
 from .context import (
-    of_samples,
-    Outside,
-    outside,
-    SampleContext,
-    thermal_stream,
-    USES_LIMIT,
-    with_history,
-    with_previous,
-)
+    of_samples, Outside, outside, SampleContext, thermal_stream, USES_LIMIT, with_history,
+    with_previous)
 from .fit import (
-    deviations_g,
-    fit_poses,
-    gated,
-    LARGEST_OFFSET_G,
-    sound_rows,
-    sure_rows,
-    uncertainty_g,
-)
+    deviations_g, fit_poses, gated, LARGEST_OFFSET_G, sound_rows, sure_rows, uncertainty_g)
 from .mounting import (
-    angle_words,
-    flat_direction,
-    in_frame,
-    level,
-    level_by_rows,
-    mounting_figures,
-    mounting_of,
-    mounting_words,
-    on_topics,
-    set_heading,
-    with_given_mounting,
-)
+    angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
+    mounting_words, on_topics, set_heading, with_given_mounting)
 from .partial import fit_partial, fit_with_fleet, mounting_only
 from .pose_planning import (
-    determines,
-    lies_in_cone,
-    next_pose,
-    NextPose,
-    Outlook,
-    outlook,
-    refuse_if_unfit,
-    words_of,
-)
+    determines, lies_in_cone, next_pose, NextPose, Outlook, outlook, refuse_if_unfit, words_of)
 from .prior import FleetPrior, posterior
 from .quality import (
-    errors_after,
-    errors_before,
-    fit_findings,
-    in_g,
-    OF_A_FIT,
-    quality_of,
-    record_of,
-    Verification,
-    verify,
-)
+    errors_after, errors_before, fit_findings, in_g, OF_A_FIT, quality_of, record_of, Verification,
+    verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .unknown_orientation import directions_of, fit_unknown, only_norm
 

@@ -17,16 +17,7 @@ from numpy.typing import ArrayLike
 from .context import HELD, limited, of_samples, with_acting
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    AXES,
-    Context,
-    correct,
-    force_slope,
-    Model,
-    ModelForm,
-    MODELS,
-    parameter_names,
-    predict,
-)
+    AXES, Context, correct, force_slope, Model, ModelForm, MODELS, parameter_names, predict)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..table import Floats, Poses, Record, Table

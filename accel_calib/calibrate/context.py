@@ -21,15 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..effects import (
-    acting_temperature,
-    Context,
-    EMPIRICAL,
-    empirical_parts,
-    Model,
-    rate_at,
-    ThermalStream,
-    variable_of,
-)
+    acting_temperature, Context, EMPIRICAL, empirical_parts, Model, rate_at, ThermalStream,
+    variable_of)
 from ..geometry import unit
 from ..table import column_of, Floats, Poses
 from ..text import counted

@@ -25,16 +25,8 @@ from .calibration import Calibration, FLEET, PRIOR, Rejected
 from .fit import deviations_g, finished, sound_rows, sure_rows, uncertainty_g
 from .pose_planning import Cone, cone_of, determines, enumerated, missing_poses, turn_words
 from .prior import (
-    FIRST_NOISE_G,
-    FLEET_NOISE_G,
-    FleetPrior,
-    LARGEST_ERROR_G,
-    most_probable,
-    NAME,
-    PriorFit,
-    priors_of,
-    UNLIKE_FLEET,
-)
+    FIRST_NOISE_G, FLEET_NOISE_G, FleetPrior, LARGEST_ERROR_G, most_probable, NAME, PriorFit,
+    priors_of, UNLIKE_FLEET)
 from .quality import fit_findings, in_g, record_of
 from .unknown_orientation import copies, only_norm, rejected_by
 from ..effects import AXES, EFFECTS, Model, MODELS, sensor_force

@@ -31,23 +31,9 @@ import numpy as np
 from .calibration import Calibration, ORIENTED
 from ..errors import RefusedFitError
 from ..estimate import (
-    Combination,
-    dilution,
-    distinct,
-    error_left_in,
-    Identifiability,
-    identifiability,
-    information_of,
-    LARGEST_DILUTION,
-    left_out,
-    NORM_MODELS,
-    over_the_sphere,
-    pose_noise,
-    poses_needed,
-    relative_weights,
-    rows_of,
-    WEAK_DILUTION,
-)
+    Combination, dilution, distinct, error_left_in, Identifiability, identifiability,
+    information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise,
+    poses_needed, relative_weights, rows_of, WEAK_DILUTION)
 from ..finding import Finding
 from ..geometry import ATTITUDES, OVER_THE_SPHERE, unit
 from ..table import Floats

@@ -28,30 +28,9 @@ from .quality import fit_findings, in_g, record_of, rival_findings
 from ..effects import Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    closed_form,
-    covariance_with,
-    dilution,
-    estimate,
-    Fit,
-    fit_norm,
-    fit_sphere,
-    free_parameters,
-    judge,
-    LARGEST_DILUTION,
-    lower_triangular,
-    NORM_MODELS,
-    NotConvergedError,
-    originals,
-    Point,
-    pose_noise,
-    poses_needed,
-    Rival,
-    rivals,
-    solve,
-    start_of,
-    TIES,
-    WEAK_DILUTION,
-)
+    closed_form, covariance_with, dilution, estimate, Fit, fit_norm, fit_sphere, free_parameters,
+    judge, LARGEST_DILUTION, lower_triangular, NORM_MODELS, NotConvergedError, originals, Point,
+    pose_noise, poses_needed, Rival, rivals, solve, start_of, TIES, WEAK_DILUTION)
 from ..finding import Finding
 from ..geometry import unit
 from ..table import Floats, Poses

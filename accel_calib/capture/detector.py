@@ -30,17 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import (
-    CaptureSettings,
-    chained,
-    Chunker,
-    CHUNKS_PER_WINDOW,
-    CONTEXT,
-    Interruption,
-    MOTION,
-    Records,
-    sums_type,
-    together,
-)
+    CaptureSettings, chained, Chunker, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION, Records,
+    sums_type, together)
 from .dwell import Dwell, dwell_type, figures, figures_type, judged, OngoingDwell
 from .rule import HORIZON, Judged, Rule
 from ..table import Floats

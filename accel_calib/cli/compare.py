@@ -21,13 +21,7 @@ from .inputs import intake, rows_between, stored_calibration
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
 from ..findings import (
-    change_in_words,
-    GAINS,
-    in_words,
-    OFFSETS,
-    rate_comparison,
-    rate_verification,
-)
+    change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_verification)
 from ..stored import read_calibration
 from ..table import check_units
 from ..text import plain, short

@@ -18,13 +18,7 @@ from .inputs import given, intake, log_options, plan_of, rows_between, settings
 from ..calibrate import Calibration, GyroBias, Outlook, outlook
 from ..disk import STANDARD_OUTPUT
 from ..errors import system_error
-from ..findings import (
-    calibration_json,
-    effect_figures,
-    linear_figures,
-    Rating,
-    refinement_json,
-)
+from ..findings import calibration_json, effect_figures, linear_figures, Rating, refinement_json
 from ..intake import Intake
 from ..pipeline import calibrated, Outcome
 from ..stored import write_calibration

@@ -437,8 +437,7 @@ def progress(what: str) -> Iterator[Progress]:
     if not sys.stderr.isatty():
         yield lambda done, count: None
         return
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeRemainingColumn
 
     columns = (BarColumn(), TextColumn('{task.description}'), TimeRemainingColumn())
     with Bar(*columns, console=Output(stderr=True), transient=True) as bar:

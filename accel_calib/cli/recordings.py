@@ -17,13 +17,7 @@ from rich.table import Table
 
 from .frame import Done, progress, rated, rating_lines, working
 from .inputs import log_options, settings, stored_calibration
-from ..calibrate import (
-    Calibration,
-    check_sensor,
-    of_samples,
-    Outside,
-    SampleContext,
-)
+from ..calibrate import Calibration, check_sensor, of_samples, Outside, SampleContext
 from ..capture import Captured
 from ..disk import STANDARD_OUTPUT
 from ..effects import Context, parse_effect

@@ -51,14 +51,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..calibrate import Calibration, fit_unknown, in_g, with_history
-from ..effects import (
-    Context,
-    effect_named,
-    force_slope,
-    Model,
-    parameter_basis,
-    reading_of,
-)
+from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import Fit, judge, NORM_MODELS
 from ..table import Floats, Poses

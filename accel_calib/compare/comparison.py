@@ -21,17 +21,8 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from .agreement import (
-    Comparable,
-    comparable,
-    LEVEL,
-    on_one_scale,
-    outlier,
-    p_values,
-    rotation_free,
-    RotationFree,
-    Runs,
-    SAME_G,
-)
+    Comparable, comparable, LEVEL, on_one_scale, outlier, p_values, rotation_free, RotationFree,
+    Runs, SAME_G)
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError

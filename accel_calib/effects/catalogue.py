@@ -23,25 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .form import (
-    ALL_AXES,
-    AXES,
-    by_axis,
-    Context,
-    CROSS,
-    CUBE,
-    Effect,
-    Factor,
-    FORCE,
-    matrix_terms,
-    MODES,
-    ODD_SQUARE,
-    ONE,
-    PRODUCTS,
-    SIZE,
-    SQUARE,
-    Term,
-    WAVE,
-)
+    ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, Effect, Factor, FORCE, matrix_terms, MODES,
+    ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term, WAVE)
 from .thermal import acting_temperature, rate_at
 from ..table import column_of, Floats, is_quantity
 from ..units import MG, STANDARD_GRAVITY

@@ -25,25 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import (
-    effect_named,
-    EFFECTS,
-    is_effect,
-    OWN,
-    parameter_names,
-    PROCESSES,
-)
+from .catalogue import effect_named, EFFECTS, is_effect, OWN, parameter_names, PROCESSES
 from .form import (
-    AFFINE,
-    Context,
-    difference,
-    Effect,
-    fitted_places,
-    FORCE,
-    MONOMIALS,
-    ONE,
-    OwnEffect,
-)
+    AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE, OwnEffect)
 from .thermal import Lag
 from ..errors import AccelCalibError, InputError
 from ..table import column_of, Floats, is_quantity, Record

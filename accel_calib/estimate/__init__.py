@@ -12,37 +12,13 @@ computes start values. `geometry` computes what poses determine before any fit.
 """
 
 from .closed_form import (
-    closed_form,
-    faces,
-    fit_12,
-    fit_sphere,
-    lower_triangular,
-    sensing_axes,
-    TIES,
-)
+    closed_form, faces, fit_12, fit_sphere, lower_triangular, sensing_axes, TIES)
 from .equations import believable, Equations, kinds, originals
 from .fit import estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
-    Combination,
-    coverage,
-    dilution,
-    distinct,
-    error_left_in,
-    free_parameters,
-    Identifiability,
-    identifiability,
-    information_of,
-    LARGEST_DILUTION,
-    left_out,
-    NORM_MODELS,
-    over_the_sphere,
-    pose_noise,
-    poses_needed,
-    relative_weights,
-    rows_of,
-    uncovered,
-    WEAK_DILUTION,
-)
+    Combination, coverage, dilution, distinct, error_left_in, free_parameters, Identifiability,
+    identifiability, information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere,
+    pose_noise, poses_needed, relative_weights, rows_of, uncovered, WEAK_DILUTION)
 from .outliers import by_pose, LARGEST_SHARE, outliers_among, variance_factor
 from .robust import covariance_with, fit_norm, outliers, Rival, rivals, start_of, unseen_mistakes
 

@@ -36,14 +36,7 @@ from numpy.typing import NDArray
 from .closed_form import along_quadrics
 from .equations import Equations, equations, measured
 from .outliers import belief_in, by_pose, ByPose, variance_factor
-from ..effects import (
-    CHANGES,
-    fitted_places,
-    LADDER,
-    Model,
-    parameter_names,
-    with_vector,
-)
+from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..geometry import unit
 from ..table import Floats, Poses

@@ -42,14 +42,7 @@ from .closed_form import closed_form
 from .equations import believable
 from .fit import estimate, Fit, judge, NotConvergedError
 from .outliers import (
-    belief_beside,
-    belief_in,
-    beyond,
-    LARGEST_SHARE,
-    LEVEL,
-    Outliers,
-    outliers_among,
-)
+    belief_beside, belief_in, beyond, LARGEST_SHARE, LEVEL, Outliers, outliers_among)
 from ..effects import linear_values, Model, MODELS, parameter_names
 from ..table import Floats, Poses
 

@@ -13,18 +13,8 @@ import numpy as np
 
 from .expected import BOUND, depends_on, directions_in, Expected
 from .limits import (
-    BAD_ERROR,
-    COVERED,
-    GOOD_ERROR,
-    HIDDEN,
-    LEFT_OUT,
-    MATTERS,
-    NEAR_FLAT,
-    PER_OUTLIER,
-    SPAN,
-    TO_CHECK,
-    WORST_ERROR,
-)
+    BAD_ERROR, COVERED, GOOD_ERROR, HIDDEN, LEFT_OUT, MATTERS, NEAR_FLAT, PER_OUTLIER, SPAN,
+    TO_CHECK, WORST_ERROR)
 from ..calibrate import Calibration, flat_direction
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES

@@ -22,20 +22,8 @@ from .task import Row
 from ..compare import NAMES
 from ..findings import change_in_words, CROSS, GAINS, in_words, OFFSETS, scale_of
 from ..report.charts import (
-    ACCENT,
-    AFTER,
-    BAND,
-    BEFORE,
-    Drawing,
-    EDGE,
-    FAINT,
-    legend_below,
-    Mark,
-    Marks,
-    new_figure,
-    styled,
-    THIRD,
-)
+    ACCENT, AFTER, BAND, BEFORE, Drawing, EDGE, FAINT, legend_below, Mark, Marks, new_figure,
+    styled, THIRD)
 from ..report.repeats import label_dates, places_of, spoken
 from ..table import Floats
 from ..text import short

@@ -19,23 +19,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from .charts import (
-    change_words,
-    drift_words,
-    lasting_words,
-    Odd,
-    odd_words,
-    of_months,
-    of_sensor,
-    of_values,
-)
-from .overview import (
-    not_agreeing,
-    odd_sensors,
-    OfModel,
-    Overview,
-    rating_of,
-    shared_effects,
-)
+    change_words, drift_words, lasting_words, Odd, odd_words, of_months, of_sensor, of_values)
+from .overview import not_agreeing, odd_sensors, OfModel, Overview, rating_of, shared_effects
 from .sensors import alike
 from .task import Row, Store
 from .. import __version__
@@ -46,16 +31,8 @@ from ..findings import Rating, scale_of
 from ..report.charts import Drawing, has_matplotlib
 from ..report.repeats import spoken
 from ..report.sheet import (
-    figures,
-    heading,
-    listing,
-    paragraph,
-    rated_sheet,
-    scroll_table,
-    section,
-    verdict_box,
-    write_sheet,
-)
+    figures, heading, listing, paragraph, rated_sheet, scroll_table, section, verdict_box,
+    write_sheet)
 from ..text import counted, short
 
 PAGE = 'fleet.html'

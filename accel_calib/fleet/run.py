@@ -26,16 +26,7 @@ from .overview import digest_of, Overview, overview, rating_of
 from .page import write_fleet_page
 from .sensors import merge_sensor, PRIOR_FILE, priors_of, read_sensors, write_sensors
 from .task import (
-    calibrate_recording,
-    Done,
-    is_damaged,
-    Options,
-    Row,
-    SENSORS_FILE,
-    Store,
-    UNREAD,
-    unread_row,
-)
+    calibrate_recording, Done, is_damaged, Options, Row, SENSORS_FILE, Store, UNREAD, unread_row)
 from ..calibrate import FleetPrior
 from ..effects import know_code, known_code
 from ..errors import InputError, needing

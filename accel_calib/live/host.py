@@ -34,20 +34,8 @@ from ..findings import rate
 from ..messages.one_reading import Triple
 from ..report.page import calibration_page, STORED
 from ..session import (
-    Answer,
-    BATCH,
-    CalibratorSettings,
-    CallSoon,
-    Compute,
-    Log,
-    LogFilter,
-    Session,
-    Severity,
-    ShowPoses,
-    state,
-    Task,
-    Worker,
-)
+    Answer, BATCH, CalibratorSettings, CallSoon, Compute, Log, LogFilter, Session, Severity,
+    ShowPoses, state, Task, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 

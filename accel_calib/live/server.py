@@ -30,15 +30,7 @@ from aiohttp import web
 
 from . import messages
 from .viewer import (
-    announce,
-    Connection,
-    not_bound,
-    reachable,
-    secured,
-    STUCK_S,
-    TooManyError,
-    Viewer,
-)
+    announce, Connection, not_bound, reachable, secured, STUCK_S, TooManyError, Viewer)
 from ..report.sheet import policy
 from ..session import Answer, Log, LogFilter
 from ..stored.exports import Exported, FORMATS

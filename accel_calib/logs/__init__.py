@@ -19,29 +19,10 @@ from .formats import NAMES
 from .quantities import are_samples, are_untimed_samples
 from .read import LineReader, Log, open_log, OpenLog, Progress, read_log, read_recording
 from .serialized import (
-    ACCELERATION,
-    ACCELERATION_COVARIANCE,
-    ANGULAR_VELOCITY,
-    ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at,
-    IMU_DOUBLES,
-    joined,
-    Layout,
-    layout_of,
-    layout_with,
-    LITTLE_ENDIAN,
-    Messages,
-    NAME_AT,
-    NINE,
-    ORIENTATION,
-    ORIENTATION_COVARIANCE,
-    put_doubles,
-    renamed,
-    samples_of,
-    STAMP,
-    STAMP_AT,
-    THREE,
-)
+    ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
+    doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
+    NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed, samples_of, STAMP,
+    STAMP_AT, THREE)
 from .tables import read_poses, write_blocks, write_table
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',

@@ -35,18 +35,7 @@ from numpy.typing import NDArray
 
 from .autopilot import ardupilot_correction, Parameters, Stated
 from .flight import (
-    as_sensed,
-    at,
-    AXES,
-    choose,
-    finite,
-    FlightLog,
-    Message,
-    MICRO,
-    sound,
-    sound_log,
-    taken,
-)
+    as_sensed, at, AXES, choose, finite, FlightLog, Message, MICRO, sound, sound_log, taken)
 from ..errors import InputError, needing
 from ..table import Autopilot, Floats
 from ..text import counted

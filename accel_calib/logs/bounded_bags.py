@@ -44,8 +44,7 @@ from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import reader as rosbag1_reader
-from rosbags.rosbag2 import reader as rosbag2_reader
-from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2 import reader as rosbag2_reader, storage_mcap
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 import yaml
 

@@ -24,20 +24,8 @@ import numpy as np
 from . import formats
 from .dialect import is_clock, is_number, Layout, shown
 from .names import (
-    BARE,
-    bare_name,
-    COUNTERS,
-    is_unit,
-    LINEAR_WORDS,
-    may_cause,
-    meaning,
-    OURS,
-    RATE,
-    READING,
-    unit_of,
-    WHOLE_WORDS,
-    WORDS,
-)
+    BARE, bare_name, COUNTERS, is_unit, LINEAR_WORDS, may_cause, meaning, OURS, RATE, READING,
+    unit_of, WHOLE_WORDS, WORDS)
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key

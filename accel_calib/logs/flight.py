@@ -39,14 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    Correction,
-    Parameters,
-    px4_correction,
-    px4_slot,
-    px4_thermal_slot,
-    raw_columns,
-    Stated,
-)
+    Correction, Parameters, px4_correction, px4_slot, px4_thermal_slot, raw_columns, Stated)
 from .formats import PX4_FIELDS, PX4_SPANS
 from ..errors import InputError, needing
 from ..table import Autopilot, COLUMNS, columns_from, Floats, numbered, Recording

@@ -24,16 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .dialect import (
-    is_clock,
-    is_comment,
-    is_number,
-    IsHeader,
-    Layout,
-    layout_of,
-    short,
-    split,
-)
+from .dialect import is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted

@@ -26,27 +26,11 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .correction import corrected, output_frame, output_scale
-from ..calibrate import (
-    Calibration,
-    check_sensor,
-    on_topics,
-    Outside,
-    SampleContext,
-)
+from ..calibrate import Calibration, check_sensor, on_topics, Outside, SampleContext
 from ..errors import InputError
 from ..logs import (
-    Bag,
-    context_of,
-    ContextTopics,
-    damage_as_input_error,
-    doubles_at,
-    IMU_DOUBLES,
-    Messages,
-    open_bag,
-    Progress,
-    put_doubles,
-    renamed,
-)
+    Bag, context_of, ContextTopics, damage_as_input_error, doubles_at, IMU_DOUBLES, Messages,
+    open_bag, Progress, put_doubles, renamed)
 from ..table import check_units, Recording
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -236,8 +220,8 @@ def _writer(bag: Bag, target: Path, suffix: str) -> Any:
         from rosbags.rosbag1 import Writer as Writer1
 
         return Writer1(target)
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.rosbag2 import (
+        CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer as Writer2)
 
     mcap = suffix == '.mcap' or (suffix != '.db3' and (
         bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))))

@@ -47,21 +47,9 @@ from ..effects import Context, ThermalStream
 from ..errors import InputError
 from ..geometry import quaternion_of
 from ..logs import (
-    ACCELERATION,
-    ACCELERATION_COVARIANCE,
-    ANGULAR_VELOCITY,
-    ANGULAR_VELOCITY_COVARIANCE,
-    Layout,
-    layout_with,
-    LITTLE_ENDIAN,
-    NAME_AT,
-    NINE,
-    ORIENTATION,
-    ORIENTATION_COVARIANCE,
-    STAMP,
-    STAMP_AT,
-    THREE,
-)
+    ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE, Layout,
+    layout_with, LITTLE_ENDIAN, NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, STAMP,
+    STAMP_AT, THREE)
 from ..table import Floats
 
 if TYPE_CHECKING:

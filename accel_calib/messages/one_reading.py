@@ -22,19 +22,8 @@ import numpy as np
 
 from ..calibrate import Calibration
 from ..effects import (
-    AFFINE,
-    check_context,
-    CONVERGED_G,
-    difference,
-    Effect,
-    fitted_places,
-    FORCE,
-    LARGEST_FORCE_G,
-    LARGEST_ITERATIONS,
-    MONOMIALS,
-    ONE,
-    too_large,
-)
+    AFFINE, check_context, CONVERGED_G, difference, Effect, fitted_places, FORCE, LARGEST_FORCE_G,
+    LARGEST_ITERATIONS, MONOMIALS, ONE, too_large)
 from ..table import Floats
 
 Triple = tuple[float, float, float]

@@ -25,28 +25,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from .components import (
-    AxisNoise,
-    Component,
-    COMPONENTS,
-    FIGURES,
-    fit_components,
-    Fitted,
-    Kind,
-    NoiseFigures,
-    shown_unit,
-)
+    AxisNoise, Component, COMPONENTS, FIGURES, fit_components, Fitted, Kind, NoiseFigures,
+    shown_unit)
 from .curve import (
-    allan_variances,
-    check_allantools,
-    Counts,
-    FLAT,
-    longest_rest,
-    LongRest,
-    octaves,
-    shares,
-    Spread,
-    spread_of,
-)
+    allan_variances, check_allantools, Counts, FLAT, longest_rest, LongRest, octaves, shares,
+    Spread, spread_of)
 from ..table import Floats, Recording
 from ..units import is_native, STANDARD_GRAVITY, Units
 

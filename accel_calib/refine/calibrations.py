@@ -24,33 +24,11 @@ from numpy.typing import NDArray
 from .base import fitted_state, State
 from .words import plain_name
 from ..calibrate import (
-    BASES,
-    Calibration,
-    fit_findings,
-    fit_poses,
-    gated,
-    in_g,
-    OF_A_FIT,
-    quality_of,
-    record_of,
-    refuse_if_unfit,
-    Rejected,
-    sound_rows,
-    sure_rows,
-    uncertainty_g,
-    with_history,
-    with_rest_noise,
-)
+    BASES, Calibration, fit_findings, fit_poses, gated, in_g, OF_A_FIT, quality_of, record_of,
+    refuse_if_unfit, Rejected, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
 from ..effects import CHANGES, included, Model, parameter_names, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import (
-    estimate,
-    fit_sphere,
-    judge,
-    LARGEST_DILUTION,
-    outliers,
-    variance_factor,
-)
+from ..estimate import estimate, fit_sphere, judge, LARGEST_DILUTION, outliers, variance_factor
 from ..finding import Finding, has, without
 from ..geometry import unit
 from ..table import check_units, Floats, Poses

@@ -35,27 +35,10 @@ import numpy as np
 
 from .base import causes, State
 from .linear import (
-    Block,
-    candidates,
-    held_out,
-    LEVEL,
-    Linear,
-    linearised,
-    outside_of,
-    products_of,
-    Set,
-)
+    Block, candidates, held_out, LEVEL, Linear, linearised, outside_of, products_of, Set)
 from ..effects import (
-    CARRIERS,
-    curve_pairs,
-    effect_named,
-    EFFECTS,
-    EMPIRICAL,
-    empirical_name,
-    empirical_parts,
-    Model,
-    MODES,
-)
+    CARRIERS, curve_pairs, effect_named, EFFECTS, EMPIRICAL, empirical_name, empirical_parts,
+    Model, MODES)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 

@@ -24,43 +24,15 @@ from dataclasses import replace
 import numpy as np
 
 from .base import is_noise, sampled, State
-from .calibrations import (
-    base_of,
-    beside_stored,
-    Given,
-    refined_calibration,
-    without_orientation,
-)
+from .calibrations import base_of, beside_stored, Given, refined_calibration, without_orientation
 from .plan import plan_poses, PosePlan
 from .result import (
-    beside_walk,
-    not_testable,
-    Refinement,
-    Stage,
-    steps_of,
-    untestable,
-    Verdict,
-    verdict_of,
-)
+    beside_walk, not_testable, Refinement, Stage, steps_of, untestable, Verdict, verdict_of)
 from .search import Found, search
 from .words import advice_for, sample_words
 from ..calibrate import (
-    Calibration,
-    check_sensor,
-    fit_with_fleet,
-    FLEET,
-    FleetPrior,
-    gated,
-    in_g,
-    only_norm,
-    posterior,
-    quality_of,
-    Rejected,
-    sound_rows,
-    sure_rows,
-    with_history,
-    with_rest_noise,
-)
+    Calibration, check_sensor, fit_with_fleet, FLEET, FleetPrior, gated, in_g, only_norm,
+    posterior, quality_of, Rejected, sound_rows, sure_rows, with_history, with_rest_noise)
 from ..effects import Model, MODELS, PROCESSES, with_vector
 from ..errors import RefusedFitError
 from ..estimate import judge, NotConvergedError

@@ -29,31 +29,12 @@ from .plan import PosePlan
 from .search import Found
 from .sets import LEAST, probabilities
 from .words import (
-    change_words,
-    curve_words,
-    direction_words,
-    grid_words,
-    instant_words,
-    limit_words,
-    percent,
-    plain_name,
-    range_words,
-    shown_name,
-)
+    change_words, curve_words, direction_words, grid_words, instant_words, limit_words, percent,
+    plain_name, range_words, shown_name)
 from ..calibrate import Calibration
 from ..effects import (
-    CHANGES,
-    effect_named,
-    EFFECTS,
-    included,
-    kind_of,
-    LADDER,
-    Model,
-    parameter_names,
-    PROCESSES,
-    variable_of,
-    WANDER,
-)
+    CHANGES, effect_named, EFFECTS, included, kind_of, LADDER, Model, parameter_names, PROCESSES,
+    variable_of, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import ATTITUDES
 from ..table import column_of, Floats, Poses, Record

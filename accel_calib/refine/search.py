@@ -28,31 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import (
-    beginning,
-    causes,
-    Clipped,
-    fitted_state,
-    is_noise,
-    off_grid,
-    State,
-    unclipped,
-    with_effect,
-)
+    beginning, causes, Clipped, fitted_state, is_noise, off_grid, State, unclipped, with_effect)
 from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, walk_beside
 from .linear import Candidate, candidates, LEVEL, Linear, linearised, Set
 from .sets import accepted, explored, Near, NOTHING, simpler
 from ..calibrate import with_previous
 from ..effects import (
-    CHANGES,
-    covariate_names,
-    effect_named,
-    EFFECTS,
-    empirical_parts,
-    included,
-    LADDER,
-    Model,
-    WANDER,
-)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER, Model,
+    WANDER)
 from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses

@@ -13,20 +13,8 @@ import numpy as np
 
 from ..calibrate import words_of
 from ..effects import (
-    CHANGES,
-    COVARIATES,
-    effect_named,
-    EMPIRICAL,
-    empirical_parts,
-    is_effect,
-    kind_of,
-    TO_SEPARATE,
-    unit_of,
-    value_unit,
-    variable_of,
-    variable_words,
-    WANDER,
-)
+    CHANGES, COVARIATES, effect_named, EMPIRICAL, empirical_parts, is_effect, kind_of, TO_SEPARATE,
+    unit_of, value_unit, variable_of, variable_words, WANDER)
 from ..geometry import ATTITUDES, unit
 from ..table import column_of, Floats, is_quantity
 from ..text import counted, short, with_sd

@@ -20,36 +20,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .charts import (
-    ACCENT,
-    AFTER,
-    against,
-    are_spread,
-    BAND,
-    BEFORE,
-    Drawing,
-    FAINT,
-    HEIGHT_INCHES,
-    INK,
-    limit_mg,
-    new_figure,
-    of_remainder,
-    PAPER,
-    save,
-    sphere_map,
-    styled,
-    THIRD,
-)
+    ACCENT, AFTER, against, are_spread, BAND, BEFORE, Drawing, FAINT, HEIGHT_INCHES, INK, limit_mg,
+    new_figure, of_remainder, PAPER, save, sphere_map, styled, THIRD)
 from .residuals import residuals_of_refinement, Variable, variable_of, variables_of, with_thermal
 from ..effects import (
-    AXES,
-    CARRIERS,
-    curve_unit,
-    effect_named,
-    EMPIRICAL,
-    empirical_parts,
-    parameter_names,
-    variable_words,
-)
+    AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
+    variable_words)
 from ..refine.words import base_words
 from ..table import Floats, Poses
 from ..text import short

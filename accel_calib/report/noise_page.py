@@ -19,18 +19,8 @@ import numpy as np
 
 from .charts import ACCENT, AFTER, Drawing, Mark, Marks, new_figure, styled, THIRD
 from .sheet import (
-    figures,
-    heading,
-    how_to_read,
-    listing,
-    numbers,
-    paragraph,
-    rated_sheet,
-    scroll_table,
-    section,
-    verdict_box,
-    write_sheet,
-)
+    figures, heading, how_to_read, listing, numbers, paragraph, rated_sheet, scroll_table, section,
+    verdict_box, write_sheet)
 from .. import __version__
 from ..findings import rate_noise
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS

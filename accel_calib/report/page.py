@@ -26,34 +26,13 @@ from .charts import of_before_after, of_coverage, of_remainder
 from .drawings import ladder, of_curve, of_step
 from .residuals import Residuals, residuals_of, residuals_of_refinement, since_first
 from .sheet import (
-    block,
-    code,
-    figures,
-    heading,
-    HINT,
-    how_to_read,
-    listing,
-    numbers,
-    paragraph,
-    rated_sheet,
-    scroll_table,
-    section,
-    snippets,
-    verdict_box,
-    write_sheet,
-)
+    block, code, figures, heading, HINT, how_to_read, listing, numbers, paragraph, rated_sheet,
+    scroll_table, section, snippets, verdict_box, write_sheet)
 from .. import __version__
 from ..calibrate import Calibration, mounting_figures, outlook
 from ..effects import (
-    AXES,
-    effect_named,
-    EMPIRICAL,
-    empirical_parts,
-    REFERENCE_TEMPERATURE,
-    value_unit,
-    variable_words,
-    with_vector,
-)
+    AXES, effect_named, EMPIRICAL, empirical_parts, REFERENCE_TEMPERATURE, value_unit,
+    variable_words, with_vector)
 from ..estimate import coverage
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
 from ..refine.words import chance, percent, values_of, verdict_words

@@ -18,48 +18,14 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .charts import (
-    ACCENT,
-    add_bar,
-    AFTER,
-    BAND,
-    BEFORE,
-    Drawing,
-    EDGE,
-    FAINT,
-    HEIGHT_INCHES,
-    INK,
-    legend_below,
-    Mark,
-    Marks,
-    new_figure,
-    PAPER,
-    styled,
-    THERMAL,
-    THIRD,
-)
+    ACCENT, add_bar, AFTER, BAND, BEFORE, Drawing, EDGE, FAINT, HEIGHT_INCHES, INK, legend_below,
+    Mark, Marks, new_figure, PAPER, styled, THERMAL, THIRD)
 from .sheet import (
-    figures,
-    heading,
-    HINT,
-    how_to_read,
-    listing,
-    rated_sheet,
-    scroll_table,
-    section,
-    verdict_box,
-    write_sheet,
-)
+    figures, heading, HINT, how_to_read, listing, rated_sheet, scroll_table, section, verdict_box,
+    write_sheet)
 from .. import __version__
 from ..compare import Comparison, History, Parameter
-from ..findings import (
-    change_in_words,
-    CROSS,
-    GAINS,
-    in_words,
-    OFFSETS,
-    rate_comparison,
-    scale_of,
-)
+from ..findings import change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, scale_of
 from ..table import Floats
 from ..text import short, with_minus
 

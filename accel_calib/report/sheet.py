@@ -25,21 +25,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from .charts import (
-    ACCENT,
-    AFTER,
-    AXIS,
-    BEFORE,
-    DISC,
-    Drawing,
-    FAINT,
-    GRID,
-    INK,
-    Marks,
-    PAPER,
-    RIM,
-    styled,
-    THIRD,
-)
+    ACCENT, AFTER, AXIS, BEFORE, DISC, Drawing, FAINT, GRID, INK, Marks, PAPER, RIM, styled, THIRD)
 from ..disk import write_atomically
 from ..effects import effect_named
 from ..table import COLUMNS, Floats

@@ -36,37 +36,15 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from .declare import (
-    CALLS,
-    declared,
-    follow,
-    LATCHED,
-    mismatches,
-    name_of,
-    published_by_others,
-    SENSOR,
-    STREAM,
-)
+    CALLS, declared, follow, LATCHED, mismatches, name_of, published_by_others, SENSOR, STREAM)
 from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
 from .stream import ContextTopics, Stream
 from .transforms import MountingBroadcaster, watch_static
 from ..errors import AccelCalibError
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings,
-    CallSoon,
-    context_topics,
-    Event,
-    Log,
-    LogFilter,
-    Mounting,
-    Result,
-    Session,
-    ShowPoses,
-    state,
-    Still,
-    Task,
-    Worker,
-)
+    CalibratorSettings, CallSoon, context_topics, Event, Log, LogFilter, Mounting, Result, Session,
+    ShowPoses, state, Still, Task, Worker)
 
 if TYPE_CHECKING:
     from rclpy.lifecycle import LifecycleState

@@ -25,19 +25,8 @@ from ..calibrate import NextPose
 from ..errors import AccelCalibError
 from ..live import check_installed
 from ..session import (
-    CalibratorSettings,
-    CallSoon,
-    Check,
-    checks,
-    figures,
-    Level,
-    Log,
-    Progress,
-    Session,
-    ShowPoses,
-    Worker,
-    worst,
-)
+    CalibratorSettings, CallSoon, Check, checks, figures, Level, Log, Progress, Session, ShowPoses,
+    Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:

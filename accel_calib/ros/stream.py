@@ -30,16 +30,8 @@ from .declare import published_by_others, SENSOR
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
-    ACCELERATION,
-    IMU_DOUBLES,
-    joined,
-    Layout,
-    layout_of,
-    LITTLE_ENDIAN,
-    NAME_AT,
-    samples_of,
-    THREE,
-)
+    ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
+    THREE)
 from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
 from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session

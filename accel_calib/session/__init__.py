@@ -17,36 +17,13 @@ from .guidance import Progress
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
-    CalibratorSettings,
-    changed,
-    columns_of,
-    context_topics,
-    default_of,
-    expected,
-    parameter,
-    Settings,
-    WEB_PORT,
-)
+    CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
+    Settings, WEB_PORT)
 from .state import Check, checks, figures, Level, words_of_state, worst
 from .store import ros_home
 from .worker import (
-    Answer,
-    CallSoon,
-    Compute,
-    Event,
-    Files,
-    Log,
-    LogFilter,
-    Mounting,
-    Result,
-    Severity,
-    ShowPoses,
-    Step,
-    Still,
-    Task,
-    Worker,
-    WorkerProcess,
-)
+    Answer, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, Result, Severity, ShowPoses,
+    Step, Still, Task, Worker, WorkerProcess)
 
 __all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
            'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',

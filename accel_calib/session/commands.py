@@ -25,14 +25,7 @@ from .store import Store, writing_advice
 from .stream import thermometer_words
 from .work import at_rest, change_words, fit, Fitted, plan_for, refined
 from .worker import Calibrations, Compute, Files, Found, Part, Task
-from ..calibrate import (
-    angle_words,
-    Calibration,
-    level,
-    mounting_only,
-    mounting_words,
-    set_heading,
-)
+from ..calibrate import angle_words, Calibration, level, mounting_only, mounting_words, set_heading
 from ..capture import Dwell, poses_from
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..text import counted, now

@@ -32,14 +32,7 @@ from .live_capture import LiveCapture, LONG_REST, overlap
 from .settings import CalibratorSettings, capture_settings, columns_of
 from .stream import StreamStatistics
 from ..calibrate import (
-    Calibration,
-    GyroBias,
-    on_topics,
-    Outside,
-    outside,
-    SampleNoise,
-    thermal_stream,
-)
+    Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, thermal_stream)
 from ..capture import Dwell
 from ..compare import compared, Drift, monitor, rest_errors
 from ..effects import Context, Model, ThermalStream

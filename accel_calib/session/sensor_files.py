@@ -23,12 +23,7 @@ from .store import aside, here, Identity, Store, store_of, writing_advice
 from ..calibrate import Calibration
 from ..disk import remove_leftovers
 from ..errors import (
-    AccelCalibError,
-    crash_words,
-    DamagedCalibrationError,
-    InputError,
-    StoredCalibrationError,
-)
+    AccelCalibError, crash_words, DamagedCalibrationError, InputError, StoredCalibrationError)
 from ..table import Poses
 
 _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

@@ -31,28 +31,10 @@ from .store import Store, writing_advice
 from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
 from .work import plan_for, rated, result_of
 from .worker import (
-    Calibrations,
-    Compute,
-    Event,
-    Files,
-    Log,
-    Mounting,
-    Result,
-    Severity,
-    ShowPoses,
-    Still,
-    Task,
-)
+    Calibrations, Compute, Event, Files, Log, Mounting, Result, Severity, ShowPoses, Still, Task)
 from ..calibrate import (
-    Calibration,
-    FrameName,
-    in_frame,
-    mounting_figures,
-    mounting_of,
-    mounting_words,
-    on_topics,
-    with_given_mounting,
-)
+    Calibration, FrameName, in_frame, mounting_figures, mounting_of, mounting_words, on_topics,
+    with_given_mounting)
 from ..compare import status
 from ..errors import InputError
 from ..findings import rating_json

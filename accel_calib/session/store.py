@@ -31,13 +31,8 @@ import numpy as np
 from ..calibrate import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, write_atomically
 from ..errors import (
-    AccelCalibError,
-    DamagedCalibrationError,
-    FREE_SPACE,
-    InputError,
-    is_full,
-    StoredCalibrationError,
-)
+    AccelCalibError, DamagedCalibrationError, FREE_SPACE, InputError, is_full,
+    StoredCalibrationError)
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses

@@ -15,16 +15,8 @@ from .guidance import FEWEST_IN_CONE, is_partial, Plan
 from .sensor import gyro_bias_of_rest
 from .settings import CalibratorSettings
 from ..calibrate import (
-    Calibration,
-    directions_of,
-    fit_partial,
-    fit_poses,
-    flat_direction,
-    level,
-    lies_in_cone,
-    next_pose,
-    outlook,
-)
+    Calibration, directions_of, fit_partial, fit_poses, flat_direction, level, lies_in_cone,
+    next_pose, outlook)
 from ..capture import Dwell, poses_from
 from ..effects import LADDER, Model
 from ..errors import RefusedFitError

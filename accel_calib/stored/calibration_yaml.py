@@ -24,54 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .plain_yaml import (
-    array_at,
-    choice_at,
-    format_plain,
-    MOST_BYTES,
-    MOST_VALUES,
-    name_at,
-    number_at,
-    read_plain,
-    shown,
-    value_at,
-    values_at,
-)
+    array_at, choice_at, format_plain, MOST_BYTES, MOST_VALUES, name_at, number_at, read_plain,
+    shown, value_at, values_at)
 from .. import __version__
 from ..calibrate import (
-    Calibration,
-    FRAMES,
-    gated,
-    GyroBias,
-    in_g,
-    MODEL_NAMES,
-    mounting_figures,
-    Quality,
-    Rejected,
-    RejectedKind,
-    SampleNoise,
-    STORED_METHODS,
-)
+    Calibration, FRAMES, gated, GyroBias, in_g, MODEL_NAMES, mounting_figures, Quality, Rejected,
+    RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import check_regular, write_atomically
 from ..effects import CHANGES, Effect, effect_named, is_effect, Model, PROCESSES
 from ..errors import (
-    AccelCalibError,
-    DamagedCalibrationError,
-    InputError,
-    RefusedFitError,
-    StoredCalibrationError,
-)
+    AccelCalibError, DamagedCalibrationError, InputError, RefusedFitError, StoredCalibrationError)
 from ..estimate import judge
 from ..finding import Finding, KINDS, LEVELS, without
 from ..table import (
-    Autopilot,
-    check_values,
-    column_of,
-    COLUMNS,
-    Floats,
-    is_quantity,
-    LARGEST,
-    Poses,
-)
+    Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
 from ..units import UNIT_NAMES, Units
 
 _FORMAT = 'accel_calib calibration'

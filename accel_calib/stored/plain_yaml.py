@@ -28,8 +28,7 @@ from yaml.resolver import Resolver
 from ..table import Floats
 
 try:  # eight times as fast, but not in every build of PyYAML
-    from yaml import CSafeDumper as SafeDumper
-    from yaml import CSafeLoader as SafeLoader
+    from yaml import CSafeDumper as SafeDumper, CSafeLoader as SafeLoader
 except ImportError:
     from yaml import SafeDumper, SafeLoader  # type: ignore[assignment]
 

@@ -45,8 +45,8 @@ from accel_calib.stored import read_calibration  # noqa: E402
 from bag_files import a_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
 from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
-from inside import format_calibration, parse_calibration, poses_of  # noqa: E402
-from inside import main as command_line  # noqa: E402
+from inside import (  # noqa: E402
+    format_calibration, main as command_line, parse_calibration, poses_of)
 import numpy as np  # noqa: E402
 
 Rng = np.random.Generator

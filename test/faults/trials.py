@@ -27,8 +27,7 @@ from typing import Any
 
 from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
-from inside import Identity, SensorStore
-from inside import main as command
+from inside import Identity, main as command, SensorStore
 
 KINDS = {'kill': (1, 0), 'torn': (2, 0), 'eio': (3, errno.EIO), 'enospc': (3, errno.ENOSPC)}
 ERRORS = ('eio', 'enospc')

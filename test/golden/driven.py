@@ -18,8 +18,7 @@ from accel_calib.session import CalibratorSettings, checks, Log, Session, ShowPo
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
-from inside import figures as health_figures
-from inside import frame_ids, layout_with, Model, stamps_of
+from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
 import numpy as np
 from shared import answer_of
 

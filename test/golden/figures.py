@@ -9,16 +9,8 @@ from collections.abc import Callable
 from typing import Any
 
 from accel_calib.calibrate import (
-    Calibration,
-    fit_partial,
-    fit_poses,
-    in_g,
-    mounting_only,
-    outlook,
-    outside,
-    verify,
-    with_history,
-)
+    Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify,
+    with_history)
 from accel_calib.compare import monitor
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
@@ -27,17 +19,8 @@ from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    carried,
-    kinds,
-    Linear,
-    Model,
-    probabilities,
-    rotation_free,
-    scatter_of,
-    search_effects,
-    spread_directions,
-    unseen_mistakes,
-)
+    carried, kinds, Linear, Model, probabilities, rotation_free, scatter_of, search_effects,
+    spread_directions, unseen_mistakes)
 import numpy as np
 
 UP = spread_directions(4)

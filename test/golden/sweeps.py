@@ -12,30 +12,12 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibrate import (
-    Calibration,
-    fit_poses,
-    FleetPrior,
-    FRAMES,
-    gated,
-    gyro_bias_of,
-    level,
-    lies_in_cone,
-    next_pose,
-    Rejected,
-    set_heading,
-    with_given_mounting,
-)
+    Calibration, fit_poses, FleetPrior, FRAMES, gated, gyro_bias_of, level, lies_in_cone,
+    next_pose, Rejected, set_heading, with_given_mounting)
 from accel_calib.compare import compare
 from accel_calib.effects import CHANGES, effect_named, EFFECTS, MONOMIALS, PROCESSES
 from accel_calib.estimate import (
-    coverage,
-    dilution,
-    error_left_in,
-    estimate,
-    identifiability,
-    Prior,
-    variance_factor,
-)
+    coverage, dilution, error_left_in, estimate, identifiability, Prior, variance_factor)
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
 from accel_calib.table import check_units, numbered, Poses
@@ -43,37 +25,10 @@ from accel_calib.units import units_of
 from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, those
 from inside import (
-    axes_of,
-    believable,
-    change,
-    distinct,
-    doubts_about_flat,
-    equations,
-    fault_of,
-    is_over,
-    measured,
-    missing_poses,
-    Model,
-    mounting,
-    mounting_figures,
-    on_one_scale,
-    originals,
-    outlier,
-    p_values,
-    posterior,
-    refuse_if_unfit,
-    rounding_left,
-    Runs,
-    sampled,
-    Scatter,
-    shape_words,
-    sound_rows,
-    spread_directions,
-    unit,
-    unseen,
-    with_heading,
-    without_knocked,
-)
+    axes_of, believable, change, distinct, doubts_about_flat, equations, fault_of, is_over,
+    measured, missing_poses, Model, mounting, mounting_figures, on_one_scale, originals, outlier,
+    p_values, posterior, refuse_if_unfit, rounding_left, Runs, sampled, Scatter, shape_words,
+    sound_rows, spread_directions, unit, unseen, with_heading, without_knocked)
 import numpy as np
 
 G, MS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')

@@ -28,28 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .made import (
-    Format,
-    frame_words,
-    head,
-    Made,
-    Options,
-    polynomial,
-    single,
-    steady_at,
-    steady_grid,
-    temperature_range,
-)
+    Format, frame_words, head, Made, Options, polynomial, single, steady_at, steady_grid,
+    temperature_range)
 from ...calibrate import Calibration
 from ...effects import (
-    CUBE,
-    MONOMIALS,
-    ODD_SQUARE,
-    PRODUCT,
-    REFERENCE_TEMPERATURE,
-    SIZE,
-    SQUARE,
-    WAVE,
-)
+    CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE)
 from ...errors import InputError
 from ...table import Floats
 

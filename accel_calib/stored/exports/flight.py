@@ -40,16 +40,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from .made import (
-    commented,
-    Format,
-    Made,
-    Options,
-    polynomial,
-    single,
-    steady_at,
-    steady_grid,
-    temperature_range,
-)
+    commented, Format, Made, Options, polynomial, single, steady_at, steady_grid,
+    temperature_range)
 from ...calibrate import Calibration
 from ...errors import InputError
 from ...logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION

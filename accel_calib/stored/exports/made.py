@@ -25,13 +25,7 @@ import numpy as np
 
 from ...calibrate import Calibration, in_g, uncertainty_g, with_history
 from ...effects import (
-    AtContext,
-    Context,
-    effect_named,
-    Model,
-    NOMINAL_SUPPLY,
-    REFERENCE_TEMPERATURE,
-)
+    AtContext, Context, effect_named, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
 from ...geometry import OVER_THE_SPHERE, spread_directions
 from ...table import Floats
 from ...units import MG, Units

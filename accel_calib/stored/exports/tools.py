@@ -27,18 +27,8 @@ from typing import Any
 import numpy as np
 
 from .made import (
-    about,
-    affine_fit,
-    commented,
-    Correction,
-    difference_mg,
-    Format,
-    frame_words,
-    LEAST_LOSS_MG,
-    Made,
-    plain_text,
-    unit_in_ascii,
-)
+    about, affine_fit, commented, Correction, difference_mg, Format, frame_words, LEAST_LOSS_MG,
+    Made, plain_text, unit_in_ascii)
 from ..calibration_yaml import CORRECTION
 from ... import __version__
 from ...calibrate import Calibration
