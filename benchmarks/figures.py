@@ -49,10 +49,18 @@ def table(lines: Sequence[Line]) -> str:
 
 
 def publish(page: str, path: Path | None) -> None:
-    """Print a page, and write it to the path if there is one."""
+    """Print a page with the commit that it is of, and write it to the path if there is one."""
+    page = f'{page.rstrip()}\n\nMeasured at the commit {commit()}.\n'
     print(page)
     if path is not None:
         path.write_text(page, encoding='utf-8')
+
+
+def commit() -> str:
+    """Return the short name of the commit, with ``-dirty`` if files have changed since."""
+    return subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=7'],
+                          cwd=Path(__file__).parent, check=True, capture_output=True,
+                          text=True).stdout.strip()
 
 
 def processor() -> str:

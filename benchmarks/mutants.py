@@ -36,6 +36,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator, operator_names
 import coverage
+from figures import publish
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings',
@@ -212,9 +213,7 @@ def main() -> None:
                     print(done, rows[-1], flush=True)
     killed_share = 1.0 - (len(rows) - 2) / len(drawn)
     words = (f'{len(drawn)} mutants, seed {options.seed}: {killed_share:.1%} killed')
-    print(words)
-    if options.markdown:
-        options.markdown.write_text('\n'.join((words, '', *rows, '')))
+    publish('\n'.join((words, '', *rows)), options.markdown)
 
 
 if __name__ == '__main__':
