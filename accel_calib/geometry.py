@@ -1,11 +1,12 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rotations as matrices, quaternions, roll, pitch and yaw; directions on the sphere."""
+"""Rotations as matrices, quaternions, roll, pitch and yaw; directions, and attitudes by name."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 import math
 
@@ -92,3 +93,74 @@ ATTITUDES = unit(np.array(sorted((signs for signs in product((0.0, 1.0, -1.0), r
                                   if any(signs)), key=np.count_nonzero)))
 """The 6 faces, 12 edges and 8 corners of a sensor that can point up, in this order: (26, 3) unit
 vectors, whose signs are those of the axes."""
+
+_NEAR = np.cos(np.radians(45.0))
+_COVERAGE_DIRECTIONS = 500
+_SAME = np.cos(np.radians(5.0))
+_NAMED = np.cos(np.radians(8.0))
+"""A direction within 8° of a face, edge or corner has its name."""
+
+_SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
+
+
+def uncovered(directions: Floats) -> Floats:
+    """Return the directions of an even grid that are not within 45° of a pose, (m, 3)."""
+    grid = spread_directions(_COVERAGE_DIRECTIONS)
+    return grid[np.max(grid @ directions.T, axis=1) < _NEAR]
+
+
+def coverage(directions: Floats) -> float:
+    """Return the share of the sphere within 45° of a pose, for (n, 3) unit vectors."""
+    return 1.0 - len(uncovered(directions)) / _COVERAGE_DIRECTIONS
+
+
+def distinct(directions: Floats) -> int:
+    """Return the number of directions at least 5° apart, for (n, 3) unit vectors."""
+    kept: list[Floats] = []
+    for direction in directions:
+        if all(direction @ other < _SAME for other in kept):
+            kept.append(direction)
+    return len(kept)
+
+
+@dataclass(frozen=True)
+class Cone:
+    """The mean direction of poses, a (3,) unit vector, and their largest angle from it [°]."""
+
+    axis: Floats
+    degrees: float
+
+
+def cone_of(directions: Floats) -> Cone:
+    """Return the mean of (n, 3) unit vectors, n >= 1, and their largest angle from it."""
+    axis = unit(directions.mean(axis=0)[np.newaxis])[0]
+    cosine = float(np.clip(np.min(directions @ axis), -1.0, 1.0))
+    return Cone(axis, float(np.degrees(np.arccos(cosine))))
+
+
+def words_of(signs: Floats) -> str:
+    """Return the name of the side, edge or corner with these signs of the axes."""
+    sides = [pair[0 if sign > 0 else 1] for pair, sign in zip(_SIDES, signs, strict=True) if sign]
+    what = {1: 'the {} side', 2: 'the {} {} edge', 3: 'the {} {} {} corner'}[len(sides)]
+    return what.format(*sides)
+
+
+def axes_of_signs(signs: Floats) -> str:
+    """Return the axes of these signs, such as ``+x -y``."""
+    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
+                    for axis, sign in zip('xyz', signs, strict=True) if sign)
+
+
+def attitude_words(up: Floats) -> str:
+    """Return a direction that points up in words: a face, edge or corner, or a tilted face."""
+    near = int(np.argmax(ATTITUDES @ up))
+    if ATTITUDES[near] @ up >= _NAMED:
+        return f'{words_of(np.sign(ATTITUDES[near]))} up ({axes_of_signs(ATTITUDES[near])})'
+    axis = int(np.argmax(np.abs(up)))
+    face = np.sign(up) * (np.arange(3) == axis)
+    flat = unit((up - up[axis] * np.eye(3)[axis])[np.newaxis])[0]
+    edges = ATTITUDES[ATTITUDES[:, axis] == 0.0]
+    raised = edges[int(np.argmax(edges @ flat))]
+    tilt = math.degrees(math.acos(min(abs(float(up[axis])), 1.0)))
+    return (f'{words_of(face)} up ({axes_of_signs(face)}), tilted by {tilt:.0f}° so that '
+            f'{words_of(np.sign(raised))} ({axes_of_signs(raised)}) rises')

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from accel_calib.calibrate import (
-    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows, words_of)
+    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
 from accel_calib.calibrate.known_orientation import axes_of, fault_of
 from accel_calib.calibrate.mounting import (
     doubts_about_flat, mounting, with_heading, with_heading_of)
@@ -42,7 +42,7 @@ from accel_calib.effects import (
     ThermalStream, with_linear_part, with_vector)
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
-from accel_calib.estimate import believable, distinct, kinds, originals, unseen_mistakes
+from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
 from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
@@ -54,7 +54,8 @@ from accel_calib.fleet.sensors import (
     alike, drift_of, estimated, merge_sensor, priors_of, typical_of)
 from accel_calib.fleet.task import schema, write_parquet
 from accel_calib.geometry import (
-    OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit)
+    attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
+    unit, words_of)
 from accel_calib.intake import poses_of
 from accel_calib.live import sources
 from accel_calib.live.messages import (
@@ -84,7 +85,7 @@ from accel_calib.refine.linear import (
 from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
 from accel_calib.refine.sets import accepted, explored, Near, probabilities
-from accel_calib.refine.words import advice_for, attitude_words, verdict_words
+from accel_calib.refine.words import advice_for, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page, linear_figures, page as refinement_page
 from accel_calib.report.repeats import comparison_page

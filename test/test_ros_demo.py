@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from accel_calib.estimate import coverage
+from accel_calib.geometry import coverage
 from faults.sample import FACTOR
 from geometry_msgs.msg import Vector3Stamped
 from inside import DEMO_CHOICES, main

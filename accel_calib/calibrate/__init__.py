@@ -26,7 +26,7 @@ from .mounting import (
     mounting_words, on_topics, set_heading, with_given_mounting)
 from .partial import fit_partial, fit_with_fleet, mounting_only
 from .pose_planning import (
-    determines, lies_in_cone, next_pose, NextPose, Outlook, outlook, refuse_if_unfit, words_of)
+    determines, lies_in_cone, next_pose, NextPose, Outlook, outlook, refuse_if_unfit)
 from .prior import FleetPrior, posterior
 from .quality import (
     errors_after, errors_before, fit_findings, in_g, OF_A_FIT, quality_of, record_of, Verification,
@@ -46,4 +46,4 @@ __all__ = ['BASES', 'FLEET', 'FRAMES', 'LARGEST_OFFSET_G', 'METHODS', 'MODEL_NAM
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
            'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows', 'thermal_stream',
            'uncertainty_g', 'verify', 'with_given_mounting', 'with_history', 'with_previous',
-           'with_rest_noise', 'words_of']
+           'with_rest_noise']

@@ -23,7 +23,7 @@ import numpy as np
 
 from .calibration import Calibration, FLEET, PRIOR, Rejected
 from .fit import deviations_g, finished, sound_rows, sure_rows, uncertainty_g
-from .pose_planning import Cone, cone_of, determines, enumerated, missing_poses, turn_words
+from .pose_planning import determines, enumerated, missing_poses, turn_words
 from .prior import (
     FIRST_NOISE_G, FLEET_NOISE_G, FleetPrior, LARGEST_ERROR_G, most_probable, NAME, PriorFit,
     priors_of, UNLIKE_FLEET)
@@ -33,7 +33,7 @@ from ..effects import AXES, EFFECTS, Model, MODELS, sensor_force
 from ..errors import InputError, RefusedFitError
 from ..estimate import Fit, judge, LARGEST_SHARE, NotConvergedError
 from ..finding import Finding, without
-from ..geometry import unit
+from ..geometry import Cone, cone_of, unit
 from ..table import check_units, Floats, Poses
 from ..text import counted
 from ..units import MG, Units

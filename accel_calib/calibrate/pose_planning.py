@@ -31,11 +31,11 @@ import numpy as np
 from .calibration import Calibration, ORIENTED
 from ..errors import RefusedFitError
 from ..estimate import (
-    Combination, dilution, distinct, error_left_in, Identifiability, identifiability,
-    information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise,
-    poses_needed, relative_weights, rows_of, WEAK_DILUTION)
+    Combination, dilution, error_left_in, Identifiability, identifiability, information_of,
+    LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise, poses_needed,
+    relative_weights, rows_of, WEAK_DILUTION)
 from ..finding import Finding
-from ..geometry import ATTITUDES, OVER_THE_SPHERE, unit
+from ..geometry import ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, words_of
 from ..table import Floats
 from ..text import counted
 from ..units import MG
@@ -51,8 +51,6 @@ _SPARE = 3
 
 _TAKEN = np.cos(np.radians(17.0))
 """An orientation within 17° of a pose counts as taken; its neighbours are 35° away."""
-
-_SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
 
 
 @dataclass(frozen=True)
@@ -115,8 +113,8 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     if up is None or not _helps(name, up, information, count):
         return NextPose(None, _enough(count, error, noise_g), error, count, fits)
     total = count + len(list(_planned(name, directions, information, _SPARE)))
-    return NextPose(up, f'turn the sensor so that {words_of(up)} points up ({_axes(up)})', error,
-                    total, fits)
+    words = f'turn the sensor so that {words_of(up)} points up ({axes_of_signs(up)})'
+    return NextPose(up, words, error, total, fits)
 
 
 def _helps(name: str, up: Floats, information: Floats, count: int) -> bool:
@@ -145,7 +143,7 @@ def _planned(name: str, directions: Floats, information: Floats, spare: int) -> 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
     """Return the sides, edges and corners to point up next, until a model is determined well."""
     information = information_of(name, directions, relative_weights(noise, len(directions)))
-    return [f'{words_of(up)} ({_axes(up)})'
+    return [f'{words_of(up)} ({axes_of_signs(up)})'
             for up in _planned(name, directions, information, 0)]
 
 
@@ -195,19 +193,6 @@ def _enough(count: int, error: float, noise_g: float | None) -> str:
     certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
                else f'{error:.2g} times the noise of a pose')
     return f'more poses no longer help: {count} poses determine |a| to within {certain}'
-
-
-def words_of(signs: Floats) -> str:
-    """Return the name of the side, edge or corner with these signs of the axes."""
-    sides = [pair[0 if sign > 0 else 1] for pair, sign in zip(_SIDES, signs, strict=True) if sign]
-    what = {1: 'the {} side', 2: 'the {} {} edge', 3: 'the {} {} {} corner'}[len(sides)]
-    return what.format(*sides)
-
-
-def _axes(signs: Floats) -> str:
-    """Return the axes of these signs, such as ``+x -y``."""
-    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
-                    for axis, sign in zip('xyz', signs, strict=True) if sign)
 
 
 @dataclass(frozen=True)
@@ -277,21 +262,6 @@ _WIDE = 75.0
 
 _MOST_NAMED = 3
 """Largest number of undetermined combinations in a message."""
-
-
-@dataclass(frozen=True)
-class Cone:
-    """The mean direction of poses, a (3,) unit vector, and their largest angle from it [°]."""
-
-    axis: Floats
-    degrees: float
-
-
-def cone_of(directions: Floats) -> Cone:
-    """Return the mean of (n, 3) unit vectors, n >= 1, and their largest angle from it."""
-    axis = unit(directions.mean(axis=0)[np.newaxis])[0]
-    cosine = float(np.clip(np.min(directions @ axis), -1.0, 1.0))
-    return Cone(axis, float(np.degrees(np.arccos(cosine))))
 
 
 def lies_in_cone(directions: Floats) -> bool:

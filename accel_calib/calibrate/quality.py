@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from .calibration import Calibration, check_sensor, Quality, Rejected
 from .context import with_history
 from ..effects import correct, Model, sensor_force
-from ..estimate import believable, coverage, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
+from ..estimate import believable, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
 from ..finding import Finding
+from ..geometry import coverage
 from ..table import Floats, Poses
 from ..text import listed
 from ..units import MG, Units

@@ -32,8 +32,8 @@ from rich.text import Text
 
 from .frame import Done, Output
 from .terminal import ended
-from ..calibrate import words_of
 from ..errors import InputError, NEEDS_ROS
+from ..geometry import words_of
 from ..units import MG
 
 if TYPE_CHECKING:

@@ -16,18 +16,18 @@ from .closed_form import (
 from .equations import believable, Equations, kinds, originals
 from .fit import estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
-    Combination, coverage, dilution, distinct, error_left_in, free_parameters, Identifiability,
-    identifiability, information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere,
-    pose_noise, poses_needed, relative_weights, rows_of, uncovered, WEAK_DILUTION)
+    Combination, dilution, error_left_in, free_parameters, Identifiability, identifiability,
+    information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise,
+    poses_needed, relative_weights, rows_of, WEAK_DILUTION)
 from .outliers import by_pose, LARGEST_SHARE, outliers_among, variance_factor
 from .robust import covariance_with, fit_norm, outliers, Rival, rivals, start_of, unseen_mistakes
 
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',
            'Prior', 'Rival', 'believable', 'by_pose', 'closed_form', 'covariance_with',
-           'coverage', 'dilution', 'distinct', 'error_left_in', 'estimate', 'faces', 'fit_12',
+           'dilution', 'error_left_in', 'estimate', 'faces', 'fit_12',
            'fit_norm', 'fit_sphere', 'free_parameters', 'identifiability', 'information_of',
            'judge', 'kinds', 'left_out', 'lower_triangular', 'originals', 'outliers',
            'outliers_among', 'over_the_sphere', 'pose_noise', 'poses_needed', 'relative_weights',
-           'rivals', 'rows_of', 'sensing_axes', 'solve', 'start_of', 'uncovered',
+           'rivals', 'rows_of', 'sensing_axes', 'solve', 'start_of',
            'unseen_mistakes', 'variance_factor']

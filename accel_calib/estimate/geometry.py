@@ -33,7 +33,7 @@ import numpy as np
 
 from .equations import believable, LEAST_NOISE
 from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
-from ..geometry import OVER_THE_SPHERE, spread_directions
+from ..geometry import OVER_THE_SPHERE
 from ..table import Floats
 
 LARGEST_DILUTION = 25.0
@@ -54,9 +54,6 @@ WEAK_DILUTION = 10.0
 NORM_MODELS = tuple(name for name, form in MODELS.items() if form.norm == name and form.gains)
 """Models for poses of unknown orientation; the smallest model is first."""
 
-_NEAR = np.cos(np.radians(45.0))
-_COVERAGE_DIRECTIONS = 500
-_SAME = np.cos(np.radians(5.0))
 _SINGULAR, _NOTHING = 1e-6, 1e-14
 
 
@@ -180,26 +177,6 @@ def _pairs_over_the_sphere(name: str) -> Floats:
     around = over_the_sphere(name)
     pairs = np.einsum('mkp,mkq->mpq', around, around)
     return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
-
-
-def coverage(directions: Floats) -> float:
-    """Return the share of the sphere within 45° of a pose, for (n, 3) unit vectors."""
-    return 1.0 - len(uncovered(directions)) / _COVERAGE_DIRECTIONS
-
-
-def uncovered(directions: Floats) -> Floats:
-    """Return the directions of an even grid that are not within 45° of a pose, (m, 3)."""
-    grid = spread_directions(_COVERAGE_DIRECTIONS)
-    return grid[np.max(grid @ directions.T, axis=1) < _NEAR]
-
-
-def distinct(directions: Floats) -> int:
-    """Return the number of directions at least 5° apart, for (n, 3) unit vectors."""
-    kept: list[Floats] = []
-    for direction in directions:
-        if all(direction @ other < _SAME for other in kept):
-            kept.append(direction)
-    return len(kept)
 
 
 _OPEN_PART = 0.1

@@ -14,8 +14,8 @@ from .expected import directions_in, Expected
 from .limits import BAD_ERROR, CHANGED, COVERED, GOOD_ERROR, MATTERS, TILT
 from .rules import degrees, findings_of, mg, number, step_after
 from ..calibrate import Calibration, Verification
-from ..estimate import coverage
 from ..finding import Finding, Level, NextStep, ranked
+from ..geometry import coverage
 from ..table import Poses
 from ..text import counted
 from ..units import MG

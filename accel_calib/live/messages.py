@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibrate import Calibration, words_of
+from ..calibrate import Calibration
 from ..errors import InputError
 from ..findings import residual_figures
+from ..geometry import words_of
 from ..session import checks, Level, Progress, Session, Severity, title, words_of_state
 from ..stored.exports import CALIBRATION_ALONE
 from ..table import Floats

@@ -35,10 +35,10 @@ from numpy.typing import NDArray
 
 from .base import fitted_state, with_effect
 from .sets import LEAST, Near, probabilities
-from .words import attitude_words, condition_words, percent, plan_lines, shown_name, versus
+from .words import condition_words, percent, plan_lines, shown_name, versus
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
-from ..geometry import ATTITUDES, spread_directions
+from ..geometry import attitude_words, ATTITUDES, spread_directions
 from ..table import Floats, is_quantity, Poses
 
 if TYPE_CHECKING:

@@ -6,25 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import words_of
 from ..effects import (
     CHANGES, COVARIATES, effect_named, EMPIRICAL, empirical_parts, is_effect, kind_of, TO_SEPARATE,
     unit_of, value_unit, variable_of, variable_words, WANDER)
-from ..geometry import ATTITUDES, unit
+from ..geometry import axes_of_signs
 from ..table import column_of, Floats, is_quantity
 from ..text import counted, short, with_sd
 
 if TYPE_CHECKING:
     from .result import Refinement, Step
     from .search import Found
-
-_NEAR = math.cos(math.radians(8.0))
-"""A direction within 8° of a face, edge or corner has its name."""
 
 _FAR = 10.0
 """Ratio to the typical size above which there is a remark."""
@@ -169,8 +164,9 @@ def range_words(column: str, ends: tuple[float, float], rms_mg: tuple[float, flo
 
 def direction_words(means: Sequence[tuple[Floats, float, int]], total: int) -> str:
     """Return the mean disagreement around directions, from (signs, mean [mg], poses) of each."""
-    return 'with ' + ', '.join(f'{_axes(signs)} up ({mean:+.2g} mg over {count} of {total} poses)'
-                               for signs, mean, count in means)
+    return 'with ' + ', '.join(
+        f'{axes_of_signs(signs)} up ({mean:+.2g} mg over {count} of {total} poses)'
+        for signs, mean, count in means)
 
 
 def change_words(name: str, values: Floats, deviations: Sequence[float], date: str) -> str:
@@ -344,25 +340,3 @@ def _duration(seconds: float) -> str:
     if seconds < 120.0:
         return f'{seconds:.0f} s'
     return f'{seconds / 60.0:.0f} min' if seconds < 7200.0 else f'{seconds / 3600.0:.1f} h'
-
-
-def attitude_words(up: Floats) -> str:
-    """Return a direction that points up in words: a face, edge or corner, or a tilted face."""
-    known = ATTITUDES
-    near = int(np.argmax(known @ up))
-    if known[near] @ up >= _NEAR:
-        return f'{words_of(np.sign(known[near]))} up ({_axes(known[near])})'
-    axis = int(np.argmax(np.abs(up)))
-    face = np.sign(up) * (np.arange(3) == axis)
-    flat = unit((up - up[axis] * np.eye(3)[axis])[np.newaxis])[0]
-    edges = known[known[:, axis] == 0.0]
-    raised = edges[int(np.argmax(edges @ flat))]
-    tilt = math.degrees(math.acos(min(abs(float(up[axis])), 1.0)))
-    return (f'{words_of(face)} up ({_axes(face)}), tilted by {tilt:.0f}° so that '
-            f'{words_of(np.sign(raised))} ({_axes(raised)}) rises')
-
-
-def _axes(signs: Floats) -> str:
-    """Return the axes of these signs, such as ``+x -y``."""
-    return ' '.join(f'{"+" if sign > 0 else "-"}{axis}'
-                    for axis, sign in zip('xyz', signs, strict=True) if sign)

@@ -26,7 +26,7 @@ import numpy as np
 from .residuals import recorded, Residuals, residuals_of, Variable, variables_of
 from ..calibrate import Calibration
 from ..errors import InputError
-from ..estimate import uncovered
+from ..geometry import uncovered
 from ..table import Floats
 from ..text import milli, percentage, short, with_minus
 

@@ -33,8 +33,8 @@ from ..calibrate import Calibration, mounting_figures, outlook
 from ..effects import (
     AXES, effect_named, EMPIRICAL, empirical_parts, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
-from ..estimate import coverage
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
+from ..geometry import coverage
 from ..refine.words import chance, percent, values_of, verdict_words
 from ..table import Floats
 from ..text import counted, milli, percentage, short, signed, with_minus

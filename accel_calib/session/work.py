@@ -20,9 +20,9 @@ from ..calibrate import (
 from ..capture import Dwell, poses_from
 from ..effects import LADDER, Model
 from ..errors import RefusedFitError
-from ..estimate import coverage, fit_sphere, pose_noise
+from ..estimate import fit_sphere, pose_noise
 from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
-from ..geometry import spread_directions
+from ..geometry import coverage, spread_directions
 from ..refine import PlannedPose, refine, Refinement, refitted
 from ..refine.words import residual_words, shown_name, times_typical, verdict_words
 from ..table import Floats, Poses

@@ -17,9 +17,10 @@ from accel_calib.calibrate import (
 from accel_calib.compare import compare
 from accel_calib.effects import CHANGES, effect_named, EFFECTS, MONOMIALS, PROCESSES
 from accel_calib.estimate import (
-    coverage, dilution, error_left_in, estimate, identifiability, Prior, variance_factor)
+    dilution, error_left_in, estimate, identifiability, Prior, variance_factor)
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
+from accel_calib.geometry import coverage
 from accel_calib.table import check_units, numbered, Poses
 from accel_calib.units import units_of
 from golden.driven import messages
