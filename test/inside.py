@@ -25,7 +25,9 @@ from accel_calib.calibrate.partial import carried
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
 from accel_calib.calibrate.prior import common_sensors, typical_spread, without_knocked
 from accel_calib.capture import rounding_left
-from accel_calib.capture.trend import _long_run as long_run, lines_through
+from accel_calib.capture.chunks import Extremes
+from accel_calib.capture.trend import (
+    _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
@@ -82,9 +84,9 @@ from accel_calib.refine.curves import (
 from accel_calib.refine.linear import (
     _RARE as RARE, Block, candidates, LEVEL as REFINE_LEVEL, Linear, linearised, products_of,
     WORTH)
-from accel_calib.refine.plan import NOTHING as NOTHING_TO_PLAN
+from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
-from accel_calib.refine.sets import accepted, explored, Near, probabilities
+from accel_calib.refine.sets import accepted, explored, Near, probabilities, simpler
 from accel_calib.refine.words import advice_for, verdict_words
 from accel_calib.report.drawings import all_drawings, curve_parts
 from accel_calib.report.page import calibration_page, linear_figures, page as refinement_page

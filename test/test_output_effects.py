@@ -131,6 +131,15 @@ def test_a_grid_is_named_where_the_stated_noise_includes_it():
     assert off_grid(few, model) == (few, None)  # as many poses as values: no gap to explain
 
 
+@pytest.mark.parametrize('apart', [1, 2, 3, (2, 3)])
+def test_the_coarsest_grid_that_holds_the_means_is_that_of_a_table_without_noise(apart):
+    steps = np.random.default_rng(2).choice(np.atleast_1d(apart), (60, 3))
+    reading = 2e-3 * np.cumsum(steps, axis=0)
+    expected = 2e-3 if isinstance(apart, tuple) else 2e-3 * apart
+    poses = Poses({'reading': reading}, np.arange(1, 61))
+    assert grid_step(poses) == pytest.approx(expected)
+
+
 def test_a_table_whose_noise_lacks_the_grid_gets_it():
     poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
     assert poses.noise is not None

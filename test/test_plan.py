@@ -9,9 +9,11 @@ import json
 
 from accel_calib.calibrate import NextPose
 from accel_calib.refine import PlannedPose, refine
+from accel_calib.table import Poses
 from accel_calib.units import units_of
 from generator import Setup, simulate, write_csv
-from inside import attitude_words, Guide, model_with, NOTHING_TO_PLAN, Plan, simulate_poses
+from inside import (
+    attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses)
 import numpy as np
 import pytest
 from shared import random_directions, run
@@ -112,6 +114,17 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
     for pose in planned:
         assert min(abs(pose.context['supply_voltage'] - each)
                    for each in (low, (low + high) / 2.0, high)) < 1e-9
+
+
+@pytest.mark.parametrize(('taken', 'expected'), [
+    ([20.0, 24.0, 30.0], [25.0, 20.0, 30.0, 15.0, 35.0]),
+    ([-30.0, 90.0], [30.0, -30.0, 90.0, -30.0, 90.0]),
+    ([-10.0, np.nan, 60.0], [25.0, -10.0, 60.0, -20.0, 70.0]),
+    ([62.0, 66.0], [64.0, 62.0, 66.0, 60.0, 68.0])])
+def test_temperatures_of_a_plan_are_those_of_the_poses_and_some_beyond(taken, expected):
+    poses = Poses({'reading': np.eye(3)[:len(taken)], 'temperature': np.array(taken)},
+                  np.arange(len(taken)))
+    assert levels_of('temperature', poses) == expected
 
 
 def test_the_poses_of_the_plan_name_the_hidden_effect():

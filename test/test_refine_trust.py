@@ -74,6 +74,17 @@ def test_a_refinement_warns_of_what_a_fit_warns_of(tmp_path, capsys):
     assert set(expected) <= set(found.calibration.warnings)
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_a_refinement_states_the_error_in_an_uncovered_region_as_a_fit_does(seed):
+    rng = np.random.default_rng(seed)
+    near = random_directions(400, rng)
+    poses = poses_of(sensor(rng), rng, near[near[:, 2] > np.cos(np.radians(70.0))][:30])
+    both = fit_poses(poses, G, model='10'), refine(poses, G, base='10').calibration
+    fitted, refined = ([each.text for each in found.noted if each.kind == 'not_covered']
+                       for found in both)
+    assert fitted == refined != []
+
+
 def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsys):
     recording, stored = tmp_path / 'recording.csv', tmp_path / 'calibration.yaml'
     assert main(['simulate', '-o', str(recording), '--recording', '--poses', '1', '--dwell',

@@ -3,15 +3,17 @@
 
 """The linear problem, the search over sets of effects and outliers, and the random walk."""
 
+from dataclasses import replace
 import math
 
 from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
     is_better_than_walk, Linear, linearised, Model, Near, Process, process_of, products_of, RARE,
-    REFINE_LEVEL, SIGNIFICANT, simulate_poses, Walk, walk_beside, WORTH)
+    REFINE_LEVEL, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from shared import random_directions, sensor
 
 COUNT = 60
@@ -192,6 +194,40 @@ def test_an_effect_and_knocked_poses_are_found_together():
     np.testing.assert_allclose(values, hidden['offset_temperature'], atol=3e-5)
 
 
+@pytest.mark.parametrize(('better', 'preferred'), [(1.9, 'quadratic'), (2.1, 'cubic')])
+def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred(
+        better, preferred):
+    def sets_at(side):
+        linear = by_hand(np.array([16.0, 16.0, side, *np.zeros(37)]), np.eye(40)[:, :3],
+                         ('quadratic', 'cubic', 'cubic'))
+        blocks = linear.blocks[0], linear.blocks[1]._replace(columns=slice(1, 3))
+        linear = replace(linear, blocks=blocks)
+        return linear, [linear.set_of((k,)) for k in (0, 1)]
+
+    def beyond(side):
+        one, two = sets_at(side)[1]
+        return two.score - one.score - better
+
+    linear, both = sets_at(brentq(beyond, 0.0, 30.0))
+    assert linear.effects_of(next(accepted(linear, both))) == (preferred,)
+
+
+def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
+    time = np.arange(COUNT) * 30.0
+    size, lag, turn = np.array([4e-4, -4e-4, 4e-4]), 240.0, time / 400.0
+    poses = poses_of({}, time=time, temperature=25.0 + 10.0 * np.sin(turn))
+    behind = np.sin(turn - np.arctan(lag / 400.0)) / np.hypot(1.0, lag / 400.0)
+    poses = poses.with_columns(reading=poses.reading + 10.0 * behind[:, np.newaxis] * size)
+    names = ('cross_coupling', 'offset_temperature', 'temperature_rate', 'quadratic')
+    _, linear = problem_of(poses, *names)
+    chosen = linear.set_of([int(linear.numbers_of[name][0]) for name in names])
+    found, = (each for each in simpler(linear, chosen)
+              if set(linear.effects_of(each)) == {*names} - {'temperature_rate'})
+    shape, = (linear.blocks[each].shape for each in found.blocks
+              if linear.blocks[each].effect == 'offset_temperature')
+    assert shape == pytest.approx([lag, 0.0], rel=0.3)
+
+
 def test_a_pose_that_an_effect_explains_is_not_left_out():
     poses = poses_of({'offset_step': [4e-3, -4e-3, 4e-3, 180.0]})  # before it: 6 poses of 60
     _, linear = problem_of(poses, 'offset_step', 'quadratic', 'offset_drift')
@@ -250,19 +286,30 @@ def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
         assert white.set_of((), (7,)).rss == pytest.approx(expected)
 
 
-def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses():
-    rng = np.random.default_rng(6)
-    process = random_process(15, 4, rng)
-    residual, ratio = rng.normal(size=15), 30.0
-    variance = np.eye(15) + ratio * (process.axes * process.values) @ process.axes.T
-    linear = by_hand(residual, np.eye(15)[:, :1], ['supply_ratio'])
-    walk = Walk(process, ratio, 0.0, 0.0)
-    left, held_out = walk.residuals(linear, linear.set_of())
+@pytest.mark.parametrize('chosen', [(), (0,)])
+def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses(chosen):
+    rng, ratio = np.random.default_rng(6), 30.0
+    base, axes = np.split(np.linalg.qr(rng.normal(size=(15, 5)))[0], [1], axis=1)
+    process = Process(axes, 1.0 / np.arange(1, 5) ** 2)
+    variance = np.eye(15) + ratio * (axes * process.values) @ axes.T
+    both = rng.normal(size=(15, 2))
+    residual, column = np.split(both - base @ (base.T @ both), 2, axis=1)
+    linear = replace(by_hand(residual[:, 0], column, ['supply_ratio']), onto=base)
+    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(linear, linear.set_of(chosen))
+    design = np.column_stack([base, column[:, :len(chosen)]])
+
+    def beside(rows):
+        inverse = np.linalg.inv(variance[np.ix_(rows, rows)])
+        normal = design[rows].T @ inverse
+        return residual[:, 0] - design @ np.linalg.solve(
+            normal @ design[rows], normal @ residual[rows, 0])
+
     for k in range(15):
         others = np.delete(np.arange(15), k)
-        weights = np.linalg.solve(variance[np.ix_(others, others)], variance[others, k])
-        assert held_out[k] == pytest.approx(residual[k] - weights @ residual[others])
-    np.testing.assert_allclose(left, np.linalg.solve(variance, residual))
+        own, row = beside(others), variance[k, others]
+        expected = own[k] - row @ np.linalg.solve(variance[np.ix_(others, others)], own[others])
+        assert held_out[k] == pytest.approx(expected)
+    np.testing.assert_allclose(left, np.linalg.solve(variance, beside(np.arange(15))))
 
 
 def wandering(size_g, seed=3):

@@ -12,7 +12,7 @@ from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.table import Recording
 from accel_calib.units import units_of
-from inside import lines_through, long_run
+from inside import excess_of_means, Extremes, lines_through, long_run, oscillation
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -194,6 +194,38 @@ def test_a_gyro_distinguishes_rests_from_slow_turning_once_its_bias_is_known():
     assert not np.any((poses['time'] > 20.0) & (poses['time'] < 23.0))
 
 
+def test_a_gyro_that_says_turning_overrules_a_steady_reading():
+    rng, limit = np.random.default_rng(3), 6.0 * 1.4826 * 0.1  # [°/s]: 6 times the robust spread
+    excess = [0.1, -0.1, 0.1, -0.1, limit - 0.02, 0.1, -0.1, -limit - 0.02, 0.1, -0.1]
+    readings, rates = [], []
+    for index, each in enumerate(excess):
+        force = [np.sin(0.5 * index), 0.0, np.cos(0.5 * index)]
+        bias = np.array([0.02, -0.01 + np.radians(each), 0.03])
+        readings += [force + 1e-3 * rng.normal(size=(300, 3)), rng.normal(size=(100, 3))]
+        rates += [bias + 1e-4 * rng.normal(size=(300, 3)), rng.normal(size=(100, 3))]
+    poses = captured(np.arange(4000) / 100.0, np.concatenate(readings),
+                     rate=np.concatenate(rates)).poses
+    assert (poses['time'] // 4.0).tolist() == [0, 1, 2, 3, 4, 5, 6, 8, 9]
+
+
+@pytest.mark.parametrize(('noise', 'shift', 'parts'), [
+    (2e-3, 1e-3, 1), (2e-3, 0.012, 2), (1e-4, 0.012, 2)])
+def test_a_knock_separates_dwells_whose_means_differ_by_more_than_the_noise(noise, shift, parts):
+    time, reading = still(5, 12.0, noise=noise)
+    reading[600:] += shift * np.linalg.svd(reading[:1])[2][1]
+    reading[595:605] += 0.3 * np.random.default_rng(1).normal(size=(10, 3))
+    assert len(captured(time, reading).poses) == parts
+
+
+def test_samples_that_repeat_an_extreme_of_an_axis_are_counted_over_blocks():
+    extremes, starts = Extremes(), np.array([0, 4])
+    first = np.array([[1, 1, 0, 1, 1, 0, 0, 0], [-2, 0, -2, 0, -3, -3, -1, 0],
+                      [5, 6, 6, 7, 7, 7, 0, 0.0]])
+    np.testing.assert_array_equal(extremes.repeated(first, starts), [[2, 2, 0], [4, 2, 3]])
+    later = np.array([[1, 0, 0, 1], [-3, 0, -3, -3], [8, 8, 0, 0.0]])
+    np.testing.assert_array_equal(extremes.repeated(later, starts[:1]), [[4, 4, 3]])
+
+
 def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):
     """Return times and readings of a sensor shaken along gravity by this share of |a|."""
     time, reading = still(seed, seconds, rate, noise)
@@ -307,6 +339,28 @@ def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
     shorter = known * [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     np.testing.assert_array_equal(long_run(beyond, sizes), long_run(known, sizes))
     assert long_run(known, sizes) > long_run(shorter, sizes)
+
+
+def test_the_excess_of_a_mean_is_1_for_fewer_than_four_cells_or_without_noise():
+    rng = np.random.default_rng(2)
+    series = np.cumsum(rng.normal(size=(3, 2, 40)), axis=2)
+    series[:, 1, 3:] = 0.0
+    centred = series - series.mean(axis=2, keepdims=True)
+    sizes = np.array([40.0, 3.0])
+    found = excess_of_means(centred, sizes, np.ones((3, 2)))
+    assert found[0] > 3.0
+    assert found[1] == 1.0
+    np.testing.assert_array_equal(excess_of_means(centred, sizes, np.zeros((3, 2))), 1.0)
+
+
+@pytest.mark.parametrize('periods', [2.0, 2.5, 3.0, 11.5])
+def test_waves_of_half_periods_beside_a_slope_are_oscillations(periods):
+    time = np.linspace(-0.5, 0.5, 37)[:-1] + 0.5 / 36
+    wave = np.outer([1.0, -0.3, 0.5], np.cos(2.0 * np.pi * periods * time + 0.4))
+    values = wave + np.outer([5.0, 1.0, 0.0], time) + 7.0
+    assert oscillation(values, 36, np.array([0]))[0] == pytest.approx(1.0)
+    noise = np.random.default_rng(1).normal(size=(3, 36))
+    assert oscillation(noise, 36, np.array([0]))[0] < 0.3
 
 
 def recording(**columns) -> Recording:
