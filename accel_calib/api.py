@@ -190,7 +190,7 @@ def load(path: Source, *, also: Sequence[Effect] = ()) -> Calibration:
     Raises
     ------
     StoredCalibrationError
-        If the file is damaged, is newer than this package, or has implausible values.
+        If the file is damaged, has another version, or has implausible values.
     OSError
         If the file cannot be read.
 

@@ -66,7 +66,7 @@ class RefusedFitError(AccelCalibError):
 
 
 class StoredCalibrationError(AccelCalibError):
-    """A stored calibration is newer than this package, or belongs to another sensor."""
+    """A stored calibration has another version, or belongs to another sensor."""
 
 
 class DamagedCalibrationError(StoredCalibrationError):

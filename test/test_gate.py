@@ -124,8 +124,8 @@ def test_a_file_edited_by_hand_is_used_with_a_warning(calibration):
     assert not has(again.noted, 'edited')
 
 
-def test_calibrations_of_version_1_still_load_and_correct_as_they_did():
-    corrected = json.loads((STORED / 'calibration_1_corrected.json').read_text())
+def test_stored_calibrations_still_load_and_correct_as_they_did():
+    corrected = json.loads((STORED / 'calibration_corrected.json').read_text())
     assert len(corrected) == 4
     context = {'temperature': np.array([22.0]), 'time': np.array([600.0])}
     for name, force in corrected.items():

@@ -39,7 +39,8 @@ def nested(opening: str) -> str:
 
 
 BOMBS: dict[str, tuple[str, str]] = {
-    'lists': (nested('['), 'more than 8 levels'),
+    # libyaml 0.2.6 refuses these itself, before its first event.
+    'lists': (nested('['), 'more than 8 levels|maximum nesting depth'),
     'mappings': (nested('{a: '), 'more than 8 levels'),
     'compact lists': (f'{FIRST}x:\n{"- " * 100_000}1\n', 'more than 8 levels'),
     'compact keys': (f'{FIRST}{"? " * 100_000}1\n', 'a key is a mapping or a list'),
@@ -167,7 +168,9 @@ def test_other_line_ends_do_not_count_as_damage(ending: str, tmp_path: Path) -> 
 
 
 DAMAGE = [
-    ('version: 3\n', 'version: 4\n', 'has version 4, expected 3 or less'),
+    ('version: 3\n', 'version: 4\n', 'has version 4, expected 3; update accel_calib, or fit'),
+    ('version: 3\n', 'version: 2\n', 'has version 2, expected 3; fit the poses again'),
+    ('version: 3\n', 'version: 0\n', 'its version is 0'),
     ('version: 3\n', 'version: x\n', 'is damaged .* expected a whole calibration'),
     ('format: accel_calib calibration', 'format: other', 'is not a calibration of accel_calib'),
     ('frame: ros', 'frame: moon', "frame is 'moon', expected one of"),
@@ -226,11 +229,6 @@ def test_damage_is_refused_in_one_line_that_names_it(old: str, new: str, words: 
     with pytest.raises(StoredCalibrationError, match=words) as refusal:
         parse_calibration(text.replace(old, new, 1), 'x.yaml')
     assert '\n' not in str(refusal.value)
-
-
-def test_the_checksum_is_also_checked_if_the_version_was_changed() -> None:
-    text = intact()[-1].replace('version: 3', 'version: 1', 1)
-    assert has(parse_calibration(text, 'x.yaml').noted, 'edited')
 
 
 def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:

@@ -124,7 +124,7 @@ class Store:
         """
         Return the stored calibration, or None if there is none.
 
-        StoredCalibrationError if it is damaged, newer than this package, for another sensor, or in
+        StoredCalibrationError if it is damaged, of another version, for another sensor, or in
         a unit that cannot be converted. InputError if it is not a regular file.
 
         """

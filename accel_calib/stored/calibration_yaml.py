@@ -34,7 +34,6 @@ from ..disk import check_regular, write_atomically
 from ..effects import CHANGES, Effect, effect_named, is_effect, Model, PROCESSES
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, RefusedFitError, StoredCalibrationError)
-from ..estimate import judge
 from ..finding import Finding, KINDS, LEVELS, without
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
@@ -43,8 +42,7 @@ from ..units import UNIT_NAMES, Units
 _FORMAT = 'accel_calib calibration'
 _FIRST_LINE = f'format: {_FORMAT}'
 _VERSION = 3
-"""Version 1 had no stream and no checksum, and NaN for an undetermined covariance; version 2 had
-findings as text, and no kinds of rejected poses."""
+"""The only version that is read; earlier ones were never released."""
 
 CORRECTION = ('force = transpose(rotation) matrix (reading - offset), plus the effects other than '
               'offset and gain')
@@ -189,12 +187,12 @@ def calibration_from(data: bytes, name: str) -> Calibration:
     _check_known(content, name)
     calibration = _checked(content, name)
     _check_own(calibration, content, name)
-    if (not found and content['version'] == 1) or digest.strip() == _digest(body.rstrip()):
-        return calibration
     if not found:
         raise _damaged(name, 'its last line, the checksum, is missing')
+    if digest.strip() == _digest(body.rstrip()):
+        return calibration
     other = _other_correction(content, calibration, name)
-    _check_keys(_upgraded(content), calibration, name)
+    _check_keys(content, calibration, name)
     return replace(calibration, noted=(*calibration.noted, OF_FILE['edited'], *other))
 
 
@@ -238,22 +236,23 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
 
 
 def _check_version(content: Any, name: str) -> None:
-    """Refuse a calibration of a newer version."""
+    """Refuse a calibration of another version."""
     if not isinstance(content, Mapping):
         raise _damaged(name, 'it is not a YAML mapping')
     version = content.get('version')
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise _damaged(name, f'its version is {shown(version)}')
-    if version > _VERSION:
-        raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION} or less',
-                                     'update accel_calib, or fit again')
+    if version != _VERSION:
+        raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
+                                     'fit the poses again' if version < _VERSION else
+                                     'update accel_calib, or fit the poses again')
 
 
 def _checked(content: Mapping[str, Any], name: str) -> Calibration:
     """Return the calibration with the content of a file, after all checks."""
     try:
         with np.errstate(all='ignore'):  # the checks refuse what is not finite
-            return gated(_calibration(_upgraded(content)))
+            return gated(_calibration(content))
     except RefusedFitError as err:
         raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
                                       err.advice) from err
@@ -297,19 +296,6 @@ def _damaged(name: str, what: str) -> DamagedCalibrationError:
                                    'fit again, or use the previous file (.before)')
 
 
-def _upgraded(content: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the content of an earlier version with records in place of its texts."""
-    if 'findings' in content:
-        return content
-    found = {key: value for key, value in content.items() if key != 'warnings'}
-    found['findings'] = [Finding('note', text).stated
-                         for text in values_at(content, 'warnings', str)]
-    found['rejected'] = [
-        {**each, 'kind': 'outlier' if value_at(each, 'reason', str)[:7] == 'outlier'
-         else 'implausible'} for each in values_at(content, 'rejected', dict)]
-    return found
-
-
 def _calibration(content: Mapping[str, Any]) -> Calibration:
     """Return the record with the content of a file; raise ValueError for an unexpected value."""
     model = Model(_effects(value_at(content, 'effects', dict)),
@@ -318,11 +304,11 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
     rejected = tuple(Rejected(value_at(each, 'row', int), value_at(each, 'reason', str),
                               choice_at(each, 'kind', get_args(RejectedKind)))
                      for each in values_at(content, 'rejected', dict))
-    calibration = Calibration(
+    return Calibration(
         name=choice_at(content, 'model', _NAMES),
         method=choice_at(content, 'method', STORED_METHODS), model=model, units=units,
         sensor=name_at(content, 'sensor', _LONGEST_NAME),
-        stream=name_at({'stream': '', **content}, 'stream', _LONGEST_NAME),
+        stream=name_at(content, 'stream', _LONGEST_NAME),
         frame=choice_at(content, 'frame', FRAMES), date=name_at(content, 'date', _LONGEST_NAME),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(value_at(content, 'quality', dict)),
@@ -330,11 +316,6 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         reason=value_at(content, 'reason', str),
         noted=tuple(map(_finding, values_at(content, 'findings', dict))),
         gyro=_gyro_bias(content), noise=_sample_noise(content))
-    used, finite = calibration.used_poses, np.all(np.isfinite(calibration.covariance))
-    if content['version'] > 1 or finite or not len(used):
-        return calibration
-    fit = judge(Model(model.values), in_g(used, calibration.units))
-    return replace(calibration, covariance=fit.covariance)
 
 
 def _units(stated: Mapping[str, Any]) -> Units:
@@ -381,7 +362,7 @@ def _finding(stated: Mapping[str, Any]) -> Finding:
 
 
 def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
-    """Return the gyro bias; None for files without it, such as those of earlier releases."""
+    """Return the gyro bias; None for files without it."""
     if content.get('gyro_bias') is None:
         return None
     stated = value_at(content, 'gyro_bias', dict)
@@ -445,7 +426,7 @@ def read_calibration(path: Path) -> Calibration:
     InputError
         If the path is a folder, a pipe, a socket or a device.
     StoredCalibrationError
-        If the file is damaged, is newer than this package, or has implausible values.
+        If the file is damaged, has another version, or has implausible values.
     OSError
         If the file cannot be read.
 

@@ -19,7 +19,6 @@ from accel_calib.errors import AccelCalibError
 from accel_calib.logs import read_log, write_table
 from accel_calib.stored import write_calibration
 import bag_files as bags
-from inside import format_calibration, parse_calibration
 from mcap_file import McapFile, STORE
 import numpy as np
 import yaml
@@ -204,9 +203,8 @@ def _wild(rng: Rng) -> str:
 
 @cache
 def intact() -> tuple[str, ...]:
-    """Return texts of stored calibrations, of both versions."""
-    old = [path.read_text() for path in sorted(STORED.glob('calibration_1*.yaml'))]
-    return (*old, *(format_calibration(parse_calibration(text, 'x.yaml')) for text in old))
+    """Return texts of stored calibrations."""
+    return tuple(path.read_text() for path in sorted(STORED.glob('calibration_*.yaml')))
 
 
 def random_trees() -> Callable[[Rng], Files]:
