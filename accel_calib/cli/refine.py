@@ -21,7 +21,8 @@ from ..intake import Intake
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
 from ..report import write_figures, write_page
-from ..stored import write_calibration, write_plan
+from ..stored import write_calibration
+from ..stored.exports import write_plan
 from ..text import counted, listed, now, short
 
 

@@ -8,8 +8,8 @@ Files of this package: calibrations and what a fleet of sensors has in common.
 
 """
 
-from .calibration_yaml import calibration_bytes, OF_FILE, read_calibration, write_calibration
-from .fleet_and_plan import read_prior, write_plan, write_priors
+from .calibration_yaml import (
+    calibration_bytes, OF_FILE, read_calibration, read_prior, write_calibration, write_priors)
 
 __all__ = ['OF_FILE', 'calibration_bytes', 'read_calibration', 'read_prior', 'write_calibration',
-           'write_plan', 'write_priors']
+           'write_priors']

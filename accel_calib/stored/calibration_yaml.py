@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Stored calibrations: readable, versioned YAML.
+Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
 `calibration_bytes` and `calibration_from` convert between records and the content of files. Only
 `write_calibration` and `read_calibration` access the disk. The reader bounds size and nesting
@@ -22,18 +22,21 @@ from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+import yaml
 
 from .plain_yaml import (
     array_at, choice_at, format_plain, MOST_BYTES, MOST_VALUES, name_at, number_at, read_plain,
     shown, value_at, values_at)
 from .. import __version__
 from ..calibrate import (
-    Calibration, FRAMES, gated, GyroBias, in_g, MODEL_NAMES, mounting_figures, Quality, Rejected,
-    RejectedKind, SampleNoise, STORED_METHODS)
+    Calibration, FleetPrior, FRAMES, gated, GyroBias, in_g, LARGEST_OFFSET_G, MODEL_NAMES,
+    mounting_figures, Quality, Rejected, RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import check_regular, write_atomically
-from ..effects import CHANGES, Effect, effect_named, is_effect, Model, PROCESSES
+from ..effects import (
+    CHANGES, Effect, effect_named, is_effect, Model, MODELS, parameter_names, PROCESSES)
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, RefusedFitError, StoredCalibrationError)
+from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
@@ -450,3 +453,74 @@ def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool
     """
     data = calibration_bytes(calibration)
     write_atomically(path, lambda file: file.buffer.write(data), keep_before=keep_before)
+
+
+# ------------------------------------------------------------- typical values of a fleet
+
+_PRIORS = 1
+"""Format of a file of typical values."""
+
+_PRIOR_NAMES = parameter_names(MODELS['10'].effects)
+
+
+def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
+    """Write typical values as YAML; raise OSError if the file cannot be written."""
+    models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': list(_PRIOR_NAMES),
+               'mean': fleet.prior.mean.tolist(),
+               'sd': np.sqrt(np.diag(fleet.prior.covariance)).tolist(),
+               'covariance': fleet.prior.covariance.tolist()} for fleet in priors.values()]
+    content = {'format': _PRIORS, 'values_of': 'model 10 at |force| = 1 g', 'unit': 'g',
+               'models': models}
+    write_atomically(path, lambda file: yaml.safe_dump(content, file, sort_keys=False,
+                                                       allow_unicode=True, width=99))
+
+
+def read_prior(path: Path, model: str = '') -> FleetPrior:
+    """
+    Read the typical values of one model of sensor.
+
+    Parameters
+    ----------
+    path : Path
+        File as `write_priors` writes it.
+    model : str
+        Model of the sensor; empty: the only one in the file.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, is newer, or has not this model.
+    OSError
+        If the file cannot be read.
+
+    """
+    try:
+        content = read_plain(path.read_text(encoding='utf-8'))
+        if content['format'] != _PRIORS:
+            raise InputError(f'{path} has format {content["format"]}, expected {_PRIORS}',
+                             'update accel_calib, or make the file again')
+        found = [_fleet_of(each) for each in values_at(content, 'models', dict)]
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
+        raise InputError(f'{path} has no typical values of a fleet: {err}',
+                         'use fleet.yaml of accel-calib fleet') from err
+    chosen = [each for each in found if each.model == model or (not model and len(found) == 1)]
+    if not chosen:
+        names = ', '.join(each.model or "''" for each in found) or 'no model'
+        raise InputError(f'{path} has {names}, expected the model {model!r}',
+                         'set --sensor-model to a model in the file')
+    return chosen[0]
+
+
+def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
+    """Return typical values from their mapping; raise ValueError if they are not sound."""
+    size = len(_PRIOR_NAMES)
+    if tuple(content['names']) != _PRIOR_NAMES:
+        raise ValueError(f'names are {content["names"]}, expected {list(_PRIOR_NAMES)}')
+    covariance = array_at(content, 'covariance', (size, size), most=LARGEST_OFFSET_G)
+    if not np.allclose(covariance, covariance.T):
+        raise ValueError('covariance is not symmetric')
+    prior = Prior(array_at(content, 'mean', (size,), most=LARGEST_OFFSET_G), covariance)
+    _ = prior.whitening  # raises LinAlgError unless it is positive definite
+    if (sensors := value_at(content, 'sensors', int)) < 1:
+        raise ValueError(f'sensors is {sensors}, expected 1 or more')
+    return FleetPrior(str(content['model']), sensors, prior)

@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Files of other tools: imu_calib, imucal, Kalibr and VINS; JSON and NumPy.
+Exports of a calibration to the places where it is used, and the plan of poses as CSV.
+
+`FORMATS` is the list of formats and `export` makes the file of one of them. What a format does not
+hold is measured (`.made`) and returned with the file. `.c_header` and `.flight_controllers` make
+headers and parameters; the other files are made here:
 
 ========= ================================================ ==================================
 format    equation                                         source
@@ -19,23 +23,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+import csv
+from dataclasses import dataclass, field
 import io
 import json
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TextIO, TYPE_CHECKING
 
 import numpy as np
 
+from . import c_header, flight_controllers
+from .c_header import identifier
+from .calibration_yaml import CORRECTION
 from .made import (
     about, affine_fit, commented, Correction, difference_mg, Format, frame_words, LEAST_LOSS_MG,
-    Made, plain_text, unit_in_ascii)
-from ..calibration_yaml import CORRECTION
-from ... import __version__
-from ...calibrate import Calibration
-from ...disk import check_regular
-from ...errors import InputError
-from ...table import Floats
-from ...units import STANDARD_GRAVITY
+    Loss, losses_of, Made, Options, plain_text, unit_in_ascii)
+from .. import __version__
+from ..calibrate import Calibration
+from ..disk import check_regular, write_atomically
+from ..errors import InputError
+from ..table import Floats
+from ..units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from ..refine import PosePlan
+
+__all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Exported', 'Format', 'Loss', 'Noise', 'Options',
+           'export', 'identifier', 'read_noise', 'write_plan']
 
 _IMU_CALIB_URL = ('https://github.com/dpkoch/imu_calib/blob/master/src/accel_calib/'
                   'accel_calib.cpp')
@@ -57,6 +72,11 @@ _VINS = {'acc_n': ('accelerometer_noise_density', 'm/s^2'),
          'acc_w': ('accelerometer_random_walk', 'm/s^3'),
          'gyr_w': ('gyroscope_random_walk', 'rad/s^2')}
 """Keys of VINS, with the figure of the noise and its unit for one sample."""
+
+_CONTEXT = {'temperature': ('temperature', 1.0), 'supply_voltage': ('supply_voltage', 1.0),
+            'std': ('vibration', STANDARD_GRAVITY), 'time': ('wait', 1.0)}
+"""Column of the plan and its unit, by column of the poses: °C, V, m/s², s after the last pose.
+Quantities keep their name."""
 
 Noise = Mapping[str, Any]
 
@@ -271,7 +291,8 @@ def read_noise(path: Path) -> Noise:
     return content
 
 
-FORMATS = {
+FORMATS: Mapping[str, Format] = MappingProxyType({
+    **c_header.FORMATS, **flight_controllers.FORMATS,
     'imu_calib': Format('imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package',
                         _make_imu_calib, source=_IMU_CALIB_URL),
     'imucal': Format('imucal', '_imucal.json', 'FerrarisCalibrationInfo as JSON', _make_imucal,
@@ -281,4 +302,104 @@ FORMATS = {
     'vins': Format('VINS', '_vins.yaml', 'lines of the noise for its configuration', _make_vins,
                    'noise', _VINS_URL),
     'json': Format('JSON', '.json', 'all values', _make_json),
-    'npz': Format('NumPy', '.npz', 'all values as arrays', _make_npz)}
+    'npz': Format('NumPy', '.npz', 'all values as arrays', _make_npz)})
+"""The formats by name."""
+
+CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs != 'noise')
+"""Formats that need nothing but the calibration."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """
+    The file of an export, and the end of its name.
+
+    `leaves_mg` is the RMS difference to the full correction over the sphere, without the mounting
+    [mg], `details` what the format does not hold, by effect, and `notes` what the user has to do.
+
+    """
+
+    text_or_bytes: str | bytes
+    suffix: str
+    leaves_mg: float
+    details: tuple[Loss, ...] = field(default=(), repr=False)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Return what the format does not hold, with numbers; one line each."""
+        return tuple(loss.words for loss in self.details)
+
+    @property
+    def data(self) -> bytes:
+        """Return the content as bytes."""
+        content = self.text_or_bytes
+        return content.encode() if isinstance(content, str) else content
+
+    def write(self, file: TextIO) -> None:
+        """Write the content to an open file."""
+        file.buffer.write(self.data)
+
+
+def export(calibration: Calibration, to: str, noise: Noise | None = None,
+           options: Options = Options()) -> Exported:
+    """
+    Return the file of a calibration in another format, and what it does not hold.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    to : str
+        One of `FORMATS`.
+    noise : mapping, optional
+        Noise of the sensor (`read_noise`), for ``kalibr`` and ``vins``.
+    options : Options
+        Choices that some formats have.
+
+    Raises
+    ------
+    InputError
+        If the format cannot hold the calibration at all, or needs what is not given.
+    ValueError
+        If there is no such format.
+
+    """
+    if to not in FORMATS:
+        raise ValueError(f'format is {to!r}, expected one of {", ".join(FORMATS)}')
+    chosen = FORMATS[to]
+    beside = {'': (), 'options': (options,), 'noise': (noise,)}[chosen.needs]
+
+    def make(of: Calibration) -> Made:
+        return chosen.make(of, *beside)
+
+    made = make(calibration)
+    return Exported(made.content, chosen.suffix, difference_mg(calibration, made),
+                    losses_of(calibration, chosen.label, make, made), made.notes)
+
+
+def write_plan(path: Path, plan: PosePlan) -> None:
+    """
+    Write the poses of a plan; the direction that points up is a unit vector in the sensor axes.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written. An earlier file is then unchanged.
+
+    """
+    columns = {**{key: (key, 1.0) for pose in plan.poses for key in pose.context}, **_CONTEXT}
+
+    def write(file: TextIO) -> None:
+        file.writelines(f'# {line}\n' for line in plan.lines)
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
+                         *(name for name, _ in columns.values()), 'separates',
+                         'expected_probability'])
+        for number, pose in enumerate(plan.poses, 1):
+            context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
+                       for key, (_, scale) in columns.items()]
+            writer.writerow([number, *(f'{part:.6f}' for part in pose.up), pose.words, *context,
+                             ' / '.join(pose.separates), f'{pose.expected:.4f}'])
+
+    write_atomically(path, write)

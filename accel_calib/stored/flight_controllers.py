@@ -42,11 +42,11 @@ from numpy.polynomial import Polynomial
 from .made import (
     commented, Format, Made, Options, polynomial, single, steady_at, steady_grid,
     temperature_range)
-from ...calibrate import Calibration
-from ...errors import InputError
-from ...logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
-from ...table import Autopilot, Firmware, Floats
-from ...units import STANDARD_GRAVITY
+from ..calibrate import Calibration
+from ..errors import InputError
+from ..logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
+from ..table import Autopilot, Firmware, Floats
+from ..units import STANDARD_GRAVITY
 
 _PX4_URL = ('https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/'
             'Accelerometer.hpp')

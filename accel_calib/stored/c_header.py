@@ -30,11 +30,11 @@ from numpy.typing import NDArray
 from .made import (
     Format, frame_words, head, Made, Options, polynomial, single, steady_at, steady_grid,
     temperature_range)
-from ...calibrate import Calibration
-from ...effects import (
+from ..calibrate import Calibration
+from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE)
-from ...errors import InputError
-from ...table import Floats
+from ..errors import InputError
+from ..table import Floats
 
 _LARGEST_DEGREE = 10
 _SMALL_G = 1e-7

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from ...calibrate import Calibration, in_g, uncertainty_g, with_history
-from ...effects import (
+from ..calibrate import Calibration, in_g, uncertainty_g, with_history
+from ..effects import (
     AtContext, Context, effect_named, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
-from ...geometry import OVER_THE_SPHERE, spread_directions
-from ...table import Floats
-from ...units import MG, Units
+from ..geometry import OVER_THE_SPHERE, spread_directions
+from ..table import Floats
+from ..units import MG, Units
 
 Correction = Callable[[Floats, Floats], Floats]
 """(n, 3) readings in the unit of the calibration, (n,) temperatures [°C] -> (n, 3) force [g]."""
