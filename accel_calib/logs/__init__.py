@@ -6,24 +6,25 @@ Reader of logs: text of any dialect, bags, flight logs of PX4 and ArduPilot, and
 
 `open_log` recognises the format, the columns and the units. What it assumed is one line,
 `OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `serialized` defines the places of
-the fields in serialized messages, and `tables` writes our own tables.
+the fields in serialized messages.
 
 """
 
 from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
-from .bag import Bag, damage_as_input_error, is_bag, open_bag
+from .bag import Bag, damage_as_input_error, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
 from .containers import Frame, Piped
-from .formats import NAMES
+from .names import NAMES
 from .quantities import are_samples, are_untimed_samples
-from .read import LineReader, Log, open_log, OpenLog, Progress, read_log, read_recording
+from .read import (
+    is_bag, LineReader, Log, open_log, OpenLog, Progress, read_log, read_poses, read_recording,
+    write_blocks, write_table)
 from .serialized import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
     NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed, samples_of, STAMP,
     STAMP_AT, THREE)
-from .tables import read_poses, write_blocks, write_table
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'IMU_DOUBLES',

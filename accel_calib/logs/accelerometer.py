@@ -23,9 +23,8 @@ from typing import cast, Literal
 
 import numpy as np
 
-from . import formats
 from .columns import Chosen, LogOptions
-from .names import READING, unit_of
+from .names import READING, record_instead, unit_of
 from ..errors import InputError
 from ..table import Floats
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
@@ -218,7 +217,7 @@ def _check_gravity(columns: Chosen, rests: Rests, units: Units | None) -> None:
     if (units is not None and units.is_native) or not rests.lack_gravity(per_g):
         return
     layout = columns.layout
-    instead = formats.record_instead(layout.header, layout.path)
+    instead = record_instead(layout.header, layout.path)
     raise InputError(f'{layout.path} holds linear acceleration, gravity removed: the readings at '
                      f'rest have a length of {rests.length:.3g}, expected 1 g',
                      instead or 'record the acceleration with gravity, often called raw or total '

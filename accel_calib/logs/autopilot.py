@@ -33,16 +33,23 @@ undoes all of this, so that readings, and the parameters made from them, are tho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry import rotation_from_rpy
-from ..table import COLUMNS, Floats
+from ..table import Autopilot, COLUMNS, columns_from, Floats, numbered, Recording
+from ..text import counted, some
+
+AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
+
+DENSE_HZ = 5.0
+"""Samples per second below which another message is preferred."""
 
 ARDUPILOT_REFERENCE = 35.0
 """Temperature about which the polynomial of ArduPilot is [°C]."""
@@ -79,7 +86,7 @@ _AT_BOOT = re.compile(r'AHRS_|CUST_ROT')
 """Parameters that take effect when the vehicle is booted again."""
 
 _TURNS = re.compile('ROT|ORIENTATION|BOARD')
-_SLOTS = range(4)
+_SLOTS, _THERMAL = range(4), 'TC_A'
 _ARDUPILOT_INSTANCES = (1, 2, 3)
 _NAMED = 3
 
@@ -215,22 +222,15 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
     return found
 
 
-def px4_slot(parameters: Parameters, device: int) -> int | None:
-    """Return n of CAL_ACCn of a device; None if PX4 has no calibration of it."""
-    for _, values in parameters.spans():
-        for slot in _SLOTS:
-            if device and values.get(f'CAL_ACC{slot}_ID') == device:
-                return slot
-    return None
+def px4_slot(parameters: Parameters, device: int, name: str = 'CAL_ACC') -> int | None:
+    """Return n of CAL_ACCn or TC_An of a device; None if PX4 has none of it in use."""
+    return next((slot for _, values in parameters.spans() for slot in _slots(values, device, name)
+                 if device), None)
 
 
-def px4_thermal_slot(parameters: Parameters, device: int) -> int | None:
-    """Return n of TC_An of a device; None if PX4 has no thermal calibration of it in use."""
-    for _, values in parameters.spans():
-        for slot in _SLOTS if values.get('TC_A_ENABLE') == 1 else ():
-            if device and values.get(f'TC_A{slot}_ID') == device:
-                return slot
-    return None
+def _slots(values: Values, device: int, name: str) -> list[int]:
+    used = name != _THERMAL or values.get('TC_A_ENABLE') == 1
+    return [slot for slot in _SLOTS if used and values.get(f'{name}{slot}_ID') == device]
 
 
 def px4_correction(parameters: Parameters, device: int, release: tuple[int, int] | None
@@ -260,10 +260,10 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
 
 def _px4_thermal(parameters: Parameters, values: Values, device: int
                  ) -> tuple[Floats, Floats, float, tuple[float, float]]:
-    slots = [slot for slot in _SLOTS if values.get(f'TC_A{slot}_ID') == device]
-    if not slots or values.get('TC_A_ENABLE') != 1:
+    slots = _slots(values, device, _THERMAL)
+    if not slots:
         return np.zeros(3), np.zeros((DEGREE, 3)), 0.0, (0.0, 0.0)
-    start = f'TC_A{slots[0]}_'
+    start = f'{_THERMAL}{slots[0]}_'
     constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
                                     for axis in range(3)]) for order in range(DEGREE + 1))
     return (constant, np.array(thermal), float(values.get(f'{start}TREF', 25.0)),
@@ -290,8 +290,7 @@ def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
                        _ardupilot_rotation(parameters, values))
         # The firmware adds the polynomial at CALTEMP, so that it is zero there.
         at_offset = float(values.get(f'INS_ACC{instance}_CALTEMP', -300.0))
-        return ByAxis(offset - found.moved(at_offset), scale, thermal, ARDUPILOT_REFERENCE,
-                      limits, found.rotation)
+        return replace(found, offset=offset - found.moved(at_offset))
 
     return correction
 
@@ -330,3 +329,181 @@ def _scale(scale: Floats) -> Floats:
 
 def _unknown(why: str) -> InputError:
     return InputError(why, 'record a log with all parameters')
+
+
+# ------------------------------------------------------------------------- messages of a log
+
+@dataclass(frozen=True)
+class Message:
+    """The samples of one message of one sensor: fields by the names of the log, and time [s]."""
+
+    name: str
+    instance: int
+    fields: Mapping[str, NDArray[Any]]
+    time: Floats
+
+    @property
+    def rate_hz(self) -> float:
+        """Return the samples per second; 0 for less than two samples."""
+        span = float(np.ptp(self.time)) if len(self.time) > 1 else 0.0
+        return (len(self.time) - 1) / span if span > 0.0 else 0.0
+
+    def __str__(self) -> str:
+        return f'{self.name} {self.instance}'
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """
+    The samples of one sensor of a flight log, in m/s².
+
+    Columns have the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has them
+    ``gx,gy,gz`` [rad/s] and ``temperature`` [°C]. The sensor is message and number, such as
+    ``sensor_accel 0``. Notes state what was not used, and what to know of the readings.
+
+    """
+
+    columns: Mapping[str, Floats]
+    sensor: str
+    read_as: str
+    autopilot: Autopilot
+    notes: tuple[str, ...] = ()
+
+    def recording(self, source: str) -> Recording:
+        """Return the samples as a recording; a number that is not finite is an InputError."""
+        columns = columns_from(self.columns, ('time', 'reading'), source)
+        return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
+
+
+@dataclass(frozen=True)
+class AsSensed:
+    """Columns of a flight log without the correction of the vehicle, if that is known."""
+
+    columns: Mapping[str, Floats]
+    autopilot: Autopilot
+    turned: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: Autopilot,
+              correction: Callable[[], Correction], advice: str) -> AsSensed:
+    """Return columns without the correction, or as they are with a note why that is not known."""
+    try:
+        raw = raw_columns(columns, parameters, correction())
+    except InputError as err:
+        return AsSensed(columns, replace(autopilot, corrected=err.message), notes=(
+            f'readings are left as the vehicle corrected them ({err.message}), so do not load an '
+            f'export of their calibration into it; {advice}',))
+    undone = (f'the correction by the vehicle is undone: {parameters.words}',)
+    return AsSensed(raw, autopilot, parameters.turned, undone if parameters.words else ())
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    The message to read, and all messages of the log that matter.
+
+    `preferred` are the names of those with accelerations, the best first; `name` is that of the
+    sensor, if the user states one.
+
+    """
+
+    message: Message
+    found: Sequence[Message]
+    preferred: Sequence[str]
+    name: str
+
+    def log(self, kind: str, found: AsSensed, temperature: str, notes: Iterable[str]
+            ) -> FlightLog:
+        """Return the log; `temperature` describes that column, if there is one."""
+        chosen = self.message
+        axes = ('axes of the sensor, before the rotation of the board' if found.turned else
+                'x forward, y right, z down')
+        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
+        if 'temperature' in found.columns:
+            read_as += f', {temperature}'
+        return FlightLog(found.columns, self.name or str(chosen), read_as, found.autopilot,
+                         (*notes, *found.notes))
+
+    def others(self) -> list[str]:
+        """Return notes on the other sensors of the same message, and on other messages."""
+        chosen, notes = self.message, []
+        usable = [message for message in self.found if len(message.time)]
+        rest = [message for message in usable
+                if message.name == chosen.name and message.instance != chosen.instance]
+        other = [message for message in usable
+                 if message.name in self.preferred and message.name != chosen.name]
+        if rest:
+            notes.append(f'{chosen} is read; other sensors: {some(rest)} '
+                         f'(--sensor {rest[0].instance})')
+        if other:
+            names = ', '.join(dict.fromkeys(f'{message.name} ({message.rate_hz:.3g} Hz)'
+                                            for message in other
+                                            if message.instance == other[0].instance))
+            notes.append(f'not used: {names} (--topic {other[0].name})')
+        return notes
+
+    def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
+              ) -> dict[str, Floats]:
+        """Return the angular rates of the first source with these fields that is as dense."""
+        for message in sources:
+            if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields):
+                rates = taken(message.fields, RATES, names)
+                if finite(*rates.values()):
+                    return {key: at(time, message, values) for key, values in rates.items()}
+        return {}
+
+
+def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
+           source: str) -> Choice:
+    """
+    Return the message to read, from those `found`; raise InputError if there is none.
+
+    `topic` is the name of the message; empty: the first of `preferred` that is dense. `sensor` is
+    the number of the sensor, alone or after the name of its message; any other text is a name for
+    the sensor, and does not choose.
+
+    """
+    usable = [message for message in found if message.name in preferred and len(message.time)]
+    if not usable:
+        raise InputError(f'{source} has none of the messages {", ".join(preferred)}, expected one '
+                         'with accelerations', 'log the accelerometer, see docs/log_formats.md')
+    chooses = sensor.isdecimal() or sensor in map(str, found)
+    number = sensor if chooses else ''
+    wanted = [message for message in usable if topic in ('', message.name)
+              and number in ('', str(message.instance), str(message))]
+    if not wanted:
+        raise InputError(f'{source} has {some(usable)}, expected '
+                         f'{" ".join(filter(None, (topic or "a message", number)))}',
+                         'name one of these, for example --topic '
+                         f'{usable[0].name} --sensor {usable[0].instance}')
+    order = sorted(wanted, key=lambda message: (preferred.index(message.name), message.instance))
+    dense = [message for message in order if message.rate_hz >= DENSE_HZ]
+    best = dense[0] if dense else max(order, key=lambda message: message.rate_hz)
+    return Choice(best, found, preferred, '' if chooses else sensor)
+
+
+def taken(fields: Mapping[str, NDArray[Any]], keys: Sequence[str], names: Sequence[str]
+          ) -> dict[str, Floats]:
+    """Return the first fields as floats under our names."""
+    return {key: np.asarray(fields[name], float) for key, name in zip(keys, names)}
+
+
+def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
+    """Return values of another message at these times, interpolated; the ends are held."""
+    order = np.argsort(source.time, kind='stable')
+    return np.interp(time, source.time[order], values[order].astype(float))
+
+
+def finite(*columns: NDArray[Any]) -> bool:
+    """Return whether there are values and all are finite numbers."""
+    return all(len(values) > 0 and bool(np.all(np.isfinite(values))) for values in columns)
+
+
+def sound(message: Message, columns: Mapping[str, Floats], why: str,
+          valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
+    """Return the valid rows whose values are all finite, and a note on the others."""
+    valid = valid & np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    dropped = int(np.sum(~valid))
+    notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
+    return {key: values[valid] for key, values in columns.items()}, notes

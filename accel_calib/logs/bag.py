@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 IMU = 'sensor_msgs/msg/Imu'
-SUFFIXES = ('.bag', '.mcap', '.db3')
 BLOCK = 4096
 """Number of messages per block; a block fits in the cache of the processor."""
 
@@ -60,11 +59,6 @@ _TIMES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfa
 
 Received = tuple['Connection', int, bytes]
 """Connection, time of receipt [ns] and serialized message."""
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a path names a bag rather than a table."""
-    return path.is_dir() or path.suffix in SUFFIXES
 
 
 @dataclass(frozen=True)

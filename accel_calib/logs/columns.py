@@ -4,11 +4,10 @@
 """
 Columns of a text log: which column of a header holds which of our columns.
 
-What the user names goes first, then our own names, then the maker's layout
-(`accel_calib.logs.formats`), then the table of names (`accel_calib.logs.names`). A table without
-header is read by the number of its columns. Two accelerometers that the names cannot tell apart
-are an error, because a wrong choice would give a wrong calibration. Other columns are used only
-where they are plain.
+What the user names goes first, then our own names, then the maker's layout, then the words of
+other names (`accel_calib.logs.names`). A table without header is read by the number of its
+columns. Two accelerometers that the names cannot tell apart are an error, because a wrong choice
+would give a wrong calibration. Other columns are used only where they are plain.
 
 """
 
@@ -21,11 +20,10 @@ from typing import Literal
 
 import numpy as np
 
-from . import formats
 from .dialect import is_clock, is_number, Layout, shown
 from .names import (
-    BARE, bare_name, COUNTERS, is_unit, LINEAR_WORDS, may_cause, meaning, OURS, RATE, READING,
-    unit_of, WHOLE_WORDS, WORDS)
+    BARE, bare_name, check_sensor, COUNTERS, format_named, is_unit, LINEAR_WORDS, LogFormat,
+    may_cause, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
@@ -55,7 +53,7 @@ class LogOptions:
         Columns of a text log under our names: a name in the header or a number from 1, such as
         ``{'time': 'timestamp_ms', 'ax': 'accX'}``. An empty text leaves a column out.
     format : str
-        Name of a maker's layout, from `accel_calib.logs.formats.NAMES`.
+        Name of a maker's layout, from `accel_calib.logs.NAMES`.
     skip_bad : bool
         Whether lines that cannot be read are skipped, rather than an error.
     rate : float or None
@@ -109,7 +107,7 @@ class Chosen:
 
     layout: Layout
     sources: Mapping[str, Source]
-    maker: formats.LogFormat | None
+    maker: LogFormat | None
     numeric: tuple[int, ...]
     text: tuple[int, ...]
     quantities: Mapping[str, int]
@@ -149,7 +147,7 @@ def is_log_header(cells: Sequence[str], options: LogOptions) -> bool:
     if theirs:
         return {cell.casefold() for cell in cells}.issuperset(theirs)
     return (set(READING) <= set(cells) or bool(_triples('reading', cells) or _bare(cells))
-            or formats.recognise(cells[:MOST]) is not None)
+            or recognise(cells[:MOST]) is not None)
 
 
 def chosen(layout: Layout, options: LogOptions) -> Chosen:
@@ -161,16 +159,16 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     """
     header, maker = layout.header, None
     if options.format:
-        maker = formats.named(options.format, header, str(layout.path))
+        maker = format_named(options.format, header, str(layout.path))
     else:
-        maker = formats.recognise(header[:MOST])
+        maker = recognise(header[:MOST])
         # Our own names go first, unless the maker's layout says that they are other columns.
         if maker is not None and set(READING) <= {*header} and not {*READING} <= {*maker.marks}:
             maker = None
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
         return with_indices(layout, _counted(layout, options, sources(layout, given)))
-    formats.check_sensor(header, layout.path)
+    check_sensor(header, layout.path)
     found = sources(layout, {**maker.present(header), **given})
     for ours, theirs in maker.divisors.items():
         found[f'{ours}/'] = column(layout, theirs)
@@ -188,7 +186,7 @@ def _counted(layout: Layout, options: LogOptions, found: dict[str, Source]) -> d
 
 
 def with_indices(layout: Layout, sources: Mapping[str, Source],
-                 maker: formats.LogFormat | None = None) -> Chosen:
+                 maker: LogFormat | None = None) -> Chosen:
     """Return the columns with the indices of those of numbers and of text."""
     text = [sources['label'].index] if 'label' in sources else []
     if 'time' in sources:

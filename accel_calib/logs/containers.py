@@ -5,10 +5,9 @@
 Files that hold several tables: ZIP archives, sheets of Excel, and arrays of MATLAB; DataFrames.
 
 phyphox and Sensor Logger export a ZIP archive with one CSV file for each sensor, and phyphox an
-Excel file with one sheet for each. `members_of` recognises such a file by its first bytes and
-returns its tables, and `member_of` returns that of the accelerometer. Each table is handed over as
-the bytes of a CSV file, piece by piece, so that it is read as any other text log is. So is a
-DataFrame.
+Excel file with one sheet for each. `open_table` returns the table of the accelerometer. It is
+handed over as the bytes of a CSV file, piece by piece, so that it is read as any other text log
+is. So is a DataFrame.
 
 ZIP is read with the standard library, ``.xlsx`` with `openpyxl`, ``.xls`` with `xlrd`, and
 ``.mat`` up to version 7 with `scipy`. Structs and timetables of MATLAB are refused: only MATLAB
@@ -37,8 +36,7 @@ import numpy as np
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
 from .flight import sound_log
-from .formats import record_instead
-from .names import meaning, READING
+from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
 from ..table import ABOUT
@@ -46,6 +44,9 @@ from ..table import ABOUT
 _ZIP, _OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
 _MATLAB, _MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
 _BLACKBOX = b'H Product:Blackbox flight data recorder'
+FIRST_BYTES = (_ZIP, _OLE, _MATLAB, _MATLAB_HDF5, _BLACKBOX)
+"""First bytes of containers, and of a log that has to be decoded."""
+
 _WORKBOOK = 'xl/workbook.xml'
 
 _ENCRYPTED = 1
@@ -112,33 +113,42 @@ class _Stream(io.RawIOBase):
 
 
 @contextmanager
-def members_of(path: Path) -> Iterator[Sequence[Member]]:
-    """Open a container, and yield its tables; none if the file is not a container."""
-    with path.open('rb') as file:
-        head = file.read(len(_BLACKBOX))
-    if head.startswith(_BLACKBOX):
-        raise InputError(f'{path} is a log of the blackbox as the flight controller wrote it, '
-                         'expected its CSV file', f'decode it with blackbox_decode {path.name}')
-    if head.startswith(_OLE):
-        yield _old_sheets(path)
-    elif head.startswith((_MATLAB, _MATLAB_HDF5)) or (path.suffix == '.mat' and b'\0' in head):
-        yield _arrays(path)
-    elif head.startswith(_ZIP):
-        with _sound_archive(path), zipfile.ZipFile(path) as archive:
-            excel = _WORKBOOK in archive.namelist()
-            yield from (_sheets(path, archive) if excel else [_files(path, archive)])
-    else:
-        yield ()
-
-
-def member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
+def open_table(path: Path, head: bytes, options: LogOptions) -> Iterator[tuple[str, TextTable]]:
     """
-    Return the table with the accelerometer; raise InputError if there is none, or several.
+    Open a container, and yield the name of its table with the accelerometer, and the table.
 
+    `head` are the first bytes. Raise InputError if there is no such table, or several.
     `options.topic` names a table. Tables of linear acceleration come last, and tables whose names
     say that they are of an accelerometer first.
 
     """
+    with _members_of(path, head) as members:
+        member = _member_of(path, members, options)
+        with member.text(path, options) as text:
+            yield member.name, text
+
+
+@contextmanager
+def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
+    """Open a container, and yield its tables."""
+    if head.startswith(_BLACKBOX):
+        raise InputError(f'{path} is a log of the blackbox as the flight controller wrote it, '
+                         'expected its CSV file', f'decode it with blackbox_decode {path.name}')
+    if head.startswith(_MATLAB_HDF5):
+        raise InputError(f'{path} is a MATLAB file of version 7.3, expected version 7 or older',
+                         f'save it with save(file, "-v7"), or {_EXPORT_MATLAB}')
+    if head.startswith(_OLE):
+        yield _old_sheets(path)
+    elif head.startswith(_MATLAB) or path.suffix == '.mat':
+        yield _arrays(path)
+    else:
+        with _sound_archive(path), zipfile.ZipFile(path) as archive:
+            excel = _WORKBOOK in archive.namelist()
+            yield from (_sheets(path, archive) if excel else [_files(path, archive)])
+
+
+def _member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
+    """Return the table with the accelerometer; see `open_table`."""
     names = [member.name for member in members]
     wanted = [member for member in members if options.topic in ('', member.name)]
     if not wanted:
@@ -296,11 +306,6 @@ def _arrays(path: Path) -> list[Member]:
     """Return the arrays of a ``.mat`` file as tables; those of one length are columns of one."""
     import scipy.io  # here, because few runs need it
 
-    with path.open('rb') as file:
-        is_hdf5 = file.read(len(_MATLAB_HDF5)) == _MATLAB_HDF5
-    if is_hdf5:
-        raise InputError(f'{path} is a MATLAB file of version 7.3, expected version 7 or older',
-                         f'save it with save(file, "-v7"), or {_EXPORT_MATLAB}')
     with sound_log(path, 'a MATLAB file (.mat)', _AGAIN):
         try:
             held = scipy.io.whosmat(path)

@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reader of PX4 flight logs (ULog, ``.ulg``), on `pyulog`, and what it shares with that of ArduPilot.
+Readers of flight logs: PX4 (ULog, on `pyulog`), and ArduPilot (DataFlash, on `pymavlink`).
 
-A flight log holds several messages with accelerations, each of several sensors. `choose` takes the
-first message in order of preference whose samples are dense enough for the capture of poses.
-
-Four messages of PX4 have accelerations, all in x forward, y right, z down and in m/s²:
+All accelerations are in x forward, y right, z down and in m/s². In the order of preference:
 
 ====================  ==========================================================================
-message               content
+message of PX4        content
 ====================  ==========================================================================
 sensor_accel          reading of one sensor before PX4 corrects it, with its temperature
 sensor_combined       mean of the selected sensor, corrected by the stored CAL_ACC parameters
@@ -18,216 +15,58 @@ vehicle_imu           change of velocity of one sensor over an interval, correct
 vehicle_acceleration  filtered and corrected reading of the selected sensor, without its bias
 ====================  ==========================================================================
 
+====================  ==========================================================================
+message of ArduPilot  content, corrected by the stored INS_ACC parameters
+====================  ==========================================================================
+IMU                   reading and angular rate of a sensor, with its temperature T
+ACC                   reading of a sensor at its own rate, where LOG_BITMASK asks for raw samples
+====================  ==========================================================================
+
 The default profile of PX4 logs `sensor_accel` once a second. It is read if it is dense enough.
+Since ArduPilot 4.1 the field I is the number of the sensor. Before, the second sensor has the
+messages IMU2 and ACC2. An ArduPilot log states the fields of each message in messages FMT. Its
+text form (``.log``) has the same messages, one per line.
+
 [1] https://docs.px4.io/main/en/dev_log/ulog_file_format
 [2] https://docs.px4.io/main/en/msg_docs/
+[3] https://ardupilot.org/copter/docs/logmessages.html
+[4] https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
 import errno
 import io
+import math
 import os
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    Correction, Parameters, px4_correction, px4_slot, px4_thermal_slot, raw_columns, Stated)
-from .formats import PX4_FIELDS, PX4_SPANS
+    ardupilot_correction, as_sensed, AsSensed, at, AXES, choose, Correction, finite, FlightLog,
+    Message, Parameters, px4_correction, px4_slot, RATES, sound, Stated, taken)
+from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError, needing
-from ..table import Autopilot, COLUMNS, columns_from, Floats, numbered, Recording
-from ..text import counted, some
+from ..table import Autopilot, Floats
+from ..text import counted
 
-AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
-MICRO = 1e-6
+PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
+"""Messages with accelerations, in order of preference."""
+
+ULOG, DATAFLASH = b'ULog\x01\x12\x35', b'\xa3\x95\x80'
+"""First bytes of logs of PX4, and of binary logs of ArduPilot (the head of a message FMT)."""
+
+FMT = re.compile(rb'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
+"""Message FMT in a text log of ArduPilot."""
 
 _STANDARD_ERROR = 2
-
-DENSE_HZ = 5.0
-"""Samples per second below which another message is preferred."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """The samples of one message of one sensor: fields by the names of the log, and time [s]."""
-
-    name: str
-    instance: int
-    fields: Mapping[str, NDArray[Any]]
-    time: Floats
-
-    @property
-    def rate_hz(self) -> float:
-        """Return the samples per second; 0 for less than two samples."""
-        span = float(np.ptp(self.time)) if len(self.time) > 1 else 0.0
-        return (len(self.time) - 1) / span if span > 0.0 else 0.0
-
-    def __str__(self) -> str:
-        return f'{self.name} {self.instance}'
-
-
-@dataclass(frozen=True)
-class FlightLog:
-    """
-    The samples of one sensor of a flight log, in m/s².
-
-    Columns have the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has them
-    ``gx,gy,gz`` [rad/s] and ``temperature`` [°C]. The sensor is message and number, such as
-    ``sensor_accel 0``. Notes state what was not used, and what to know of the readings.
-
-    """
-
-    columns: Mapping[str, Floats]
-    sensor: str
-    read_as: str
-    autopilot: Autopilot
-    notes: tuple[str, ...] = ()
-
-    def recording(self, source: str) -> Recording:
-        """Return the samples as a recording; a number that is not finite is an InputError."""
-        columns = columns_from(self.columns, ('time', 'reading'), source)
-        return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
-
-
-@dataclass(frozen=True)
-class AsSensed:
-    """Columns of a flight log without the correction of the vehicle, if that is known."""
-
-    columns: Mapping[str, Floats]
-    autopilot: Autopilot
-    turned: bool = False
-    notes: tuple[str, ...] = ()
-
-
-def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: Autopilot,
-              correction: Callable[[], Correction], advice: str) -> AsSensed:
-    """Return columns without the correction, or as they are with a note why that is not known."""
-    try:
-        raw = raw_columns(columns, parameters, correction())
-    except InputError as err:
-        return AsSensed(columns, replace(autopilot, corrected=err.message), notes=(
-            f'readings are left as the vehicle corrected them ({err.message}), so do not load an '
-            f'export of their calibration into it; {advice}',))
-    undone = (f'the correction by the vehicle is undone: {parameters.words}',)
-    return AsSensed(raw, autopilot, parameters.turned, undone if parameters.words else ())
-
-
-@dataclass(frozen=True)
-class Choice:
-    """
-    The message to read, and all messages of the log that matter.
-
-    `preferred` are the names of those with accelerations, the best first; `name` is that of the
-    sensor, if the user states one.
-
-    """
-
-    message: Message
-    found: Sequence[Message]
-    preferred: Sequence[str]
-    name: str
-
-    def log(self, kind: str, found: AsSensed, temperature: str, notes: Iterable[str]
-            ) -> FlightLog:
-        """Return the log; `temperature` describes that column, if there is one."""
-        chosen = self.message
-        axes = ('axes of the sensor, before the rotation of the board' if found.turned else
-                'x forward, y right, z down')
-        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
-        if 'temperature' in found.columns:
-            read_as += f', {temperature}'
-        return FlightLog(found.columns, self.name or str(chosen), read_as, found.autopilot,
-                         (*notes, *found.notes))
-
-    def others(self) -> list[str]:
-        """Return notes on the other sensors of the same message, and on other messages."""
-        chosen, notes = self.message, []
-        usable = [message for message in self.found if len(message.time)]
-        rest = [message for message in usable
-                if message.name == chosen.name and message.instance != chosen.instance]
-        other = [message for message in usable
-                 if message.name in self.preferred and message.name != chosen.name]
-        if rest:
-            notes.append(f'{chosen} is read; other sensors: {some(rest)} '
-                         f'(--sensor {rest[0].instance})')
-        if other:
-            names = ', '.join(dict.fromkeys(f'{message.name} ({message.rate_hz:.3g} Hz)'
-                                            for message in other
-                                            if message.instance == other[0].instance))
-            notes.append(f'not used: {names} (--topic {other[0].name})')
-        return notes
-
-    def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
-              ) -> dict[str, Floats]:
-        """Return the angular rates of the first source with these fields that is as dense."""
-        for message in sources:
-            if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields):
-                rates = taken(message.fields, RATES, names)
-                if finite(*rates.values()):
-                    return {key: at(time, message, values) for key, values in rates.items()}
-        return {}
-
-
-def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
-           source: str) -> Choice:
-    """
-    Return the message to read, from those `found`; raise InputError if there is none.
-
-    `topic` is the name of the message; empty: the first of `preferred` that is dense. `sensor` is
-    the number of the sensor, alone or after the name of its message; any other text is a name for
-    the sensor, and does not choose.
-
-    """
-    usable = [message for message in found if message.name in preferred and len(message.time)]
-    if not usable:
-        raise InputError(f'{source} has none of the messages {", ".join(preferred)}, expected one '
-                         'with accelerations', 'log the accelerometer, see docs/log_formats.md')
-    chooses = sensor.isdecimal() or sensor in map(str, found)
-    number = sensor if chooses else ''
-    wanted = [message for message in usable if topic in ('', message.name)
-              and number in ('', str(message.instance), str(message))]
-    if not wanted:
-        raise InputError(f'{source} has {some(usable)}, expected '
-                         f'{" ".join(filter(None, (topic or "a message", number)))}',
-                         'name one of these, for example --topic '
-                         f'{usable[0].name} --sensor {usable[0].instance}')
-    order = sorted(wanted, key=lambda message: (preferred.index(message.name), message.instance))
-    dense = [message for message in order if message.rate_hz >= DENSE_HZ]
-    best = dense[0] if dense else max(order, key=lambda message: message.rate_hz)
-    return Choice(best, found, preferred, '' if chooses else sensor)
-
-
-def taken(fields: Mapping[str, NDArray[Any]], keys: Sequence[str], names: Sequence[str]
-          ) -> dict[str, Floats]:
-    """Return the first fields as floats under our names."""
-    return {key: np.asarray(fields[name], float) for key, name in zip(keys, names)}
-
-
-def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
-    """Return values of another message at these times, interpolated; the ends are held."""
-    order = np.argsort(source.time, kind='stable')
-    return np.interp(time, source.time[order], values[order].astype(float))
-
-
-def finite(*columns: NDArray[Any]) -> bool:
-    """Return whether there are values and all are finite numbers."""
-    return all(len(values) > 0 and bool(np.all(np.isfinite(values))) for values in columns)
-
-
-def sound(message: Message, columns: Mapping[str, Floats], why: str,
-          valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
-    """Return the valid rows whose values are all finite, and a note on the others."""
-    valid = valid & np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
-    dropped = int(np.sum(~valid))
-    notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
-    return {key: values[valid] for key, values in columns.items()}, notes
 
 
 @contextmanager
@@ -270,16 +109,13 @@ def _silent_c() -> Iterator[None]:
 
 # --------------------------------------------------------------------------------------- PX4
 
-MAGIC = b'ULog\x01\x12\x35'
 _INVALID = 0x7fffffff
 """Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
 
-_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 to SDLOG_PROFILE to '
-           'log it at 10 Hz)')
+_PX4_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 to SDLOG_PROFILE '
+               'to log it at 10 Hz)')
 _RELATIVE = 'accelerometer_timestamp_relative'
-_XYZ = ('x', 'y', 'z')
-PREFERRED = tuple(PX4_FIELDS)
-_FILTERED = 'vehicle_acceleration'
+_RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
 _NEEDED = {name: {*fields, *_MORE.get(name, ())} for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
@@ -301,47 +137,39 @@ class _WholeReads(io.BufferedReader):
         return data
 
 
-def is_ulg(path: Path) -> bool:
-    """Return whether a file is a ULog, from its first bytes."""
-    if not path.is_file():
-        return False
-    with path.open('rb') as file:
-        return file.read(len(MAGIC)) == MAGIC
-
-
 @np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
 def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of a PX4 log.
 
-    By default the message is the first of `PREFERRED` that is dense enough, and the sensor the
+    By default the message is the first of `PX4_MESSAGES` that is dense enough, and the sensor the
     lowest number. Another text for the sensor is a name. Raise InputError if pyulog is not
     installed, or the file is damaged or has no such message.
 
     """
-    found, parameters, release, notes = _messages(path)
+    found, parameters, release, notes = _px4_messages(path)
     known = [message for message in found
              if message.name in _NEEDED and _NEEDED[message.name] <= set(message.fields)]
-    choice = choose(known, PREFERRED, topic, sensor, str(path))
+    choice = choose(known, PX4_MESSAGES, topic, sensor, str(path))
     chosen = choice.message
-    columns, invalid = _samples(chosen)
+    columns, invalid = _px4_samples(chosen)
     time = columns['time']
     if not len(time):
         raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
                          'name another message with --topic')
-    if chosen.name == PREFERRED[0]:
+    if chosen.name == _RAW:
         gyros = (message for message in found
                  if (message.name, message.instance) == ('sensor_gyro', chosen.instance))
-        columns |= choice.rates(time, gyros, _XYZ)
-    columns |= _temperature(chosen, time, found)
+        columns |= choice.rates(time, gyros, ('x', 'y', 'z'))
+    columns |= _px4_temperature(chosen, time, found)
     device = _device(chosen, found)
     autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
-                          px4_thermal_slot(parameters, device))
-    if chosen.name == PREFERRED[0]:
+                          px4_slot(parameters, device, 'TC_A'))
+    if chosen.name == _RAW:
         sensed = AsSensed(columns, autopilot)
     else:
         sensed = as_sensed(columns, parameters, autopilot, lambda: _correction(
-            chosen, parameters, device, release), _ADVICE)
+            chosen, parameters, device, release), _PX4_ADVICE)
     return choice.log('PX4 log', sensed, 'temperature of the sensor',
                       (*notes, *invalid, *choice.others()))
 
@@ -355,16 +183,14 @@ def _correction(chosen: Message, parameters: Parameters, device: int,
     return px4_correction(parameters, device, release)
 
 
-def _messages(path: Path) -> tuple[list[Message], Parameters, tuple[int, int] | None, list[str]]:
+def _px4_messages(path: Path
+                  ) -> tuple[list[Message], Parameters, tuple[int, int] | None, list[str]]:
     """Return the messages and parameters that matter, the release of PX4, and notes on damage."""
     with needing('pyulog', 'a PX4 log (.ulg)'):
         from pyulog import ULog
-    if not is_ulg(path):
-        raise InputError(f'{path} does not start as a ULog does, expected a PX4 log (.ulg)',
-                         'check that this is the intended file')
     with _WholeReads(io.FileIO(path)) as file, sound_log(path, 'a PX4 log (.ulg)'):
-        log = ULog(file, [*PREFERRED, *_ALSO])
-        found = [Message(data.name, data.multi_id, data.data, _time(data.data))
+        log = ULog(file, [*PX4_MESSAGES, *_ALSO])
+        found = [Message(data.name, data.multi_id, data.data, _px4_time(data.data))
                  for data in log.data_list if len(data.data['timestamp'])]
     notes = []
     if log.file_corruption:
@@ -380,7 +206,7 @@ def _messages(path: Path) -> tuple[list[Message], Parameters, tuple[int, int] | 
         (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
 
 
-def _time(fields: Mapping[str, NDArray[Any]]) -> Floats:
+def _px4_time(fields: Mapping[str, NDArray[Any]]) -> Floats:
     """Return the time of the samples [s]; timestamp_sample where it is set."""
     stamps = fields['timestamp']
     if 'timestamp_sample' in fields and np.all(fields['timestamp_sample'] > 0):
@@ -388,7 +214,7 @@ def _time(fields: Mapping[str, NDArray[Any]]) -> Floats:
     return stamps.astype(float) * MICRO
 
 
-def _samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
+def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
     """Return time, readings and rates of the valid rows, and a note on the others."""
     fields, time = message.fields, message.time
     columns = taken(fields, (*AXES, *RATES), PX4_FIELDS[message.name])
@@ -414,16 +240,218 @@ def _device(chosen: Message, found: Sequence[Message] = ()) -> int:
     return int(stated[0][-1]) if stated and np.ptp(stated[0]) == 0 else 0
 
 
-def _temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
+def _px4_temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
     """Return the temperature that sensor_accel of the same device reports."""
     sources = [message for message in found
-               if message.name == PREFERRED[0] and 'temperature' in message.fields]
+               if message.name == _RAW and 'temperature' in message.fields]
     device = _device(chosen, found)
     same = [message for message in sources if device and _device(message) == device]
-    if chosen.name == PREFERRED[0]:
+    if chosen.name == _RAW:
         same = [message for message in sources if message.instance == chosen.instance]
     elif not same and len(sources) == 1:
         same = sources
     if not same or not finite(same[0].fields['temperature']):
         return {}
     return {'temperature': at(time, same[0], same[0].fields['temperature'])}
+
+
+# --------------------------------------------------------------------------------- ArduPilot
+
+_READING, _RATES = ('AccX', 'AccY', 'AccZ'), ('GyrX', 'GyrY', 'GyrZ')
+_ARDUPILOT_ADVICE = 'take the log from the vehicle whole: it begins with all parameters'
+_MOST_SENSORS = 255
+_NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
+_STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
+"""Fields with the time of a sample, the best first, and their factors to seconds."""
+
+_SCALES = {'c': 1e-2, 'C': 1e-2, 'e': 1e-2, 'E': 1e-2, 'L': 1e-7}
+_TYPES = {'b': 'i1', 'B': 'u1', 'M': 'u1', 'h': '<i2', 'H': '<u2', 'c': '<i2', 'C': '<u2',
+          'i': '<i4', 'I': '<u4', 'L': '<i4', 'e': '<i4', 'E': '<u4', 'f': '<f4', 'd': '<f8',
+          'g': '<f2', 'q': '<i8', 'Q': '<u8', 'n': 'S4', 'N': 'S16', 'Z': 'S64', 'a': 'S64'}
+"""Types of the fields, from the letters of a message FMT [4]."""
+
+_Table = dict[str, NDArray[Any]]
+
+
+@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
+def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
+    """
+    Read the accelerations of one sensor of an ArduPilot log.
+
+    By default the message is IMU if it is dense enough, otherwise ACC, and the sensor the lowest
+    number. Another text for the sensor is a name. Raise InputError if the file is damaged or has
+    no such message, or pymavlink is not installed (binary logs only).
+
+    """
+    with path.open('rb') as file:
+        is_binary = file.read(len(DATAFLASH)) == DATAFLASH
+    tables, notes = _binary(path) if is_binary else _text(path)
+    found = _ardupilot_messages(tables)
+    choice = choose(found, ARDUPILOT_MESSAGES, topic, sensor, str(path))
+    chosen = choice.message
+    columns, dropped = sound(
+        chosen, {'time': chosen.time, **taken(chosen.fields, AXES, _READING)},
+        'the reading is not a number')
+    sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
+    columns |= choice.rates(columns['time'], sources, _RATES)
+    columns |= _ardupilot_temperature(chosen, columns['time'], found)
+    parameters = _parameters(tables.get('PARM', {}))
+    sensed = as_sensed(columns, parameters, _autopilot(parameters, chosen.instance + 1),
+                       lambda: ardupilot_correction(parameters, chosen.instance + 1),
+                       _ARDUPILOT_ADVICE)
+    return choice.log('ArduPilot log', sensed, 'temperature T',
+                      (*notes, *dropped, *choice.others()))
+
+
+def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
+    """Return the messages of each sensor: by the field I, or by the number in the name."""
+    found = []
+    for name, stated in tables.items():
+        table = {key: values for key, values in stated.items() if values.dtype.kind in 'iuf'}
+        match = _NAME.fullmatch(name)
+        stamp = next((key for key in _STAMPS if key in table), '')
+        needed = _RATES if name.startswith('GYR') else _READING
+        if not match or not stamp or not set(needed) <= set(table):
+            continue
+        instances = _instances(table, len(table[stamp]), max(int(match[2] or 1) - 1, 0))
+        for instance in np.unique(instances).tolist():
+            of = instances == instance
+            fields = {key: values[of] for key, values in table.items()}
+            found.append(Message(match[1], instance, fields,
+                                 fields[stamp].astype(float) * _STAMPS[stamp]))
+    return found
+
+
+def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
+    """Return the number of the sensor of each message; damaged numbers are 0."""
+    stated = table.get('I', np.full(count, number))
+    return np.clip(np.nan_to_num(stated.astype(float)), 0.0, _MOST_SENSORS).astype(np.int64)
+
+
+def _ardupilot_temperature(chosen: Message, time: Floats, found: Sequence[Message]
+                           ) -> dict[str, Floats]:
+    """Return the temperature that IMU of the same sensor reports."""
+    for message in found:
+        name = next((key for key in ('T', 'Temp') if key in message.fields), '')
+        if (message.name, message.instance) == ('IMU', chosen.instance) and name:
+            values = message.fields[name]
+            if finite(values) and np.any(values):
+                return {'temperature': at(time, message, values)}
+    return {}
+
+
+def _autopilot(parameters: Parameters, instance: int) -> Autopilot:
+    """Return the place of an accelerometer, numbered from 1."""
+    *_, (_, values) = parameters.spans()
+    device = values.get(f'INS_ACC{"" if instance == 1 else instance}_ID', 0.0)
+    warm = values.get(f'INS_TCAL{instance}_ENABLE', 0.0) != 0.0
+    return Autopilot('ardupilot', instance, int(device) or None, instance if warm else None)
+
+
+def _parameters(table: _Table) -> Parameters:
+    """Return the messages PARM, in order; damaged ones are left out."""
+    stamp = next((key for key in _STAMPS if key in table), '')
+    if not stamp or not {'Name', 'Value'} <= set(table):
+        return Parameters([])
+    rows = zip(*(table[key].tolist() for key in (stamp, 'Name', 'Value')))
+    return Parameters([
+        Stated(float(time) * _STAMPS[stamp],
+               name.decode('latin-1') if isinstance(name, bytes) else str(name), float(value))
+        for time, name, value in rows if _is_number(time) and _is_number(value)])
+
+
+def _is_number(value: float | str) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except ValueError:  # a damaged line of text
+        return False
+
+
+def _wanted(name: str) -> bool:
+    return name == 'PARM' or bool(_NAME.fullmatch(name))
+
+
+def _indexed(path: Path) -> Any:
+    """Return the log of pymavlink, which knows where each message begins."""
+    with needing('pymavlink', 'an ArduPilot log (.bin)'):
+        from pymavlink.DFReader import DFReader_binary
+
+    class Index(DFReader_binary):  # type: ignore[misc]
+        def init_clock(self) -> None:
+            """Skip the search for a GPS time, which parses a whole log that has none."""
+
+    with sound_log(path, 'an ArduPilot log (.bin)'):
+        log = Index(str(path))
+        log.close()
+    return log
+
+
+def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
+    """Return the fields of the messages of a binary log."""
+    log = _indexed(path)
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    tables, cut = {}, 0
+    for number, form in log.formats.items():
+        starts = np.array(log.offsets[number], dtype=np.int64) + 3
+        if not _wanted(form.name) or not len(starts) or not _is_sound(form):
+            continue
+        layout = np.dtype([(name, _TYPES[letter])
+                           for name, letter in zip(form.columns, form.format)])
+        whole = starts[starts + layout.itemsize <= len(data)]
+        cut += len(starts) - len(whole)
+        rows = data[whole[:, np.newaxis] + np.arange(layout.itemsize)]
+        values = rows.view(layout)[:, 0]
+        tables[form.name] = {name: values[name] * _SCALES[letter] if letter in _SCALES
+                             else values[name] for name, letter in zip(form.columns, form.format)}
+    notes = [f'{counted(cut, "message")} cut off at the end'] if cut else []
+    known = sum(len(log.offsets[number]) * form.len for number, form in log.formats.items())
+    if known < len(data):
+        notes.append(f'{counted(len(data) - known, "byte")} between messages left out')
+    return tables, notes
+
+
+def _is_sound(form: Any) -> bool:
+    """Return whether a message has one letter for each field, and a name of its own for each."""
+    return all(form.columns) and len(form.format) == len(form.columns) == len(set(form.columns))
+
+
+def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
+    """Return the fields of the messages of a text log: ``IMU, 123456, 0, …`` on each line."""
+    names: dict[str, list[str]] = {}
+    lines: dict[str, list[str]] = {}
+    notes: list[str] = []
+    with path.open(encoding='latin-1') as file:
+        for line in file:
+            if not line.endswith('\n'):
+                notes.append('the last line left out: it has no end')
+                break
+            kind, _, rest = line.partition(',')
+            if kind == 'FMT':
+                cells = [cell.strip() for cell in rest.split(',')]
+                if len(cells) > 4 and _wanted(cells[2]):
+                    names[cells[2]] = cells[4:]
+            elif kind in names:
+                lines.setdefault(kind, []).append(rest)
+    tables: dict[str, _Table] = {}
+    bad = 0
+    for kind, rows in lines.items():
+        sound = [row for row in rows if row.count(',') == len(names[kind]) - 1]
+        bad += len(rows) - len(sound)
+        if sound:
+            tables[kind] = _parsed(path, kind, names[kind], sound)
+    if bad:
+        notes.append(f'{counted(bad, "line")} of another length left out')
+    return tables, notes
+
+
+def _parsed(path: Path, kind: str, names: Sequence[str], rows: Sequence[str]) -> _Table:
+    """Return the fields of the lines of one message; only those of PARM are not all numbers."""
+    if kind == 'PARM':
+        cells = [[cell.strip() for cell in row.split(',')] for row in rows]
+        return dict(zip(names, np.array(cells, dtype=str).reshape(-1, len(names)).T))
+    try:
+        numbers = np.loadtxt(rows, delimiter=',', ndmin=2, comments=None)
+    except ValueError as err:
+        raise InputError(f'{path}: message {kind}: {err}, expected numbers',
+                         'correct the line or remove it') from err
+    return dict(zip(names, numbers.reshape(-1, len(names)).T))

@@ -2,25 +2,43 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Names of columns: which quantity, axis and unit the name of a column in a log means.
+Names in the header of a text log: what those of any author mean, and the layouts of makers.
 
-A name is parted into words at blanks, punctuation, digits and capital letters. `WORDS` lists the
-words for each quantity, and `UNITS` the units. A unit is in brackets or at the end of the
-name. The remaining words distinguish the sensors of a log. Our own names (`ax`, `time`, …) go
+**Words.** A name is parted into words at blanks, punctuation, digits and capital letters. `WORDS`
+lists the words for each quantity, and `UNITS` the units. A unit is in brackets or at the end of
+the name. The remaining words distinguish the sensors of a log. Our own names (`ax`, `time`, …) go
 before all others.
+
+**Layouts.** Phones, autopilots and small boards have a `LogFormat` for each layout of a text log,
+as their makers document it. `recognise` returns the layout whose columns a header has, and
+`format_named` the one that the user names. A layout only states what the names in the file mean. A
+unit that the maker leaves to the user's settings is empty, and the reader finds it from the
+readings at rest.
+
+**Frames.** A specific force is +1 g along the axis that points up. Phones (phyphox, Sensor Logger
+on Android, MATLAB Mobile) and Betaflight log this sign with z up. PX4 and ArduPilot log this sign
+with z down, so that a level vehicle reads -1 g on z; ``--frame ros`` turns it. iOS itself
+(CoreMotion) has the opposite sign: a phone that lies with its screen up reads -1 g on z. No fit
+depends on the sign. A flat pose does, and `LogFormat.note` names the frame for it.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import lru_cache
 import math
+from pathlib import Path
 import re
+from typing import Literal
 import unicodedata
 
+from ..errors import InputError
 from ..table import COLUMNS
+from ..text import some
+from ..units import UnitName
 
 READING = COLUMNS['reading'].names
 RATE = COLUMNS['rate'].names
@@ -76,7 +94,7 @@ COUNTERS = frozenset(('counter', 'packetcounter', 'packetnumber', 'packet', 'fra
 TICKS = {'sampletimefine': {'ticks of 100 µs': 1e-4, 'µs': 1e-6}}
 """Units of clocks with a name of their own: of Xsens, by the model."""
 
-_RAD = math.pi / 180.0
+MICRO, MILLI, DEGREE = 1e-6, 1e-3, math.pi / 180.0
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
     'reading': {
         **dict.fromkeys(('ms2', 'm/s2', 'm/s/s', 'ms-2', 'mps2', 'mss', 'mpss', 'mpsps', 'm/sec2',
@@ -93,8 +111,8 @@ UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
         **dict.fromkeys(('rad/s', 'rads', 'radps', 'rad/sec', 'rads-1', 'rad', 'radsec',
                          'radians/s'), ('rad/s', 1.0)),
         **dict.fromkeys(('deg/s', 'degs', 'dps', 'degps', 'deg/sec', 'degs-1', 'deg', 'degrees/s',
-                         'degree/s', 'degsec', 'degrees/sec'), ('°/s', _RAD)),
-        **dict.fromkeys(('mdps', 'mdeg/s'), ('m°/s', 1e-3 * _RAD)),
+                         'degree/s', 'degsec', 'degrees/sec'), ('°/s', DEGREE)),
+        **dict.fromkeys(('mdps', 'mdeg/s'), ('m°/s', 1e-3 * DEGREE)),
         'rpm': ('rpm', math.pi / 30.0)},
     'time': {
         **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds'), ('s', 1.0)),
@@ -266,3 +284,293 @@ def _unit_in(quantity: str, words: list[str]) -> tuple[str, list[str]]:
         text = next((word for word in words if len(word) > 1 and unit_of('time', word)), '')
         return text, words
     return '', words
+
+
+# ------------------------------------------------------------------------ layouts of makers
+
+@dataclass(frozen=True)
+class LogFormat:
+    """
+    One layout of a text log.
+
+    Parameters
+    ----------
+    name : str
+        Name of the maker or tool, as ``--format`` has it.
+    columns : mapping of str to str
+        Name in the file of each of our columns: ``time``, ``ax`` to ``gz``, ``temperature``.
+    scales : mapping of str to float
+        Factor from the unit of the file to ours, for the columns other than the reading that need
+        one. A time without a factor is in a unit that the reader recognises.
+    units : {'m/s2', 'g', 'native', ''}
+        Unit of the reading; empty if the file does not determine it.
+    marks : tuple of str
+        Names that together make the layout plain. The columns are looked for as well.
+    without_gravity : tuple of str
+        Names of the maker's columns of acceleration without gravity, and names of its files of
+        it (ending in ``.csv``).
+    other_sensors : tuple of str
+        Names of the maker's files of other sensors with the same columns.
+    record : str
+        What to record or to use instead of such files.
+    divisors : mapping of str to str
+        Name in the file of the column by which one of our columns is divided, if any.
+    instance : str
+        Name of the column with the number of the sensor, if rows of several sensors alternate.
+    note : str
+        What else a user should know.
+    plain : bool
+        Whether the names alone determine the layout; otherwise it is used only where the user
+        names it.
+
+    """
+
+    name: str
+    columns: Mapping[str, str]
+    scales: Mapping[str, float] = field(default_factory=dict)
+    units: UnitName | Literal[''] = 'm/s2'
+    marks: tuple[str, ...] = ()
+    without_gravity: tuple[str, ...] = ()
+    other_sensors: tuple[str, ...] = ()
+    record: str = ''
+    divisors: Mapping[str, str] = field(default_factory=dict)
+    instance: str = ''
+    note: str = ''
+    plain: bool = True
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Names that a header of this layout has, in any order."""
+        ours = [self.columns[key] for key in ('time', *READING) if key in self.columns]
+        return tuple(dict.fromkeys((*ours, *self.divisors.values(), *self.marks)))
+
+    def fits(self, header: Sequence[str]) -> bool:
+        """Return whether a header has the names of this layout; case and spacing are ignored."""
+        given = {folded(name) for name in header}
+        return bool(self.columns) and {folded(name) for name in self.needed} <= given
+
+    def present(self, header: Sequence[str]) -> dict[str, str]:
+        """Return the columns of this layout in a header, with the spelling of the header."""
+        spelled = {folded(name): name for name in reversed(header)}
+        return {key: spelled[folded(name)] for key, name in self.columns.items()
+                if folded(name) in spelled}
+
+
+def folded(name: str) -> str:
+    """Return a name without quotes, in lower case, with single spaces."""
+    return ' '.join(name.strip().strip('"\'').split()).casefold().replace('²', '^2')
+
+
+_LOWER, _UPPER, _BY_NUMBER = ('x', 'y', 'z'), ('X', 'Y', 'Z'), ('0', '1', '2')
+
+
+def _axes(pattern: str, keys: Sequence[str] = READING, names: Sequence[str] = _LOWER
+          ) -> dict[str, str]:
+    """Return a name for each axis; ``{}`` in the pattern stands for the axis."""
+    return {key: pattern.replace('{}', name) for key, name in zip(keys, names)}
+
+
+# ---------------------------------------------------------------------------- phyphox
+# https://github.com/phyphox/phyphox-android
+# The data sets of the app's own experiments, and of those made with "Add simple experiment".
+# Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
+
+_PHYPHOX_FORMATS = tuple(
+    LogFormat('phyphox', {'time': 'Time (s)', **_axes(pattern)}, {'time': 1.0},
+              without_gravity=(
+                  *_axes('Linear Acceleration {} (m/s^2)').values(), 'Linear Acceleration.csv',
+                  'Linear Accelerometer.csv', 'Acceleration without g.csv'),
+              record="record 'Acceleration with g' (Raw sensors) in phyphox")
+    for pattern in ('Acceleration {} (m/s^2)', '{} (m/s^2)'))
+
+# ------------------------------------------------------------------- Physics Toolbox
+# https://www.vieyrasoftware.net
+# The g-force meter has gravity; ax, ay, az beside it are the linear acceleration.
+
+_TOOLBOX = LogFormat('physics-toolbox', {'time': 'time', **_axes('gF{}'), **dict(zip(
+    RATE, ('wx', 'wy', 'wz')))}, {'gx': 1.0}, 'g', READING)
+
+# ---------------------------------------------------------------------- Sensor Logger
+# https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
+# One file per sensor with the same header; the name of the file is the name of the sensor.
+
+_LOGGER = LogFormat(
+    'sensor-logger', {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '', ('time',),
+    ('Accelerometer.csv',),
+    ('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
+     'MagnetometerUncalibrated.csv'),
+    'use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor Logger',
+    note='Readings in g are those of an iPhone, with the opposite sign: a flat pose needs '
+         '--frame win8.')
+
+# ---------------------------------------------------------------------- MATLAB Mobile
+# https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html
+# The timetable Acceleration, written by writetimetable; or sensorlog_accel_*.csv of a phone's
+# local log, where the time is in ms of Unix time.
+
+_MATLAB_FORMATS = tuple(
+    LogFormat('matlab', {'time': time, **_axes('{}', names=_UPPER)}, plain=False)
+    for time in ('Timestamp', 'Time'))
+
+# ------------------------------------------------------------------------------- PX4
+# https://docs.px4.io/main/en/msg_docs/
+# One file for each topic, <log>_<topic>_<instance>.csv, written by ulog2csv of pyulog; the columns
+# are the fields of the messages SensorAccel, SensorCombined, VehicleImu and VehicleAcceleration.
+
+_FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g on z; --flat '
+        'turns them to x forward, y left, z up.')
+
+
+def _numbered(name: str) -> tuple[str, ...]:
+    return tuple(f'{name}[{k}]' for k in range(3))
+
+
+PX4_FIELDS: dict[str, tuple[str, ...]] = {
+    'sensor_accel': _LOWER,
+    'sensor_combined': (*_numbered('accelerometer_m_s2'), *_numbered('gyro_rad')),
+    'vehicle_imu': (*_numbered('delta_velocity'), *_numbered('delta_angle')),
+    'vehicle_acceleration': _numbered('xyz')}
+"""Fields of the messages with accelerations, in order of preference: of the reading and rate."""
+
+PX4_SPANS = {'delta_velocity_dt': READING, 'delta_angle_dt': RATE}
+"""Interval [µs] in which a change of velocity or angle was measured."""
+
+
+def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
+         **others: str) -> LogFormat:
+    """Return the layout of a message; `changes` are divided by their intervals."""
+    divisors = {key: name for name, keys in PX4_SPANS.items() for key in keys if changes}
+    return LogFormat(
+        'px4', {'time': 'timestamp', **dict(zip((*READING, *RATE), PX4_FIELDS[message])),
+                **others},
+        {'time': MICRO, **dict.fromkeys(divisors, 1.0 / MICRO)}, marks=marks, divisors=divisors,
+        note=note)
+
+
+_PX4_FORMATS = (
+    _px4('sensor_accel', ('device_id', 'error_count'), temperature='temperature'),
+    _px4('sensor_combined', note='Readings are corrected by the stored CAL_ACC parameters; those '
+                                 f'of sensor_accel are not. {_FRD}'),
+    _px4('vehicle_imu', changes=True),
+    _px4('vehicle_acceleration', ('timestamp_sample',)))
+
+# -------------------------------------------------------------------------- ArduPilot
+# https://ardupilot.org/copter/docs/logmessages.html
+# mavlogdump.py --format csv --types IMU (or ACC) writes the fields of the message after its own
+# timestamp.
+
+_ACC = _axes('Acc{}', names=_UPPER)
+
+_ARDUPILOT_FORMATS = tuple(
+    LogFormat('ardupilot', {'time': time, **_ACC, **more}, {'time': MICRO}, marks=marks,
+              instance='I',
+              note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
+    for time, more, marks in (
+        ('TimeUS', {**_axes('Gyr{}', RATE, _UPPER), 'temperature': 'T'}, ('GyrX',)),
+        ('SampleUS', {}, ('TimeUS',)),
+        ('TimeUS', {}, ())))
+
+# ------------------------------------------------------------------------- Betaflight
+# https://github.com/betaflight/blackbox-tools
+# blackbox_decode, whose options --unit-frame-time, --unit-acceleration and --unit-rotation add the
+# unit to the name, and the export of the Blackbox Explorer. Without units the readings are counts
+# (acc_1G of the log's header per g), and the unit of the gyro is not in the file.
+
+_BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
+_BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
+_BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
+
+
+def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
+    """Return the layout with these units in the names of its columns."""
+    columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
+    scales = {'time': _BLACKBOX_TIMES[time]}
+    marks: tuple[str, ...] = ('loopIteration',)
+    if rate:
+        turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER)
+        columns |= turns
+        scales |= dict.fromkeys(RATE, _BLACKBOX_RATES[rate])
+        marks = tuple(turns.values())
+    note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
+    return LogFormat('betaflight', columns, scales, _BLACKBOX_UNITS[unit], marks, note=note)
+
+
+_BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_TIMES
+                            for unit in _BLACKBOX_UNITS for rate in _BLACKBOX_RATES)
+
+# ------------------------------------------------------------------- ESP32 and Arduino
+# A sketch prints the names and units that its author chose, so that the table of names finds the
+# columns (none are listed here), and the readings at rest determine the unit.
+
+_ESP32 = LogFormat('esp32', {}, units='', plain=False)
+
+FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, _TOOLBOX, _LOGGER, *_MATLAB_FORMATS,
+                                  *_PX4_FORMATS, *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS,
+                                  _ESP32)
+
+NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
+"""Names of the formats, as ``--format`` has them."""
+
+
+def recognise(header: Sequence[str]) -> LogFormat | None:
+    """Return the layout whose names a header has, or None; the one with most names, if several."""
+    fitting = [each for each in FORMATS if each.plain and each.fits(header)]
+    return _closest(fitting, header) if fitting else None
+
+
+def format_named(name: str, header: Sequence[str], source: str) -> LogFormat:
+    """Return the layout of a maker, one of `NAMES`, that a header has; InputError if none."""
+    layouts = [each for each in FORMATS if each.name == name]
+    if not layouts:
+        close = get_close_matches(name, NAMES, 1)
+        raise InputError(f'format is {name!r}, expected one of {", ".join(NAMES)}',
+                         f'use {close[0]}' if close else 'leave the format out: it is recognised')
+    fitting = [each for each in layouts if each.fits(header) or not each.columns]
+    if fitting:
+        return _closest(fitting, header)
+    given = {folded(column) for column in header}
+    nearest = max(layouts, key=lambda each: len({*map(folded, each.needed)} & given))
+    lacking = [column for column in nearest.needed if folded(column) not in given]
+    raise InputError(f'{source} has the columns {some(header)}, and lacks '
+                     f'{", ".join(lacking)} of a log of {name}',
+                     'leave the format out, or name the columns with --columns')
+
+
+def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
+    found = max(fitting, key=lambda each: len(each.needed))
+    # Logs of ArduPilot before version 4.1 have no column with the number of the sensor.
+    there = folded(found.instance) in {folded(name) for name in header}
+    return found if there else replace(found, instance='')
+
+
+def check_sensor(header: Sequence[str], path: Path) -> None:
+    """Check the name of a file, if its maker gives the files of all sensors the same columns."""
+    layout = recognise(header)
+    if layout and _is_named(path, layout.other_sensors):
+        raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
+                         'of an accelerometer', layout.record)
+
+
+def record_instead(header: Sequence[str], path: Path) -> str:
+    """
+    Return what to record instead, if the maker marks a file as acceleration without gravity.
+
+    The names are no proof: other tools use them for readings with gravity. A reader asks here for
+    its advice once the readings at rest show no gravity.
+
+    """
+    given = {folded(name) for name in header}
+    for layout in FORMATS:
+        marks = [folded(name) for name in layout.without_gravity if not name.endswith('.csv')]
+        if marks and given.issuperset(marks):
+            return layout.record
+        if layout.plain and layout.fits(header) and _is_named(path, layout.without_gravity):
+            return layout.record
+    return ''
+
+
+def _is_named(path: Path, names: Sequence[str]) -> bool:
+    def stem(name: str) -> str:
+        return folded(name).replace(' ', '').removesuffix('.csv')
+
+    return stem(path.name) in map(stem, names)

@@ -258,6 +258,8 @@ class Quantities:
                                                 for name in column.names])
         columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
                     for key, k in self.chosen.quantities.items()}
+        if self.rate_hz is not None:
+            columns['time'] = (cells.row - 1) / self.rate_hz
         return columns, cells.row
 
     def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:

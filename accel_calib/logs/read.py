@@ -1,34 +1,55 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading of logs of all kinds, and of lines that arrive from a serial port."""
+"""
+Reading of logs of all kinds, of lines from a serial port, and of our own tables.
+
+A log is recognised by its first bytes. Our own tables have ``#`` comments, one header line, and
+columns by name: those of `accel_calib.table.COLUMNS`; other columns of numbers are quantities.
+Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
+``# sensor: "imu_link"`` and ``# autopilot: {…}``.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+import csv
 from dataclasses import dataclass, replace
 from itertools import chain
+import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .ardupilot import is_dataflash, read_dataflash
-from .bag import Bag, is_bag, open_bag
+from .autopilot import FlightLog
+from .bag import Bag, open_bag
 from .bag_samples import context_of, imu_samples, together
-from .columns import chosen, is_log_header, LogOptions
-from .containers import Frame, member_of, members_of, Piped
+from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
+from .containers import FIRST_BYTES, Frame, open_table, Piped
 from .dialect import layout_of
-from .flight import FlightLog, is_ulg, read_ulg
+from .flight import DATAFLASH, FMT, read_dataflash, read_ulg, ULOG
+from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
-from ..disk import check_regular
+from ..disk import check_regular, write_atomically
 from ..errors import InputError, saying
-from ..table import check_units, check_values, is_quantity, Poses, Recording
+from ..table import (
+    check_units, check_values, column_of, COLUMNS, is_quantity, numbered, Poses, present,
+    Recording, Table)
 from ..text import some
 from ..units import Units, units_of
+
+_BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
+_HEAD = 8192
+"""Number of bytes at the beginning of a file that show its kind."""
+
+_DIGITS = '.12g'
+_SHOWN = 12
+"""Number of other columns in an error message."""
 
 Progress = Callable[[int, int], object]
 """Function called with the number of samples done, and that of all samples."""
@@ -145,23 +166,29 @@ def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog
         name = Path(str(path))
         with path.table.text(name, options) as text:
             yield _text(name, text, options)
-    elif is_bag(path):
+        return
+    if is_bag(path):
         with open_bag(path) as bag:
             yield _bag(bag, options)
-    elif is_ulg(path):
+        return
+    with path.open('rb') as file:
+        head = file.read(_HEAD)
+    if head.startswith(ULOG):
         yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
-    elif is_dataflash(path):
+    elif head.startswith(DATAFLASH) or FMT.search(head):
         yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
+    elif head.startswith(FIRST_BYTES) or (path.suffix == '.mat' and b'\0' in head):
+        with open_table(path, head, options) as (member, text):
+            log = _text(path / member, text, options)
+            yield replace(log, read_as=', '.join(filter(None, (member, log.read_as))))
     else:
-        with members_of(path) as members:
-            if members:
-                member = member_of(path, members, options)
-                with member.text(path, options) as text:
-                    log = _text(path / member.name, text, options)
-                    yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))))
-            else:
-                with open_text(path, lambda cells: is_log_header(cells, options)) as text:
-                    yield _text(path, text, options)
+        with open_text(path, lambda cells: is_log_header(cells, options)) as text:
+            yield _text(path, text, options)
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path names a bag rather than a table."""
+    return path.is_dir() or path.suffix in _BAG_SUFFIXES
 
 
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
@@ -209,7 +236,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities,
              options: LogOptions) -> OpenLog:
     """Return a text log whose columns and units are known."""
-    blocks = _timed(converted(path, cells, quantities), quantities.rate_hz)
+    blocks = _converted(path, cells, quantities)
     head = next(blocks)
     units, about = quantities.units, text.layout.about
     sensor, autopilot = str(about.get('sensor', '')), about.get('autopilot')
@@ -221,8 +248,7 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
                    for block in chain((head,), blocks))
         count = _estimated(text, head)
     else:
-        poses = Poses(*whole(joined([head, *blocks]), quantities.notes), units.name, sensor,
-                      autopilot)
+        poses = Poses(*_whole([head, *blocks], quantities.notes), units.name, sensor, autopilot)
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
@@ -236,13 +262,7 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
                    noted=lambda: (*text.notes, *quantities.all_notes))
 
 
-def _timed(blocks: Iterator[Block], rate_hz: float | None) -> Iterator[Block]:
-    """Yield blocks, with the times of a stated rate if there is one."""
-    for columns, row in blocks:
-        yield columns if rate_hz is None else {**columns, 'time': (row - 1) / rate_hz}, row
-
-
-def converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
+def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
     """Yield blocks in our units."""
     for block in cells:
         columns, row = quantities.columns(block)
@@ -250,21 +270,14 @@ def converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Ite
         yield columns, row
 
 
-def joined(blocks: Sequence[Block]) -> Block:
-    """Return blocks as one."""
-    if len(blocks) == 1:
-        return blocks[0]
-    return ({key: np.concatenate([columns[key] for columns, _ in blocks])
-             for key in blocks[0][0]}, np.concatenate([row for _, row in blocks]))
-
-
-def whole(block: Block, notes: list[str]) -> Block:
-    """Return a block without quantities that lack a number in a row; they are noted."""
-    columns, row = block
+def _whole(blocks: Sequence[Block], notes: list[str]) -> Block:
+    """Return blocks as one, without quantities that lack a number in a row; they are noted."""
+    columns = {key: np.concatenate([block[key] for block, _ in blocks]) for key in blocks[0][0]}
     lacking = [key for key in columns if is_quantity(key) and not np.isfinite(columns[key]).all()]
     if lacking:
         notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    return {key: values for key, values in columns.items() if key not in lacking}, row
+    return ({key: values for key, values in columns.items() if key not in lacking},
+            np.concatenate([row for _, row in blocks]))
 
 
 def _estimated(text: TextTable, head: Block) -> int:
@@ -282,6 +295,83 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
     yield Recording(poses.columns, poses.row, poses.units, poses.sensor, poses.autopilot)
+
+
+# -------------------------------------------------------------------------- our own tables
+
+def read_poses(path: Path) -> Poses:
+    """
+    Read a pose table.
+
+    Raises
+    ------
+    InputError
+        If the table is empty, lacks columns, or contains a value that is not a finite number.
+    OSError
+        If the file cannot be read.
+
+    """
+    check_regular(path)
+    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
+                   expected=','.join(READING)) as text:
+        layout = text.layout
+        check_once(layout)
+        others = [name for name in layout.header[:_SHOWN] if name not in OURS]
+        keys = present([*(name for name in layout.header if name in OURS), *others],
+                       ('reading',), str(path))
+        columns = with_indices(layout, {name: Source(layout.header.index(name), name)
+                                        for key in keys for name in COLUMNS[key].names})
+        text.choose(columns.numeric, columns.text, spare=len(columns.quantities))
+        blocks = list(_converted(path, text.blocks(), Quantities(columns, units_of('g'))))
+        table, _ = _whole(blocks, [])
+        return Poses(table, numbered(table), **layout.about)
+
+
+def write_table(path: Path, table: Table) -> None:
+    """Write poses or samples; errors as in `write_blocks`."""
+    write_blocks(path, (table,))
+
+
+def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
+    """
+    Write poses or samples block by block, and return the number of rows.
+
+    The memory needed is that of one block. The tables have the same columns, units and sensor. If
+    the file cannot be written (OSError), or the iterable fails, an earlier file is unchanged.
+
+    """
+    rows = 0
+
+    def write(file: TextIO) -> None:
+        nonlocal rows
+        writer = csv.writer(file, lineterminator='\n')
+        keys: list[str] = []
+        for block in blocks:
+            if not keys:
+                keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
+                keys += block.quantities
+                _write_head(file, block)
+                writer.writerow([name for key in keys for name in column_of(key).names])
+            parts = [_as_text(block[key]) for key in keys]
+            writer.writerows(zip(*(column for part in parts for column in part), strict=True))
+            rows += len(block)
+
+    write_atomically(path, write)
+    return rows
+
+
+def _write_head(file: TextIO, table: Table) -> None:
+    for name, value in table.about.items():
+        file.write(f'# {name}: {json.dumps(value, ensure_ascii=False)}\n')
+
+
+def _as_text(values: NDArray[Any]) -> list[list[str]]:
+    """Return the columns of an array as text, with enough digits for all sensors."""
+    if values.dtype.kind in 'US':
+        return [values.tolist()]
+    digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need all digits
+    return [[format(value, digits) for value in column.tolist()]
+            for column in np.atleast_2d(values.T)]
 
 
 # ----------------------------------------------------------------------------- serial ports
@@ -324,11 +414,11 @@ class LineReader:
             raise InputError(f'{name} sends no row of numbers, expected one line for each sample',
                              'check the format of the lines')
         timed = 'time' in columns.sources
-        self._rate_hz = None if timed else options.rate or len(first.row) / seconds
+        rate_hz = options.rate or len(first.row) / seconds
         self._quantities = decided(columns, first, options if timed else
-                                   replace(options, rate=self._rate_hz))
+                                   replace(options, rate=rate_hz))
         self.units = self._quantities.units
-        rate = '' if timed else (f'no times, {self._rate_hz:.4g} Hz '
+        rate = '' if timed else (f'no times, {rate_hz:.4g} Hz '
                                  f'({"stated" if options.rate else "measured"})')
         self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
         self.first = self._recording(first)
@@ -347,8 +437,6 @@ class LineReader:
             return None
         columns, row = self._quantities.columns(cells)
         check_values(columns, self._name)
-        if self._rate_hz is not None:
-            columns['time'] = (row - 1) / self._rate_hz
         return Recording(columns, row, self.units.name) if len(row) else None
 
 
