@@ -225,7 +225,6 @@ def _check_gravity(columns: Chosen, rests: Rests, units: Units | None) -> None:
 
 
 def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName, float]:
-    """Return the unit that the readings at rest show, and the factor to it."""
     own = columns.sources['ax'].name == 'ax'
     if own and rests.unit is None and rests.near(STANDARD_GRAVITY, _STATED_FACTOR):
         return 'm/s2', 1.0

@@ -336,7 +336,6 @@ def _late(bag: Bag, imu: str) -> float:
 
 
 def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[str]:
-    """Return a note about topics that look like a quantity and are not used."""
     topics = dict(sorted({c.topic: c.msgtype for c in bag.reader.connections
                           if c.msgcount and _looks_like(c, quantity)}.items()))
     if used is not None:

@@ -386,7 +386,6 @@ def readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
 
 
 def _not_listed(path: Path, stored: Sequence[Path]) -> list[str]:
-    """Return a note about files of the folder that its metadata do not list."""
     check_regular(path / 'metadata.yaml')
     text = (path / 'metadata.yaml').read_text(encoding='utf-8', errors='replace')
     lost = [each.name for each in stored if each.name not in text]

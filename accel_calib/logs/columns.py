@@ -212,7 +212,6 @@ def _quantities(layout: Layout, used: Container[int], sources: Mapping[str, Sour
 
 
 def _sample(layout: Layout, index: int, rows: int = _FIRST_ROWS) -> list[str]:
-    """Return the cells of a column in the first rows."""
     return [row[index] for row in layout.sample[:rows] if index < len(row)]
 
 
@@ -236,7 +235,6 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
 
 
 def _given(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
-    """Return the columns that the user names."""
     for ours in given:
         if ours not in OURS:
             raise InputError(f'--columns names {ours!r}, expected one of {", ".join(OURS)}',
@@ -296,7 +294,6 @@ def check_once(layout: Layout) -> None:
 
 
 def _own(layout: Layout) -> dict[str, Source]:
-    """Return the columns with our own names."""
     check_once(layout)
     index = {name: k for k, name in enumerate(layout.header)}
     return {name: _source(layout, index[name]) for own in COLUMNS.values()
@@ -304,7 +301,6 @@ def _own(layout: Layout) -> dict[str, Source]:
 
 
 def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
-    """Return the columns of the accelerometer."""
     if set(READING) <= set(found):
         return {}
     header = layout.header
@@ -372,7 +368,6 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
 
 
 def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
-    """Return the columns of time, angular rate, temperature and supply, where they are plain."""
     more: dict[str, Source] = {}
     header = layout.header
     by_quantity: dict[str, list[int]] = {}

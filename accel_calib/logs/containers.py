@@ -130,7 +130,6 @@ def open_table(path: Path, head: bytes, options: LogOptions) -> Iterator[tuple[s
 
 @contextmanager
 def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
-    """Open a container, and yield its tables."""
     if head.startswith(_BLACKBOX):
         raise InputError(f'{path} is a log of the blackbox as the flight controller wrote it, '
                          'expected its CSV file', f'decode it with blackbox_decode {path.name}')
@@ -215,7 +214,6 @@ def _sound_archive(path: Path) -> Iterator[None]:
 
 
 def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
-    """Return the files of an archive that can be logs."""
     infos = [info for info in archive.infolist() if not info.is_dir() and not any(
         part.startswith(('.', '__MACOSX')) or part == 'meta'  # phyphox: about the phone
         for part in Path(info.filename).parts)]
@@ -231,7 +229,6 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
 # ------------------------------------------------------------------------------------ Excel
 
 def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
-    """Yield the sheets of an ``.xlsx`` file, while it is open."""
     size = sum(info.file_size for info in archive.infolist())
     if size > _MOST_BYTES:
         raise InputError(f'{path} unpacks to more than {_MOST_BYTES} bytes, expected a smaller '
@@ -250,7 +247,6 @@ def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
 
 
 def _old_sheets(path: Path) -> list[Member]:
-    """Return the sheets of an ``.xls`` file."""
     with needing('xlrd', 'an Excel file (.xls)'):
         import xlrd
     with sound_log(path, 'an Excel file (.xls)', _AGAIN):
@@ -266,12 +262,10 @@ def _old_sheets(path: Path) -> list[Member]:
 
 
 def _rows(path: Path, rows: Callable[[], Iterator[Sequence[Any]]]) -> _Stream:
-    """Open the rows of a sheet as a CSV file."""
     return _Stream(_csv(_padded(path, rows())))
 
 
 def _csv(rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
-    """Yield rows as lines of a CSV file."""
     while block := list(islice(rows, _ROWS)):
         text = io.StringIO()
         csv.writer(text, lineterminator='\n').writerows(block)
@@ -364,7 +358,6 @@ class Piped(str):
     data: bytes
 
     def __new__(cls, data: bytes) -> Piped:
-        """Return the log with these bytes."""
         made = super().__new__(cls, 'standard input')
         made.data = data
         return made

@@ -187,7 +187,6 @@ def seconds_of(texts: Sequence[str], path: Path, rows: Sequence[int]) -> Floats:
 
 
 def _seconds(text: str) -> float | None:
-    """Return a date in seconds, or None if it is none."""
     match = _CLOCK.fullmatch(text)
     if match is None:
         return None
@@ -287,7 +286,6 @@ def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
 
 
 def _check_text(path: Path, head: Sequence[str], expected: str) -> None:
-    """Check that the head is text, and not empty."""
     bad = sum(len(_UNREADABLE.findall(line)) for line in head)
     if bad > _UNREADABLE_SHARE * sum(map(len, head)):
         raise InputError(f'{path} is not a text file, expected a CSV table',
@@ -308,8 +306,6 @@ class _Found:
 
 
 class _Finder:
-    """Finds the header line and the delimiter in the first lines of a file."""
-
     def __init__(self, head: Sequence[str], is_header: IsHeader) -> None:
         self.head, self.is_header = head, is_header
         self.filled = [k for k, line in enumerate(head) if not line.isspace()]
@@ -428,14 +424,12 @@ def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
 
 
 def _decimal(rows: Sequence[Sequence[str]]) -> str:
-    """Return the decimal mark of the rows; empty if all numbers are whole."""
     found = (_DECIMAL.fullmatch(cell) for row in rows for cell in row)
     marks = {match[1] for match in found if match}
     return ',' if ',' in marks else '.' if marks else ''
 
 
 def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
-    """Return a note about the lines that are no part of the table."""
     if not lines:
         return ()
     mark = ':' if len(lines) == 1 else ', the first is'

@@ -341,7 +341,6 @@ def _ardupilot_temperature(chosen: Message, time: Floats, found: Sequence[Messag
 
 
 def _autopilot(parameters: Parameters, instance: int) -> Autopilot:
-    """Return the place of an accelerometer, numbered from 1."""
     *_, (_, values) = parameters.spans()
     device = values.get(f'INS_ACC{"" if instance == 1 else instance}_ID', 0.0)
     warm = values.get(f'INS_TCAL{instance}_ENABLE', 0.0) != 0.0
@@ -387,7 +386,6 @@ def _indexed(path: Path) -> Any:
 
 
 def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
-    """Return the fields of the messages of a binary log."""
     log = _indexed(path)
     data = np.frombuffer(path.read_bytes(), np.uint8)
     tables, cut = {}, 0
@@ -416,7 +414,6 @@ def _is_sound(form: Any) -> bool:
 
 
 def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
-    """Return the fields of the messages of a text log: ``IMU, 123456, 0, …`` on each line."""
     names: dict[str, list[str]] = {}
     lines: dict[str, list[str]] = {}
     notes: list[str] = []

@@ -239,7 +239,6 @@ def _parted(words: list[str]) -> list[str]:
 
 
 def _axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[str]]:
-    """Return the axis that words or brackets name, and the other words."""
     named = [k for k, word in enumerate(words) if word in _AXES]
     if named:
         k = named[-1]

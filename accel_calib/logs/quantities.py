@@ -27,13 +27,15 @@ from numpy.typing import NDArray
 from .accelerometer import compact, rests_of, unit_of_reading
 from .columns import Chosen, FRACTION, LogOptions, rates_beside, unused
 from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
-from .names import bare_name, COUNTERS, meaning, RATE, READING, TICKS, unit_of, ZEROS
+from .names import (
+    bare_name, COUNTERS, DEGREE, meaning, RATE, READING, TICKS, unit_of, UNITS, ZEROS)
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats
 from ..units import Units, units_of
 
-TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'µs': 1e-6, 'ns': 1e-9}
+TIME_UNITS = dict(UNITS['time'].values())
+"""Factors to seconds, by the name of the unit."""
 
 TICK = 'ticks of 100 µs'
 
@@ -51,7 +53,6 @@ _LARGEST_RATE = 40.0
 """Angular rates [rad/s] above those of common gyros, 2000 °/s."""
 
 _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
-_DEGREE = np.pi / 180.0
 
 _USUAL_HZ = 100.0
 _DAY_S = 86_400.0
@@ -363,7 +364,6 @@ def _decide_time(made: Quantities, first: Cells, options: LogOptions) -> None:
 
 
 def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, str]:
-    """Return the unit of the stamps, and what is assumed."""
     source, layout = made.chosen.sources['time'], made.chosen.layout
     scale = made.chosen.maker and made.chosen.maker.scales.get('time')
     if scale:
@@ -423,7 +423,6 @@ def _says_nothing(columns: Chosen, options: LogOptions) -> bool:
 # ---------------------------------------------------------------------------------- context
 
 def _drop(made: Quantities, keys: Sequence[str], note: str) -> None:
-    """Leave columns out, and note why."""
     sources = {key: value for key, value in made.chosen.sources.items() if key not in keys}
     made.chosen = replace(made.chosen, sources=sources)
     made.notes.append(note)
@@ -446,7 +445,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
         _drop(made, RATE, f'the angular rates {words} look like counts and are not used: state '
               'their unit in the names, such as gyroX_dps')
         return
-    unit, factor = stated or (('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', _DEGREE))
+    unit, factor = stated or (('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
     made.scale(RATE, factor)
     made.said.append(f'{words} in {unit}' + ('' if unit == 'rad/s' else ' -> rad/s')
                      + ('' if stated else ' (assumed)'))

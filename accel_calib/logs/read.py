@@ -161,7 +161,6 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
 
 @contextmanager
 def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog]:
-    """Open a log; parameters and errors as in `open_log`."""
     if not isinstance(path, Path):
         name = Path(str(path))
         with path.table.text(name, options) as text:
@@ -224,8 +223,7 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     columns = chosen(text.layout, options)
-    text.choose(columns.numeric, columns.text, columns.dates, spare=len(columns.quantities),
-                skip_bad=options.skip_bad)
+    text.choose(columns, skip_bad=options.skip_bad)
     cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
@@ -235,7 +233,6 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 
 def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities,
              options: LogOptions) -> OpenLog:
-    """Return a text log whose columns and units are known."""
     blocks = _converted(path, cells, quantities)
     head = next(blocks)
     units, about = quantities.units, text.layout.about
@@ -263,7 +260,6 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
 
 
 def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
-    """Yield blocks in our units."""
     for block in cells:
         columns, row = quantities.columns(block)
         check_values(columns, str(path))
@@ -321,7 +317,7 @@ def read_poses(path: Path) -> Poses:
                        ('reading',), str(path))
         columns = with_indices(layout, {name: Source(layout.header.index(name), name)
                                         for key in keys for name in COLUMNS[key].names})
-        text.choose(columns.numeric, columns.text, spare=len(columns.quantities))
+        text.choose(columns)
         blocks = list(_converted(path, text.blocks(), Quantities(columns, units_of('g'))))
         table, _ = _whole(blocks, [])
         return Poses(table, numbered(table), **layout.about)
@@ -407,8 +403,7 @@ class LineReader:
         self._name = name
         columns = chosen(layout, options)
         self._table = TextTable(layout, iter(()), strict=False)
-        self._table.choose(columns.numeric, columns.text, columns.dates,
-                           spare=len(columns.quantities), skip_bad=True)
+        self._table.choose(columns, skip_bad=True)
         first = self._table.read(lines[layout.start:])
         if not len(first.row):
             raise InputError(f'{name} sends no row of numbers, expected one line for each sample',

@@ -20,6 +20,7 @@ import io
 from itertools import chain, islice
 from operator import methodcaller
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ from .dialect import is_clock, is_comment, is_number, IsHeader, Layout, layout_o
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
+
+if TYPE_CHECKING:
+    from .columns import Chosen
 
 ROWS = 65536
 """Number of lines in a block."""
@@ -138,16 +142,15 @@ class TextTable:
         self.characters = 0
         self.more = False
 
-    def choose(self, numeric: Sequence[int], text: Sequence[int] = (), dates: Sequence[int] = (),
-               *, spare: int = 0, skip_bad: bool = False) -> None:
+    def choose(self, columns: Chosen, *, skip_bad: bool = False) -> None:
         """
-        Set the columns of numbers, text and dates to read; bad rows raise unless `skip_bad`.
+        Set the columns to read; bad rows raise unless `skip_bad`.
 
-        In the last columns of numbers, `spare` of them, other cells are NaN.
+        In the last columns of numbers, the quantities, other cells are NaN.
 
         """
-        self._numeric, self._text, self._dates = tuple(numeric), tuple(text), tuple(dates)
-        self._needed = self._numeric[:len(self._numeric) - spare]
+        self._numeric, self._text, self._dates = columns.numeric, columns.text, columns.dates
+        self._needed = self._numeric[:len(self._numeric) - len(columns.quantities)]
         self._spare = self._numeric[len(self._needed):]
         self._skip_bad = skip_bad
 

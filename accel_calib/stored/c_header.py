@@ -123,7 +123,6 @@ def _value(polynomial: Floats, s: Floats) -> Floats:
 
 
 def _header_of(calibration: Calibration) -> Header:
-    """Return the numbers of the header of a calibration."""
     low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE,) * 2
     middle, half = (low + high) / 2.0, max((high - low) / 2.0, 1e-3)
     count, units = 4 * _LARGEST_DEGREE, calibration.units
@@ -218,7 +217,6 @@ def _equation(header: Header) -> list[str]:
 
 
 def _literal(value: float) -> str:
-    """Return a C literal of a float."""
     text = str(np.float32(value))
     return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
 
@@ -303,7 +301,6 @@ def _added(header: Header, axis: int) -> str:
 
 
 def _monomial(index: int) -> str:
-    """Return the C expression of a bending monomial."""
     x, size = (f'u[{(index - SQUARE) % 3}]', '({0} < 0.0f ? -{0} : {0})')
     if index >= WAVE:
         mode, axis = divmod(index - WAVE, 3)

@@ -89,7 +89,6 @@ def _affine(calibration: Calibration, factor: float = 1.0) -> tuple[Floats, Floa
 
 
 def _make_imu_calib(calibration: Calibration) -> Made:
-    """Return the YAML file of the ROS package imu_calib."""
     matrix, constant, correct = _affine(calibration)
     lines = ['SM:', *(f'  - {_yaml_number(value)}' for value in matrix.ravel().tolist()),
              'bias:', *(f'  - {_yaml_number(value)}' for value in constant.tolist())]
@@ -119,7 +118,6 @@ def _make_imucal(calibration: Calibration) -> Made:
 
 
 def _make_json(calibration: Calibration) -> Made:
-    """Return all values as JSON."""
     return Made(_json(_content(calibration)), None, True, _affine_alone(calibration))
 
 
@@ -150,7 +148,6 @@ def _affine_alone(calibration: Calibration) -> tuple[str, ...]:
 
 
 def _content(calibration: Calibration) -> dict[str, Any]:
-    """Return the values of a calibration by name."""
     quality, model = calibration.quality, calibration.model
     return {
         'format': 'accel_calib export', 'package_version': __version__, 'equation': CORRECTION,

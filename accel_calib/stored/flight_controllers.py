@@ -254,12 +254,10 @@ def _signs(options: Options) -> Floats:
 
 
 def _device(options: Options, prefix: str) -> Parameters:
-    """Return the parameter with the device id, if it is known."""
     return {} if options.device_id is None else {f'{prefix}ID': options.device_id}
 
 
 def _three(start: str, end: str, values: Floats) -> Parameters:
-    """Return three parameters by axis."""
     return {f'{start}{axis}{end}': float(value) for axis, value in zip('XYZ', values)}
 
 

@@ -28,9 +28,9 @@ from yaml.resolver import Resolver
 from ..table import Floats
 
 try:  # eight times as fast, but not in every build of PyYAML
-    from yaml import CSafeDumper as SafeDumper, CSafeLoader as SafeLoader
+    from yaml import CSafeLoader as SafeLoader
 except ImportError:
-    from yaml import SafeDumper, SafeLoader  # type: ignore[assignment]
+    from yaml import SafeLoader  # type: ignore[assignment]
 
 Kind = TypeVar('Kind')
 
@@ -55,19 +55,6 @@ _WHOLE = re.compile(r'[-+]?(?:0|[1-9][0-9]*)')
 _NOT_FINITE = re.compile(r'[-+]?\.(?:nan|inf)', re.IGNORECASE)
 _EXPECTED: Mapping[type, str] = {dict: 'names with values', list: 'a list', str: 'text',
                                  int: 'a whole number'}
-
-
-class _Dumper(SafeDumper):
-    """The safe dumper without anchors: equal lists are written in full."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def format_plain(content: Mapping[str, Any]) -> str:
-    """Return the text of a mapping; lists of numbers are in one line as far as they fit."""
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99,
-                     default_flow_style=None)
 
 
 def read_plain(text: str) -> Any:
