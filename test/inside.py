@@ -60,9 +60,6 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.intake import poses_of
 from accel_calib.live import sources
-from accel_calib.live.messages import (
-    CALIBRATION_ALONE, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE, log as live_log,
-    PERIOD as LIVE_PERIOD)
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.logs import are_samples, bag_samples, bounded_bags, layout_with, open_bag, text
 from accel_calib.logs.bag_samples import together
@@ -153,9 +150,11 @@ DECOMPRESSED = bounded_bags, 'decompressed'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer
-    from accel_calib.live.host import Host
-    from accel_calib.live.server import PageServer
-    from accel_calib.live.viewer import announce, qr_code, reachable
+    from accel_calib.live.host import Host, log_line as live_log
+    from accel_calib.live.server import PageServer, PERIOD as LIVE_PERIOD
+    from accel_calib.live.viewer import (
+        announce, CALIBRATION_ALONE, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
+        qr_code, reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'

@@ -21,29 +21,35 @@ from contextlib import suppress
 import math
 from queue import Empty, SimpleQueue
 from time import monotonic, time
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from . import messages
-from .messages import PERIOD
-from .server import PageServer
+from .server import PageServer, PERIOD
+from .viewer import Message, OFFERED
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
-from ..findings import rate
+from ..findings import rate, residual_figures
+from ..geometry import words_of
 from ..messages.one_reading import Triple
 from ..report.page import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, Compute, Log, LogFilter, Session, Severity,
-    ShowPoses, state, Task, Worker)
+    Answer, BATCH, CalibratorSettings, CallSoon, checks, Compute, Level, Log, LogFilter, Progress,
+    Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
+from ..units import MG
 
 if TYPE_CHECKING:
     from .sources import Source
 
-Show = Callable[[messages.Message], object]
+Show = Callable[[Message], object]
 """Function that shows a message to all viewers."""
+
+_DIGITS = 7
+_DECIMALS = 6
+_NEAR = 0.38
+"""Component of a unit vector above which a side points up: about half of that of an edge."""
 
 _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and press Fit')
 
@@ -89,16 +95,17 @@ class Exchange:
 
     def show_progress(self, reading: Triple | None = None) -> None:
         """Show the progress; the parameter is as in `state.progress`."""
-        self.show(messages.progress(monotonic(), state.progress(self._session, reading)))
+        self.show(_progress(monotonic(), state.progress(self._session, reading)))
 
     def show_poses(self, event: ShowPoses) -> None:
-        """Show the poses."""
-        self.show(messages.poses(event.up))
+        """Show the poses, and the state that may have changed with them."""
+        self.show(_poses(event.up))
+        self.show_state()
 
     def show_line(self, line: Log) -> None:
         """Show a log line."""
         self._line += 1
-        self.show(messages.log(self._line, line.severity, line.words, time()))
+        self.show(log_line(self._line, line.severity, line.words, time()))
 
     def show_state(self) -> None:
         """Show the state; the server sends it only if it has changed."""
@@ -106,13 +113,13 @@ class Exchange:
         if session.sensor.present is not self._shown:
             self._shown = session.sensor.present
             self._number += 1
-        self.show(messages.state(
+        self.show(_state(
             session, self.problem, busy=next(iter(self._worker.running), ''), page=self._number))
 
     # The page asks; these are called in the thread of the server
 
     def ask(self, command: str, answer: Answer) -> None:
-        """Run a command of `messages.COMMANDS`, and call `answer`."""
+        """Run a command of `viewer.COMMANDS`, and call `answer`."""
         self._call_soon(lambda: self._ask(command, answer))
 
     def page(self, answer: Answer) -> None:
@@ -148,7 +155,7 @@ class Exchange:
         if name in ('enable', 'disable'):
             return commands.enable(name == 'enable')
         command = getattr(commands, name)
-        return (yield from command(offered=True) if name in messages.OFFERED else command())
+        return (yield from command(offered=True) if name in OFFERED else command())
 
     def _draw(self, answer: Answer) -> None:
         """Draw the calibration page, unless it is drawn already."""
@@ -197,6 +204,116 @@ def drawn(calibration: Calibration, source: str, stored: str) -> str:
     return calibration_page(calibration, rate(calibration), source, stored=stored)
 
 
+def _progress(time: float, now: Progress) -> Message:
+    """Return the progress of a calibration at a time [s]."""
+    return {
+        'kind': 'progress', 'time': round(time, 3), 'still': now.still,
+        'stillness': _fixed(now.stillness), 'dwell': _fixed(now.dwell),
+        'min_dwell': now.min_dwell, 'poses': now.poses, 'total': now.total,
+        'coverage': _fixed(now.coverage), 'accuracy_mg': _fixed(now.accuracy * MG),
+        'step': now.step, 'advice': now.advice, 'command': now.command,
+        'direction': list(now.direction),
+        'up': [round(part, _DECIMALS) for part in now.up], 'raw': _fixed(now.length),
+        'corrected': _fixed(now.corrected), 'temperature': _fixed(now.temperature)}
+
+
+def _poses(up: Floats) -> Message:
+    """Return the poses: (n, 3) directions of up in the sensor axes, unit vectors."""
+    return {'kind': 'poses', 'up': _rounded(up),
+            'words': [_side_up(direction) for direction in up]}
+
+
+def log_line(number: int, severity: Severity, words: str, time: float) -> Message:
+    """Return a log line with its number; `time` is that since 1970 [s]."""
+    return {'kind': 'log', 'number': number, 'severity': severity, 'words': words,
+            'time': round(time, 3)}
+
+
+def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
+    """
+    Return the state of a session.
+
+    Parameters
+    ----------
+    session : Session
+        The session; the calibration that is offered, or otherwise the one in use, is shown.
+    problem : str
+        What the user must know before all else; empty: the most severe finding.
+    busy : str
+        Name of the command that runs; may be empty.
+    page : int
+        Number of the calibration page.
+
+    """
+    sensor = session.sensor
+    in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
+    return {
+        'kind': 'state', 'sensor': session.name, 'source': session.topic,
+        'state': words_of_state(session), 'problem': problem or _problem(session),
+        'calibration': '' if in_use is None else title(in_use),
+        'preview': sensor.offered is not None,
+        'levelled': shown is not None and shown.is_levelled,
+        'file': session.files.path, 'busy': busy,
+        'counts_per_g': None if shown is None else _counts_per_g(shown),
+        'rating': None if shown is None or rating is None else {
+            'rating': rating.name, 'reason': rating.reason},
+        'result': None if shown is None else _result(shown),
+        'page': '' if shown is None else f'/calibration.html?{page}'}
+
+
+def _problem(session: Session) -> str:
+    """Return the most severe finding, other than that there is no calibration yet."""
+    found = [each for each in checks(session) if each.level > Level.OK and (
+        each.name != 'calibration' or session.sensor.calibration or session.problem)]
+    return max(found, key=lambda each: each.level).words if found else ''
+
+
+def _result(calibration: Calibration) -> Message:
+    """Return the numbers of a calibration."""
+    quality, used = calibration.quality, len(calibration.used_poses)
+    return {
+        'model': calibration.name, 'date': calibration.date, 'unit': calibration.units.name,
+        'poses': used, 'left_out': len(calibration.poses) - used,
+        'coverage': _number(quality.coverage),
+        'residuals': [[figure.label, _number(figure.value), figure.unit]
+                      for figure in residual_figures(quality)],
+        'effects': list(calibration.model.effects), 'warnings': list(calibration.warnings),
+        'offset': _rounded(calibration.offset), 'offset_sd': _rounded(calibration.offset_sd),
+        'gain': _rounded(calibration.gain), 'gain_sd': _rounded(calibration.gain_sd)}
+
+
+def _counts_per_g(calibration: Calibration) -> float | None:
+    """Return the mean sensitivity of a sensor in native units; None in other units."""
+    if not calibration.units.is_native:
+        return None
+    return _number(float(np.mean(np.linalg.norm(calibration.gain, axis=0))))
+
+
+def _fixed(value: float) -> float | None:
+    """Return a number with the decimals of progress; this is faster than `_number`."""
+    return round(value, _DECIMALS) if math.isfinite(value) else None
+
+
+def _number(value: float | None) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f'{value:.{_DIGITS}g}')
+
+
+def _rounded(values: Any) -> Any:
+    """Return an array as lists."""
+    array = np.asarray(values, float)
+    if array.ndim == 0:
+        return _number(float(array))
+    return [_rounded(each) for each in array]
+
+
+def _side_up(direction: Floats) -> str:
+    """Return the side, edge or corner nearest to a direction, such as ``front side``."""
+    signs = np.where(np.abs(direction) > _NEAR, np.sign(direction), 0.0)
+    return words_of(signs).removeprefix('the ')
+
+
 _TICK = 1.0
 """Interval between two checks of the stream [s]."""
 
@@ -239,7 +356,6 @@ class Host:
         except AccelCalibError:
             self._end_session()
             raise
-        self.exchange.show = self.server.show
 
     def run(self, is_over: Callable[[], bool]) -> None:
         """Serve until `is_over`, which is called about 20 times per second, returns true."""
@@ -344,7 +460,6 @@ class Host:
                 self._log(event)
             elif isinstance(event, ShowPoses):
                 self.exchange.show_poses(event)
-                self.exchange.show_state()
             elif isinstance(event, Generator):
                 self._worker.run(event, self._on_done)
 

@@ -17,28 +17,34 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from concurrent.futures import Future
+from dataclasses import dataclass
 import hmac
 from importlib.resources import files
 from ipaddress import ip_address
 import secrets
 import socket
 from threading import Thread
-from typing import Any, cast, Protocol, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from aiohttp import web
 
-from . import messages
 from .viewer import (
-    announce, Connection, not_bound, reachable, secured, STUCK_S, TooManyError, Viewer)
+    announce, Connection, HISTORY_S, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
+    text_of, TooManyError, Viewer, welcome)
 from ..report.sheet import policy
-from ..session import Answer, Log, LogFilter
-from ..stored.exports import Exported, FORMATS
+from ..session import Log, LogFilter
+from ..stored.exports import FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from importlib.resources.abc import Traversable
     from pathlib import Path
+
+    from .host import Exchange
+
+PERIOD = 0.05
+"""Interval between two messages of progress [s]."""
 
 _VIEWERS = 16
 """Largest number of viewers, and of connections that have not said hello yet."""
@@ -69,20 +75,84 @@ _WRONG_TOKEN = 'the token of this link is of another start of the program, so it
                f'{_ITS_LINK}'
 
 
-class Desk(Protocol):
-    """What the server asks for, in its own thread; `exchange.Exchange` is one."""
+class Board:
+    """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
-    def ask(self, command: str, answer: Answer) -> None:
-        """Run a command, and call `answer`."""
+    def __init__(self) -> None:
+        self._newest: dict[str, tuple[Message, str]] = {}
+        self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
+        self.history: deque[Message] = deque(maxlen=int(HISTORY_S / PERIOD))
 
-    def page(self, answer: Answer) -> None:
-        """Call `answer` with the calibration page, or why there is none."""
+    def take(self, message: Message, *, is_seen: bool) -> bool:
+        """Keep a message; return whether it is new. `is_seen`: there are viewers."""
+        kind = message['kind']
+        if kind == 'log':
+            self._lines.append((message['number'], text_of(message)))
+            return True
+        before = self._newest.get(kind, ({}, ''))[0]
+        if before is message or (kind != 'progress' and before == message):
+            return False
+        self._newest[kind] = message, text_of(message) if is_seen else ''
+        return True
 
-    def export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
-        """Call `answer` with an export, or why there is none."""
+    def newest(self, kind: str) -> tuple[Message, str] | None:
+        """Return the newest message of a kind, and its text."""
+        found = self._newest.get(kind)
+        if found is not None and not found[1]:
+            found = self._newest[kind] = found[0], text_of(found[0])
+        return found
 
-    def warn(self, words: str) -> None:
-        """Log a warning."""
+    def lines_after(self, number: int) -> list[tuple[int, str]]:
+        """Return the log lines with larger numbers."""
+        if not self._lines or self._lines[-1][0] <= number:
+            return []
+        return [line for line in self._lines if line[0] > number]
+
+    def welcome(self, why: str) -> str:
+        """Return the answer to ``hello``; the parameter is as in `viewer.welcome`."""
+        return text_of(welcome(why, self.history.copy()))
+
+
+@dataclass(frozen=True)
+class Address:
+    """The port, names and versions of IP by which a browser may call this server."""
+
+    port: int
+    hosts: frozenset[str]
+    versions: frozenset[int]
+
+    @classmethod
+    def of(cls, sockets: Iterable[socket.socket]) -> Address:
+        """Return the address of a server that listens on these sockets."""
+        bound = [each.getsockname() for each in sockets]
+        own = socket.gethostname().lower()
+        names = {own, own.split('.')[0]}
+        return cls(bound[0][1],
+                   frozenset({'localhost', *names, *(f'{name}.local' for name in names)}),
+                   frozenset(ip_address(each[0].split('%')[0]).version for each in bound))
+
+    def refusal(self, request: web.BaseRequest) -> str:
+        """Return why a request is refused by its Host or Origin; empty if it is not."""
+        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
+        if len(hosts) != 1 or not self._is_own(hosts[0]):
+            return 'the header Host is not an address of this server; open its own link'
+        if origins and [each.lower() for each in origins] != [f'http://{hosts[0].lower()}']:
+            return 'the header Origin is of another site; open the link of this server'
+        return ''
+
+    def _is_own(self, host: str) -> bool:
+        """Return whether a Host is an address of this server, with its port."""
+        try:
+            parts = urlsplit(f'//{host}')
+            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
+        except ValueError:
+            return False
+        if port != self.port or '@' in host or parts.path or parts.query or parts.fragment:
+            return False
+        try:
+            return ip_address(name).version in self.versions
+        except ValueError:
+            return name in self.hosts
 
 
 class PageServer:
@@ -91,8 +161,8 @@ class PageServer:
 
     Parameters
     ----------
-    desk : Desk
-        What answers the viewers.
+    desk : Exchange
+        What answers the viewers; it is called in the thread of the server.
     host : str
         Address to bind to.
     port : int
@@ -107,23 +177,19 @@ class PageServer:
 
     """
 
-    def __init__(self, desk: Desk, host: str, port: int) -> None:
+    def __init__(self, desk: Exchange, host: str, port: int) -> None:
         self._desk, self._host, self._port = desk, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._over: asyncio.Event | None = None
         self._thread: Thread | None = None
         self._link_file: Path | None = None
-        self._newest: dict[str, tuple[messages.Message, str]] = {}
-        self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
-        self._history: deque[messages.Message] = deque(
-            maxlen=int(messages.HISTORY_S / messages.PERIOD))
+        self.board = Board()
         self.viewers: list[Viewer] = []
         self._new: list[Viewer] = []
         self._connections: list[Connection] = []
         self._reported, self._filter = Counter[str](), LogFilter()
-        self._hosts: frozenset[str] = frozenset()
-        self._versions: frozenset[int] = frozenset()
+        self._address = Address(port, frozenset(), frozenset())
         page = files(__package__) / 'page'
         self._files: dict[str, Traversable] = {
             f'/page/{each.name}': each for each in page.iterdir()
@@ -143,6 +209,7 @@ class PageServer:
         except OSError as error:
             self._thread.join()
             raise not_bound(error, self._host, self._port) from error
+        self._desk.show = self.show
 
     def close(self) -> None:
         """Close all viewers, and stop serving."""
@@ -158,10 +225,10 @@ class PageServer:
         words, self._link_file = announce(self.link, f'live_page_{self._port}.txt')
         return words
 
-    def show(self, message: messages.Message) -> None:
+    def show(self, message: Message) -> None:
         """Show a message to all viewers, and keep it for those who come later."""
         if message['kind'] == 'progress':  # without waking the thread of the server
-            self._history.append(message)
+            self.board.history.append(message)
         else:
             self._call(lambda: self._take(message))
 
@@ -193,7 +260,8 @@ class PageServer:
         except Exception as error:  # `start` raises it, in its own thread
             started.set_exception(error)
             return
-        self._know_names([each.getsockname() for each in listener.sockets])
+        self._address = Address.of(listener.sockets)
+        self._port = self._address.port
         self._over = asyncio.Event()
         started.set_result(None)
         self._look()
@@ -231,56 +299,23 @@ class PageServer:
         if self._filter.passes(Log('warning', what, what, _QUIET_S)):
             self._desk.warn(f'the live page {what} ({self._reported[what]} so far)')
 
-    def _know_names(self, addresses: list[Any]) -> None:
-        """Note the port, and the names by which a browser may call this server."""
-        self._port = addresses[0][1]
-        self._versions = frozenset(ip_address(each[0].split('%')[0]).version
-                                   for each in addresses)
-        own = socket.gethostname().lower()
-        names = {own, own.split('.')[0]}
-        self._hosts = frozenset({'localhost', *names, *(f'{name}.local' for name in names)})
-
     def _look(self) -> None:
         """Show the newest progress, close stuck viewers, and look again."""
         loop = asyncio.get_running_loop()
         wait = _RARELY_S
         if self.viewers:
-            wait = messages.PERIOD
-            if self._history:
-                self._take(self._history[-1])
+            wait = PERIOD
+            if self.board.history:
+                self._take(self.board.history[-1])
             for viewer in list(self.viewers):
                 viewer.abort_if_stuck(loop.time())
         loop.call_later(wait, self._look)
 
-    def _take(self, message: messages.Message) -> None:
+    def _take(self, message: Message) -> None:
         """Keep a message, and wake the viewers."""
-        kind = message['kind']
-        if kind == 'log':
-            self._lines.append((message['number'], messages.text_of(message)))
-        else:
-            before = self._newest.get(kind, ({}, ''))[0]
-            if before is message or (kind != 'progress' and before == message):
-                return
-            self._newest[kind] = message, messages.text_of(message) if self.viewers else ''
-        for viewer in self.viewers:
-            viewer.wake()
-
-    def newest(self, kind: str) -> tuple[messages.Message, str] | None:
-        """Return the newest message of a kind, and its text."""
-        found = self._newest.get(kind)
-        if found is not None and not found[1]:
-            found = self._newest[kind] = found[0], messages.text_of(found[0])
-        return found
-
-    def lines_after(self, number: int) -> list[tuple[int, str]]:
-        """Return the log lines with larger numbers."""
-        if not self._lines or self._lines[-1][0] <= number:
-            return []
-        return [line for line in self._lines if line[0] > number]
-
-    def welcome(self, why: str) -> str:
-        """Return the answer to ``hello``; the parameter is as in `messages.welcome`."""
-        return messages.text_of(messages.welcome(why, self._history.copy()))
+        if self.board.take(message, is_seen=bool(self.viewers)):
+            for viewer in self.viewers:
+                viewer.wake()
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())
@@ -289,7 +324,7 @@ class PageServer:
         """Answer a request."""
         connection = cast('Connection', request.protocol)
         connection.stage = 1
-        refusal = self._refusal(request)
+        refusal = self._address.refusal(request)
         if refusal:
             return secured(web.Response(status=403, text=f'{refusal}\n'))
         path = request.rel_url.raw_path if request.method == 'GET' else ''
@@ -308,29 +343,6 @@ class PageServer:
             return web.Response(status=404, text='there is no such page; open /\n')
         return web.Response(body=file.read_bytes(), content_type=_kind_of(file.name),
                             charset=None if file.name.endswith('.png') else 'utf-8')
-
-    def _refusal(self, request: web.BaseRequest) -> str:
-        """Return why a request is refused by its Host or Origin; empty if it is not."""
-        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
-        if len(hosts) != 1 or not self._is_own(hosts[0]):
-            return 'the header Host is not an address of this server; open its own link'
-        if origins and [each.lower() for each in origins] != [f'http://{hosts[0].lower()}']:
-            return 'the header Origin is of another site; open the link of this server'
-        return ''
-
-    def _is_own(self, host: str) -> bool:
-        """Return whether a Host is an address of this server, with its port."""
-        try:
-            parts = urlsplit(f'//{host}')
-            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
-        except ValueError:
-            return False
-        if port != self._port or '@' in host or parts.path or parts.query or parts.fragment:
-            return False
-        try:
-            return ip_address(name).version in self._versions
-        except ValueError:
-            return name in self._hosts
 
     async def _page(self) -> web.Response:
         """Return the calibration page."""
@@ -369,7 +381,7 @@ class PageServer:
                       ) -> web.StreamResponse:
         """Serve a viewer until it ends."""
         socket_ = secured(web.WebSocketResponse(
-            heartbeat=STUCK_S / 1.5, max_msg_size=messages.LARGEST, compress=False))
+            heartbeat=STUCK_S / 1.5, max_msg_size=LARGEST, compress=False))
         if not socket_.can_prepare(request).ok:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)

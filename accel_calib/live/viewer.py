@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The link of the live page, its connections, and its viewers.
+The link of the live page, its connections, its viewers, and the messages that they exchange.
+
+All messages are JSON. A viewer sends ``hello`` first and then ``ask``. The server sends messages
+with a ``kind``. Numbers that are not known are null. Lengths of vectors are in g, errors in mg,
+temperatures in °C, and times in seconds: of a log line since 1970, otherwise of a steady clock.
 
 A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
 viewer is a connection that has become a WebSocket.
@@ -17,22 +21,26 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 import errno
 from http import HTTPStatus
 import io
 from ipaddress import ip_address
+import json
 import math
 import os
 from pathlib import Path
 import socket
 import sys
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from aiohttp import web, WSCloseCode, WSMsgType
 
-from . import messages
+from .. import __version__
 from ..errors import InputError
 from ..session import ros_home
+from ..stored.exports import CALIBRATION_ALONE
 
 if TYPE_CHECKING:
     from .server import PageServer
@@ -57,10 +65,95 @@ _HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
                 "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
                 "frame-ancestors 'none'")}
 
+Message = Mapping[str, Any]
+
+OFFERED = ('fit', 'refine', 'set_level', 'set_heading', 'calibrate_at_rest')
+"""Commands whose result is offered as a preview."""
+
+COMMANDS = ('capture_pose', 'undo_pose', *OFFERED, 'save', 'undo', 'load', 'reset', 'enable',
+            'disable')
+"""Commands of the page."""
+
+LARGEST = 4096
+"""Largest message of a viewer [bytes]."""
+
+HISTORY_S = 60.0
+"""Time for which a new viewer gets the history [s]."""
+
+_HISTORY = ('time', 'raw', 'corrected', 'temperature')
+
 Answered = TypeVar('Answered', bound=web.StreamResponse)
 
 _BUFFER = 65536
 """Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The first message: the token, and the number of the last log line that the viewer has."""
+
+    token: str
+    seen: int
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A command, with a number for its answer."""
+
+    id: int  # noqa: A003, the name in the message
+    command: str
+
+
+def request_of(text: str) -> Hello | Ask:
+    """
+    Return the message of a viewer.
+
+    Raises
+    ------
+    InputError
+        If the text is not such a message.
+
+    """
+    wrong = InputError('the message is not understood, expected {"hello": {"token", "seen"}} or '
+                       '{"ask": {"id", "command"}}', 'load the page again')
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        raise wrong from None
+    match found:
+        case {'hello': {'token': str(token), 'seen': int(seen)}}:
+            return Hello(token, seen)
+        case {'ask': {'id': int(number), 'command': str(command)}}:
+            return Ask(number, command)
+    raise wrong
+
+
+def text_of(message: Message) -> str:
+    """Return a message as JSON."""
+    return json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(',', ':'))
+
+
+def welcome(why: str, history: Iterable[Message]) -> Message:
+    """
+    Return the answer to ``hello``.
+
+    Parameters
+    ----------
+    why : str
+        Why commands are not accepted; empty if they are.
+    history : iterable of dict
+        Messages of `progress`, the oldest first.
+
+    """
+    kept = list(history)
+    return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
+            'seconds': HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
+            'history': {key: [each[key] for each in kept] for key in _HISTORY}}
+
+
+def answer_of(number: int, success: bool, words: str) -> Message:
+    """Return the answer to ``ask``."""
+    return {'kind': 'answer', 'id': number, 'success': success, 'words': words}
 
 
 def qr_code(link: str) -> str:
@@ -205,7 +298,7 @@ class Viewer:
     def __init__(self, server: PageServer, websocket: web.WebSocketResponse,
                  connection: Connection) -> None:
         self._server, self._socket, self.abort = server, websocket, connection.abort
-        self._sent: dict[str, messages.Message] = {}
+        self._sent: dict[str, Message] = {}
         self._answers: deque[str] = deque()
         self._seen = 0
         self.why, self._asking = '', 0
@@ -229,12 +322,12 @@ class Viewer:
         sending: asyncio.Task[None] | None = None
         try:
             hello = await self._next(_HELLO_S)
-            if isinstance(hello, messages.Hello):
+            if isinstance(hello, Hello):
                 self._seen = hello.seen
                 self._server.admit(self, hello.token)
                 sending = asyncio.create_task(self._send_all())
                 while request := await self._next(None):
-                    if isinstance(request, messages.Ask):
+                    if isinstance(request, Ask):
                         self._ask(request)
         except TooManyError as error:
             await self._socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=str(error).encode())
@@ -248,16 +341,16 @@ class Viewer:
             if sending is not None:
                 sending.cancel()
 
-    async def _next(self, timeout: float | None) -> messages.Hello | messages.Ask | None:
+    async def _next(self, timeout: float | None) -> Hello | Ask | None:
         """Return the next message of the viewer; None: it has ended."""
         message = await self._socket.receive(timeout=timeout)
-        return messages.request_of(message.data) if message.type is WSMsgType.TEXT else None
+        return request_of(message.data) if message.type is WSMsgType.TEXT else None
 
-    def _ask(self, request: messages.Ask) -> None:
+    def _ask(self, request: Ask) -> None:
         """Run a command, if the viewer may."""
         def answer(success: bool, words: str) -> None:
             self._asking -= 1
-            self._answers.append(messages.text_of(messages.answer(request.id, success, words)))
+            self._answers.append(text_of(answer_of(request.id, success, words)))
             self.wake()
 
         if self._asking + len(self._answers) >= _COMMANDS:
@@ -265,16 +358,16 @@ class Viewer:
         self._asking += 1
         if self.why:
             answer(False, self.why)
-        elif request.command not in messages.COMMANDS:
+        elif request.command not in COMMANDS:
             answer(False, f'the page asks for {request.command[:40]!r}, expected one of '
-                   f'{", ".join(messages.COMMANDS)}; load the page again')
+                   f'{", ".join(COMMANDS)}; load the page again')
         else:
             self._server.ask(request.command, answer)
 
     async def _send_all(self) -> None:
         """Send what is new, until the viewer ends or takes no data."""
         try:
-            await self._send(self._server.welcome(self.why))
+            await self._send(self._server.board.welcome(self.why))
             while True:
                 self._news.clear()
                 await self._send_new()
@@ -285,11 +378,11 @@ class Viewer:
     async def _send_new(self) -> None:
         """Send the log lines, the newest message of each kind, and then the answers."""
         answers = len(self._answers)  # later ones may be about a state that is not sent yet
-        for number, text in self._server.lines_after(self._seen):
+        for number, text in self._server.board.lines_after(self._seen):
             await self._send(text)
             self._seen = number
         for kind in ('state', 'poses', 'progress'):
-            newest = self._server.newest(kind)
+            newest = self._server.board.newest(kind)
             if newest is not None and newest[0] is not self._sent.get(kind):
                 self._sent[kind] = newest[0]
                 await self._send(newest[1])

@@ -5,9 +5,9 @@
 The ROS nodes. They only convert messages, call other parts, and publish the results.
 
 `calibrator_node` and `simulator_node` are the nodes; `run` has the executables, which start, spin
-and end them. In the calibrator, `stream` processes Imu messages, `display` makes diagnostics,
-markers and the live page, and `transforms` reads and publishes the mounting. `declare` declares
-parameters and the quality of service. `watch` receives the progress, and `demo` runs both nodes.
+and end them. In the calibrator, `stream` processes Imu messages. `declare` declares parameters,
+services, the quality of service and static transforms. `watch` receives the progress, and `demo`
+runs both nodes.
 
 All callbacks run in one thread, and only callbacks use the session.
 

@@ -17,37 +17,41 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from queue import SimpleQueue
+from collections.abc import Callable, Iterable
 from time import monotonic
-from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from diagnostic_msgs.srv import SelfTest
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import Point, Vector3Stamped
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool, String
-from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import MarkerArray
+from std_msgs.msg import Bool, ColorRGBA, String
+from std_srvs.srv import SetBool
+from visualization_msgs.msg import Marker, MarkerArray
 
 from .declare import (
-    CALLS, declared, follow, LATCHED, mismatches, name_of, published_by_others, SENSOR, STREAM)
-from .display import diagnostics_of, Page, pose_markers, progress_of, self_test_of
+    CALLS, declared, follow, in_executor, LATCHED, mismatches, MountingBroadcaster, name_of,
+    published_by_others, SENSOR, serve, STREAM, watch_static)
 from .stream import ContextTopics, Stream
-from .transforms import MountingBroadcaster, watch_static
+from ..calibrate import NextPose
 from ..errors import AccelCalibError
+from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, context_topics, Event, Log, LogFilter, Mounting, Result, Session,
-    ShowPoses, state, Still, Task, Worker)
+    CalibratorSettings, Check, checks, context_topics, Event, figures, Level, Log, LogFilter,
+    Mounting, Progress, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
+from ..table import Floats
 
 if TYPE_CHECKING:
     from rclpy.lifecycle import LifecycleState
+
+    from ..live.host import Exchange
+    from ..live.server import PageServer
 
 _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
              'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
@@ -55,6 +59,101 @@ _TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_hea
 
 _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
+
+
+def diagnostics_of(session: Session, node: str) -> list[DiagnosticStatus]:
+    """Return the state with all values, and one status for each concern."""
+    found = checks(session)
+    state = _status(worst(session, found), node, session.name)
+    state.values = _values(figures(session))
+    return [state, *(_status(check, node, session.name) for check in found)]
+
+
+def self_test_of(session: Session, node: str) -> list[DiagnosticStatus]:
+    """Return one status for each check; the test passes if all are OK."""
+    return [_status(check, node, session.name) for check in checks(session)]
+
+
+def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
+    """Return the progress of a calibration as a message."""
+    return DiagnosticStatus(level=bytes([Level.OK]), name=f'{node}: progress', hardware_id=sensor,
+                            message=progress.advice, values=_values(progress.figures()))
+
+
+def _status(check: Check, node: str, sensor: str) -> DiagnosticStatus:
+    return DiagnosticStatus(level=bytes([check.level]), name=f'{node}: {check.name}',
+                            message=check.words, hardware_id=sensor)
+
+
+def _values(named: Iterable[tuple[str, str]]) -> list[KeyValue]:
+    return [KeyValue(key=key, value=value) for key, value in named]
+
+
+_CAPTURED = (0.2, 0.7, 0.3, 1.0)
+_ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
+_WORDS = (1.0, 1.0, 1.0, 1.0)
+_SPHERE = (0.6, 0.6, 0.7, 0.15)
+_NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_ABOVE = np.array([0.0, 0.0, _WORDS_AT])
+_DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
+
+
+def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerArray:
+    """
+    Return markers of the captured poses and of the next pose; they replace all earlier markers.
+
+    Parameters
+    ----------
+    directions : (n, 3) array
+        Directions of up in the sensor axes, unit vectors.
+    asked : NextPose
+        The next pose, or that more poses no longer help.
+    frame_id : str
+        Frame of the sensor.
+
+    """
+    markers = [Marker(action=Marker.DELETEALL),
+               _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
+    for k, direction in enumerate(directions):
+        markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
+        markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
+    if asked.direction is None:
+        markers.append(_text('next', 1, asked.words, _ABOVE))
+    else:
+        arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
+        arrow.points = [Point(), _point(asked.direction)]
+        markers += [arrow, _text('next', 1, asked.words, asked.direction * _WORDS_AT)]
+    for marker in markers:
+        marker.header.frame_id = frame_id
+    return MarkerArray(markers=markers)
+
+
+def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...],
+            size: float) -> Marker:
+    red, green, blue, alpha = color
+    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
+                    color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
+    marker.scale.x = marker.scale.y = marker.scale.z = size
+    if kind == Marker.ARROW:
+        marker.scale.y = marker.scale.z = 2.0 * size
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _text(namespace: str, number: int, text: str, at: Floats) -> Marker:
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER)
+    marker.text = text
+    return _at(marker, at)
+
+
+def _at(marker: Marker, position: Floats) -> Marker:
+    marker.pose.position = _point(position)
+    return marker
+
+
+def _point(position: Floats) -> Point:
+    x, y, z = position.tolist()
+    return Point(x=x, y=y, z=z)
 
 
 class Calibrator:
@@ -79,8 +178,8 @@ class Calibrator:
         self._context = ContextTopics(node, settings)
         self.session = Session(settings, self._topic)  # last, because it locks the files
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
-        call_soon = in_executor(node)
-        self._worker = Worker(call_soon, self._handle_events,
+        self._call_soon = in_executor(node)
+        self._worker = Worker(self._call_soon, self._handle_events,
                               lambda words: self._log(Log('error', words)))
         self._filter, self._progress_at = LogFilter(), 0.0
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
@@ -95,7 +194,8 @@ class Calibrator:
         self._heard: list[Any] = []
         self._said = [*outputs, self._still, self._poses, self._progress, self._result,
                       self._diagnostics]
-        self._page = Page(node, self.session, self.stream, self._worker, call_soon, self._log)
+        self._page: Exchange | None = None
+        self._server: PageServer | None = None
         self._still.publish(Bool(data=False))
         self._serve()
 
@@ -124,7 +224,24 @@ class Calibrator:
                 lambda message: self.stream.set_context('temperature', message.temperature),
                 SENSOR, qos_overriding_options=overrides))
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._page.start()
+        if self.session.settings.web_port:
+            try:
+                self._serve_page(self.session.settings)
+            except AccelCalibError as error:
+                self._log(Log('error', str(error)))
+
+    def _serve_page(self, settings: CalibratorSettings) -> None:
+        """Serve the live page; its server has its own thread."""
+        check_installed()
+        from ..live.host import Exchange
+        from ..live.server import PageServer, PERIOD
+        page = Exchange(self.session, self._worker, self._call_soon, self._log, self.stream.flush)
+        server = PageServer(page, settings.web_host, settings.web_port)
+        server.start()
+        self._page, self._server = page, server
+        self._log(Log('info', server.announce()))
+        self._node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
+                                clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _command(self, name: str) -> Callable[[], Task]:
         """Return a command of the session that first processes all messages so far."""
@@ -160,7 +277,7 @@ class Calibrator:
         array = DiagnosticArray(status=diagnostics_of(self.session, self._name))
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-        self._page.show_state()
+        self._show_state()
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, self.session.commands.enable(request.data)
@@ -193,7 +310,8 @@ class Calibrator:
             self._still.publish(Bool(data=event.still))
         elif isinstance(event, ShowPoses):
             self._poses.publish(pose_markers(event.up, event.asked, event.frame_id))
-            self._page.show_poses(event)
+            if self._page is not None:
+                self._page.show_poses(event)
         elif isinstance(event, Mounting):
             self._broadcast(event)
         elif isinstance(event, Result):
@@ -204,7 +322,11 @@ class Calibrator:
     def _on_done(self, success: bool, words: str) -> None:
         """Log the end of a task, and show what has changed with it."""
         self._log(Log('info' if success else 'warning', words))
-        self._page.show_state()
+        self._show_state()
+
+    def _show_state(self) -> None:
+        if self._page is not None:
+            self._page.show_state()
 
     def _broadcast(self, event: Mounting) -> None:
         """Publish the levelled frame as a child of the frame of the sensor."""
@@ -218,7 +340,8 @@ class Calibrator:
     def _log(self, line: Log) -> None:
         if not self._filter.passes(line):
             return
-        self._page.show_line(line)
+        if self._page is not None:
+            self._page.show_line(line)
         log = self._node.get_logger()  # rclpy needs a separate line of code for each severity
         if line.severity == 'error':
             log.error(line.words)
@@ -230,46 +353,11 @@ class Calibrator:
     def close(self) -> None:
         """Finish writing, and release the files."""
         self._node.remove_on_set_parameters_callback(self._followed)
-        self._page.close()
+        self._page = None
+        if self._server is not None:
+            self._server.close()
         self._worker.close()
         self.session.close()
-
-
-def in_executor(node: Node) -> CallSoon:
-    """Return a function that lets the executor of a node call functions, in their order."""
-    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
-
-    def call_next() -> None:
-        try:
-            waiting.get()()
-        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
-            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
-
-    def call_soon(function: Callable[[], None]) -> None:
-        waiting.put(function)
-        executor = node.executor
-        if executor is not None:
-            # The executor may run tasks in any order; the queue keeps their order.
-            executor.create_task(call_next)
-
-    return call_soon
-
-
-def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker,
-          log: Callable[[Log], object]) -> None:
-    """Create the service ``~/name``, which logs and responds the result of a command."""
-    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response,
-                                  qos_profile=CALLS)
-    send = service.send_response
-
-    def send_response(response: Any, header: Any) -> None:
-        def answer(success: bool, words: str) -> None:
-            log(Log('info' if success else 'warning', words))
-            send(Trigger.Response(success=success, message=words), header)
-
-        worker.do(name, command(), answer)
-
-    service.send_response = send_response
 
 
 class CalibratorNode(Node):
