@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TYPE_CHECKING
 
+import numpy as np
+
 from .calibrate import (
-    Calibration, fit_poses, fit_with_fleet, FleetPrior, FrameName, level_by_rows, Method)
-from .effects import PROCESSES
+    Calibration, directions_of, fit_partial, fit_poses, fit_with_fleet, flat_direction, FleetPrior,
+    FrameName, level, level_by_rows, lies_in_cone, Method, PRIOR)
+from .effects import LADDER, Model, PROCESSES
 from .errors import RefusedFitError
 from .findings import rate, Rating
 from .table import Poses
@@ -23,6 +26,9 @@ if TYPE_CHECKING:
 
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""
+
+FEWEST_IN_CONE = 4
+"""Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,12 @@ class Plan:
         Name of the sensor; by default the name in the poses.
     also : tuple of str
         Names of own effects of the user, which the search tries beside the catalogue.
+    before : Calibration, optional
+        The calibration in use. Effects that a refinement has added to it are kept, with new
+        values, and so are its levelled frame and its mounting, without a `flat` pose.
+    in_cone : bool
+        Fit poses that are all near one direction, too, with typical values of sensors, unless
+        `before` is a full fit.
 
     """
 
@@ -65,6 +77,8 @@ class Plan:
     frame: FrameName = 'ros'
     sensor: str = ''
     also: tuple[str, ...] = ()
+    before: Calibration | None = field(default=None, repr=False)
+    in_cone: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,18 +114,63 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
 
     """
     date, chosen = now(), poses if plan.rows is None else poses.take(plan.rows)
-    calibration = (
-        fit_poses(chosen, units, model=plan.model, method=plan.method, sensor=plan.sensor,
-                  date=date) if plan.fleet is None
-        else fit_with_fleet(chosen, units, plan.fleet, sensor=plan.sensor, date=date))
+    calibration = _fit(chosen, units, plan, date)
     refinement, line = None, 'not refined, as asked'
     if plan.refined:
         refinement, line = _refinement(chosen, units, plan, date)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
-    calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
-                                plan.nose_down)
+    if plan.before is not None and plan.flat is None:
+        calibration = _mounted_as(plan.before, calibration)
+    else:
+        calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
+                                    plan.nose_down)
     return Outcome(calibration, refinement, line)
+
+
+def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
+    before = plan.before
+    if plan.fleet is not None:
+        return fit_with_fleet(poses, units, plan.fleet, sensor=plan.sensor, date=date)
+    if before is not None and is_refined(before):
+        from .refine import refitted
+        return refitted(before, poses, sensor=plan.sensor, date=date)
+    if plan.in_cone and (before is None or is_partial(before)) and _lie_in_cone(poses, units):
+        return fit_partial(poses, units, sensor=plan.sensor, date=date)
+    return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
+                     date=date)
+
+
+def is_refined(calibration: Calibration) -> bool:
+    """Return whether a calibration has effects beyond offset and gain."""
+    return any(name not in LADDER for name in calibration.model.effects)
+
+
+def is_partial(calibration: Calibration) -> bool:
+    """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
+    return calibration.method == PRIOR or not calibration.model.effects
+
+
+def _lie_in_cone(poses: Poses, units: Units) -> bool:
+    if units.is_native:
+        return False
+    try:
+        up = directions_of(poses, units)
+    except RefusedFitError:
+        return False
+    return len(up) >= FEWEST_IN_CONE and lies_in_cone(up)
+
+
+def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
+    """Return a calibration with the levelled frame and the mounting of the one before it."""
+    if not before.is_levelled:
+        return calibration
+    context = before.typical_context(1)
+    flat = flat_direction(before.frame) * before.force_per_g
+    reading = before.predict(flat[np.newaxis], context)[0]
+    headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
+                     frame=before.frame)
+    return level(headed, reading, before.frame, context)
 
 
 def _row(poses: Poses, flat: Flat) -> int | None:

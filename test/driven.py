@@ -9,10 +9,9 @@ from collections.abc import Generator
 from typing import Any
 
 from accel_calib.session import (
-    CalibratorSettings, checks, columns_of, Log, Result, Session, state, Task)
+    answered, CalibratorSettings, checks, columns_of, Log, Result, Session, state, Task)
 from inside import next_action
 import numpy as np
-from shared import answer_of
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -41,7 +40,7 @@ class Driver:
 
     def done(self, task: Task) -> str:
         """Return the answer of a command."""
-        answer: str = answer_of(task)
+        answer: str = answered(task)
         self.handle()
         return answer
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from accel_calib.calibrate import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
@@ -70,6 +71,7 @@ from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
 from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
+from accel_calib.pipeline import is_partial
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import (
     beginning, clipped, fitted_state, grid_step, off_grid, sampled, unclipped)
@@ -89,17 +91,17 @@ from accel_calib.report.repeats import comparison_page
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import sheet, snippets
 from accel_calib.ros.run import own_domain
-from accel_calib.session import store as session_store, worker
+from accel_calib.session import answered, store as session_store, worker
+from accel_calib.session.commands import load
 from accel_calib.session.guidance import Guide, next_action, Plan
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
-from accel_calib.session.sensor_files import load as load_store, Lock
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, Identity, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
+    aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics
-from accel_calib.session.work import fitted, is_partial, plan_for
+from accel_calib.session.work import fit as fit_in_node, plan_for
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import (
@@ -117,6 +119,11 @@ NODES = {
 """Arguments of Python that run a node, by its name."""
 
 CALIBRATOR = NODES['calibrator']
+
+
+def load_store(store: SensorStore) -> Any:
+    """Return what is usable of a store."""
+    return answered(load(store))
 
 
 def format_calibration(calibration: Calibration) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration
 from accel_calib.geometry import unit
-from accel_calib.session import Step, Task
+from accel_calib.session import Step
 from accel_calib.table import Floats
 from inside import COMMAND, main, Model, model_with
 import numpy as np
@@ -108,18 +108,3 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
 def result(step: Step) -> Any:
     """Return the result of a step, computed in this process."""
     return step.run(lambda function, *given: function(*given))
-
-
-def answer_of(task: Task) -> Any:
-    """Run a task of a session at once, and return its answer."""
-    try:
-        step = next(task)
-        while True:
-            try:
-                found = result(step)
-            except Exception as error:
-                step = task.throw(error)
-            else:
-                step = task.send(found)
-    except StopIteration as end:
-        return end.value

@@ -19,7 +19,7 @@ from accel_calib.logs import write_table
 from accel_calib.session import CalibratorSettings, Files, Log, Task
 from accel_calib.stored import read_calibration
 from faults.sample import sample
-from inside import fitted, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
+from inside import fit_in_node, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
 from inside_ros import in_executor, serve
 import numpy as np
 import pytest
@@ -129,7 +129,8 @@ def test_worker_process_computes_what_this_process_computes(
         process: WorkerProcess, stored: Callable[..., Path]) -> None:
     calibration = read_calibration(stored())
     given = calibration.poses, calibration.units, CalibratorSettings(model='10'), '', None
-    found, here = process.call(fitted, *given), fitted(*given)
+    found, here = (call(fit_in_node, *given).calibration for call in (
+        process.call, lambda function, *given: function(*given)))
     np.testing.assert_array_equal(found.model.vector, here.model.vector)
     np.testing.assert_array_equal(found.covariance, here.covariance)
     assert process.call(os.getpid) != os.getpid()
@@ -149,9 +150,9 @@ def test_errors_in_the_worker_process_are_raised_here(
     calibration = read_calibration(stored())
     few = calibration.poses.take(slice(0, 2)), calibration.units, CalibratorSettings(model='10')
     with pytest.raises(RefusedFitError) as here:
-        fitted(*few, '', None)
+        fit_in_node(*few, '', None)
     with pytest.raises(RefusedFitError) as there:
-        process.call(fitted, *few, '', None)
+        process.call(fit_in_node, *few, '', None)
     assert str(there.value) == str(here.value)
     with pytest.raises(ValueError, match='math domain'):
         process.call(math.sqrt, -1.0)

@@ -6,7 +6,7 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
 belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
-`store` manages files, and `sensor_files` locks them. `work` contains the computations, and
+`store` manages and locks files. `work` contains the computations, and
 `worker` runs the tasks and defines the events. `stream` describes the messages, `state` the state.
 `settings` defines the parameters.
 
@@ -22,12 +22,12 @@ from .settings import (
 from .state import Check, checks, figures, Level, words_of_state, worst
 from .store import ros_home
 from .worker import (
-    Answer, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, Result, Severity, ShowPoses,
-    Step, Still, Task, Worker, WorkerProcess)
+    Answer, answered, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, Result, Severity,
+    ShowPoses, Step, Still, Task, Worker, WorkerProcess)
 
 __all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
            'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',
            'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
-           'WorkerProcess', 'changed', 'checks', 'columns_of', 'context_topics', 'default_of',
-           'expected', 'figures', 'parameter', 'ros_home', 'state', 'title', 'words_of_state',
-           'worst']
+           'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of', 'context_topics',
+           'default_of', 'expected', 'figures', 'parameter', 'ros_home', 'state', 'title',
+           'words_of_state', 'worst']

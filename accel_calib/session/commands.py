@@ -14,35 +14,37 @@ stores it or ~/undo discards it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+import json
 import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import is_partial, next_action
+from .guidance import next_action, next_words
 from .sensor import Sensor
-from .store import Store, writing_advice
-from .stream import thermometer_words
-from .work import at_rest, change_words, fit, Fitted, plan_for, refined
-from .worker import Calibrations, Compute, Files, Found, Part, Task
-from ..calibrate import angle_words, Calibration, level, mounting_only, mounting_words, set_heading
+from .store import Store, tidied, unusable, writing_advice
+from .stream import AGAIN, thermometer_words
+from .work import at_rest, change_words, fit, Fitted, plan_for, rated, refined
+from .worker import Compute, Files, Parse, Part, Result, ShowPoses, Task
+from ..calibrate import (
+    angle_words, Calibration, level, mounting_figures, mounting_only, mounting_words, set_heading)
 from ..capture import Dwell, poses_from
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
+from ..findings import rating_json
+from ..pipeline import is_partial
+from ..table import Poses
 from ..text import counted, now
 
 if TYPE_CHECKING:
     from .session import Session
     from ..findings import Rating
-    from ..refine import Refinement
 
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
 
 _AUTO_FIT_EVERY = 60.0
 """Shortest time between two automatic fits [s]."""
-
-_NEXT_LATER = 'the next pose is on ~/poses after the computation that is running'
-"""Advice while a fit or a refinement occupies the worker process."""
 
 
 class ChangedError(AccelCalibError):
@@ -60,30 +62,24 @@ class Commands:
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session = self._session
-        self._check_fresh()
+        session, sensor = self._session, self._session.sensor
+        _check_fresh(session)
         session.files.usable()
-        dwell = session.sensor.live.capture_now()
+        dwell = sensor.live.capture_now()
         if dwell is None:
-            raise self._not_still()
-        session.sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
+            raise _not_still(session)
+        sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         session.poses_changed(ended=False)
-        poses = session.sensor.live.book.poses()
+        poses = sensor.live.book.poses()
         words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
         if session.computing:
             yield Files()
-            return f'{words}; {_NEXT_LATER}'
-        sensor = session.sensor
+            return f'{words}; the next pose is on ~/poses after the computation that is running'
         plan = yield Compute(plan_for, poses, session.units, session.settings.model)
         if session.sensor is sensor:
             sensor.guide.plan = plan
-        return f'{words}{self._next()}'
-
-    def _next(self) -> str:
-        """Return the end of an answer: the next step."""
-        action = next_action(self._session)
-        return '' if action is None else f'; next: {action.words}'
+        return f'{words}{next_words(session)}'
 
     def undo_pose(self) -> Task:
         """Remove the last pose."""
@@ -101,13 +97,8 @@ class Commands:
 
     def fit(self, *, offered: bool = False) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        fitted = yield from self._fitted()
-        return (yield from self._use_fit(fitted, offered=offered))
-
-    def _use_fit(self, fitted: Fitted, *, offered: bool = False) -> Part[str]:
-        """Store and use, or offer, a fit or a refinement; return the answer."""
-        return (yield from self._use(fitted.calibration, fitted.words, fitted.details,
-                                     fitted.refinement, fitted.rating, offered=offered))
+        fitted = yield from _fitted(self._session)
+        return (yield from _use(self._session, fitted, offered=offered))
 
     def due(self) -> list[Task]:
         """Return an automatic fit if one is due."""
@@ -125,7 +116,7 @@ class Commands:
         if self._session.sensor is not sensor:
             return ''
         try:
-            fitted = yield from self._fitted()
+            fitted = yield from _fitted(self._session)
         except ChangedError:
             sensor.auto_fit_waits = True
             return ''
@@ -135,88 +126,48 @@ class Commands:
                 return ''
             raise
         self._refused = ''
-        return (yield from self._use_fit(fitted)) if fitted.differs else ''
-
-    def _fitted(self) -> Part[Fitted]:
-        """Return a fit to the poses; the values of a refined calibration are fitted anew."""
-        session = self._session
-        return (yield from self._sound('fit', fit, session.units, session.settings, session.name,
-                                       session.sensor.present))
-
-    def _sound(self, name: str, function: Callable[..., Fitted], *given: Any) -> Part[Fitted]:
-        """Return what a function makes of the poses, if it is fit for use."""
-        session, sensor = self._session, self._session.sensor
-        session.files.usable()
-        sensor.live.refresh()
-        poses = sensor.live.book.poses()
-        try:
-            fitted = yield from self._unless_changed(name, function, poses, *given)
-            if fitted.refusal:
-                session.rate(fitted.refinement)
-                raise RefusedFitError(f'{fitted.words}; not used: {fitted.refusal[0]}',
-                                      fitted.refusal[1])
-            if fitted.rating.name == 'BAD':
-                raise RefusedFitError(f'{fitted.words}; not used: {fitted.rating.reason}',
-                                      fitted.rating.next.text)
-        except RefusedFitError as error:
-            sensor.guide.refuse(len(poses), error.advice)
-            raise
-        sensor.fitted_poses = len(poses)
-        return fitted
+        return (yield from _use(self._session, fitted)) if fitted.differs else ''
 
     def refine(self, *, offered: bool = False) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
-        fitted = yield from self._sound('refine', refined, session.units, session.name,
-                                        session.sensor.present, thermometer_words(session),
-                                        session.own)
-        session.sensor.guide.follow(fitted.planned)
-        return (yield from self._use_fit(fitted, offered=offered))
+        fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
+                                   session.sensor.present, thermometer_words(session),
+                                   session.own)
+        if fitted.refinement is not None:
+            session.sensor.guide.follow(fitted.refinement.plan.poses)
+        return (yield from _use(session, fitted, offered=offered))
 
-    def _unless_changed(self, name: str, function: Callable[..., Found], *given: Any
-                        ) -> Part[Found]:
-        """Compute; fail if another command changes the calibration meanwhile."""
-        session = self._session
-        sensor, changes = session.sensor, session.sensor.changes
-        session.computing += 1
-        try:
-            found: Found = yield Compute(function, *given)
-        finally:
-            session.computing -= 1
-        if session.sensor is not sensor or sensor.changes != changes:
-            raise ChangedError(f'another command changed the calibration during ~/{name}; '
-                               'the result is discarded', f'call ~/{name} again')
-        return found
+    # The mounting
 
     def set_level(self, *, offered: bool = False) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
-        session, rest = self._session, self._rest()
+        session, rest = self._session, _rest(self._session)
         calibration = session.sensor.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
                 poses_from([rest]), session.units, sensor=session.name, date=now()))
-        return (yield from self._use_mounting(
-            self._levelled(calibration, rest), 'the mounting is levelled by this pose',
-            offered=offered))
+        return (yield from _use_mounting(
+            session, _levelled(session, calibration, rest),
+            'the mounting is levelled by this pose', offered=offered))
 
     def set_heading(self, *, offered: bool = False) -> Task:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        calibration = self._session.sensor.present
+        session, calibration = self._session, self._session.sensor.present
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
-        rest = self._rest()
-        headed = set_heading(calibration, rest.mean,
-                             self._session.sensor.context_of(rest, calibration))
+        rest = _rest(session)
+        headed = set_heading(calibration, rest.mean, session.sensor.context_of(rest, calibration))
         words = 'the heading is set by this pose'
         if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
             words += ('; the front of the robot is now on the other side of the sensor: if the '
                       'nose was up, tilt it down and call ~/set_heading again')
-        return (yield from self._use_mounting(headed, words, offered=offered))
+        return (yield from _use_mounting(session, headed, words, offered=offered))
 
     def calibrate_at_rest(self, *, offered: bool = False) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
-        session, rest = self._session, self._rest()
+        session, rest = self._session, _rest(self._session)
         before = session.sensor.present
         calibration = session.with_given(at_rest(rest, session.units, session.name, before))
         words = (calibration.reason if before is None or is_partial(before)
@@ -224,83 +175,32 @@ class Commands:
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words += f', gyro bias ({bias}) °/s'
-        return (yield from self._use_mounting(self._levelled(calibration, rest), words,
-                                              offered=offered))
-
-    def _levelled(self, calibration: Calibration, rest: Dwell) -> Calibration:
-        """Return a calibration levelled by a rest; check it against the given mounting."""
-        session = self._session
-        levelled = level(calibration, rest.mean, session.frame,
-                         session.sensor.context_of(rest, calibration))
-        if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
-            raise InputError('this pose differs by more than 10° of tilt from the mounting in '
-                             'mounting_rpy or base_frame', 'place the robot level, or correct the '
-                             'given mounting and restart the node')
-        return levelled
-
-    def _use_mounting(self, calibration: Calibration, words: str, *, offered: bool) -> Part[str]:
-        """Store and use, or offer, a calibration with a new mounting; return the answer."""
-        details = [change_words(self._session.sensor.present, calibration), *(
-            each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
-        return (yield from self._use(
-            calibration, f'{words}; {angle_words(calibration.rotation)}', details,
-            self._session.sensor.refinement, offered=offered))
-
-    def _use(self, calibration: Calibration, words: str, details: list[str],
-             refinement: Refinement | None = None, rating: Rating | None = None, *,
-             offered: bool = False) -> Part[str]:
-        """Store and use, or offer, a calibration; log the details, and return the answer."""
-        session, store = self._session, self._session.files.usable()
-        offered = offered or session.settings.confirm
-        not_stored = yield from self._with_files(_stored, store, None if offered else calibration)
-        mounting = [] if not calibration.is_levelled else [mounting_words(
-            calibration.rotation, session.frame_id or '', session.settings.base_frame)]
-        if offered:
-            session.offer(calibration, refinement, rating)
-            session.log('info', '; '.join(filter(None, [*details, *mounting])))
-            return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
-                    '~/undo to discard it')
-        session.adopt(calibration, refinement, rating)
-        if not_stored is not None:
-            session.sensor.unsaved = True
-            raise InputError(f'the calibration is in use but could not be stored: {not_stored}',
-                             f'{writing_advice(not_stored)}, and call ~/save')
-        stored = f'stored in {store.calibration}'
-        session.log('info', '; '.join(filter(None, [*details, stored, *mounting])))
-        return f'{words}{self._next()}'
-
-    def _with_files(self, function: Callable[..., Found], *given: Any) -> Part[Found]:
-        """Use files; fail if another sensor replaces this one meanwhile."""
-        session, sensor, name = self._session, self._session.sensor, self._session.name
-        found: Found = yield Calibrations(function, *given)
-        if session.sensor is not sensor:
-            raise InputError(f'the sensor {session.name!r} has replaced {name!r} meanwhile, '
-                             'expected one sensor: the result is not used',
-                             'call the service again')
-        return found
+        return (yield from _use_mounting(session, _levelled(session, calibration, rest), words,
+                                         offered=offered))
 
     # Files
 
     def save(self) -> Task:
         """Use the offered calibration if there is one; store calibration and poses."""
-        session, store = self._session, self._session.files.usable()
-        calibration = session.sensor.present
+        session, sensor, store = self._session, self._session.sensor, self._session.files.usable()
+        calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
-        yield Calibrations(store.save, calibration, session.sensor.live.book.poses())
-        session.sensor.unsaved = False
-        if session.sensor.offered is calibration:
-            session.adopt(calibration, session.sensor.refinement, session.sensor.rating)
+        yield Files(store.write, *(yield Parse(store.prepared, calibration)))
+        yield Files(store.save_poses, sensor.live.book.poses())
+        sensor.unsaved = False
+        if sensor.offered is calibration:
+            session.adopt(calibration, sensor.refinement, sensor.rating)
         return f'stored in {store.calibration} and {store.poses}'
 
     def load(self) -> Task:
         """Read the stored calibration again; if it is refused, the calibration in use is kept."""
-        store = self._session.files.usable()
-        calibration = yield from self._with_files(store.load_calibration)
+        session, store = self._session, self._session.files.usable()
+        calibration = yield from _alone(session, Parse(store.load_calibration))
         if calibration is None:
             raise StoredCalibrationError(f'{store.calibration} does not exist',
                                          'call ~/fit, or copy a calibration there')
-        self._session.adopt(calibration)
+        session.adopt(calibration)
         return f'read {store.calibration}'
 
     def undo(self) -> Task:
@@ -308,9 +208,10 @@ class Commands:
         session = self._session
         if session.sensor.offered is not None:
             session.sensor.fitted_poses = 0
-            session.offer(None)
+            session.sensor.offer(None)
+            session.rate(None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
-        calibration = yield from self._with_files(session.files.usable().step_back)
+        calibration = yield from _alone(session, Files(session.files.usable().step_back))
         before = session.sensor.calibration
         session.adopt(calibration)
         session.sensor.fitted_poses = 0
@@ -321,8 +222,9 @@ class Commands:
 
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
-        session = self._session
-        kept = yield from self._with_files(session.files.usable().set_aside)
+        session, store = self._session, self._session.files.usable()
+        is_good = yield from _alone(session, Parse(store.is_good))
+        kept = yield from _alone(session, Files(store.set_aside, is_good))
         session.sensor.live.clear()
         session.adopt(None)
         session.sensor.fitted_poses = 0
@@ -342,48 +244,220 @@ class Commands:
                     'published; capture poses and call ~/fit')
         return 'the correction is on: corrected messages are published'
 
-    # Checks
 
-    def _rest(self) -> Dwell:
-        self._check_fresh()
-        rest = self._session.sensor.live.detector.current()
-        if rest is None:
-            raise self._not_still()
-        return rest
+# ----------------------------------------------------------------------------- parts of commands
 
-    def _check_fresh(self) -> None:
-        """Check that the last message is recent, and that its stamp is."""
-        statistics = self._session.statistics
-        if not statistics.messages:
-            raise InputError('there is no Imu message yet', 'start the driver')
-        if statistics.age > _OLD:
-            raise InputError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
-                             f'one within {_OLD:g} s', 'check the driver and try again')
-        if statistics.stopped > _OLD:
-            raise InputError(f'the stamps have not changed for {statistics.stopped:.1f} s '
-                             f'({statistics.stamp:.3f} s), expected the time of each reading',
-                             'set header.stamp in the driver')
-
-    def _not_still(self) -> InputError:
-        session = self._session
-        least, length = session.settings.min_dwell, session.statistics.length_g(session.units)
-        if abs(length - 1.0) > session.settings.still_norm_tolerance:
-            return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                              'hold the sensor still; if it is still, restart the node with the '
-                              'right units')
-        if not session.sensor.live.still:
-            return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
-                              'check ~/still')
-        return InputError(f'the sensor has been still for less than {least:g} s',
-                          'hold it still for longer')
+def _fitted(session: Session) -> Part[Fitted]:
+    """Return a fit to the poses; the values of a refined calibration are fitted anew."""
+    return (yield from _sound(session, 'fit', fit, session.units, session.settings, session.name,
+                              session.sensor.present))
 
 
-def _stored(store: Store, calibration: Calibration | None, call: Callable[..., Any]
-            ) -> OSError | None:
-    """Store a calibration if there is one; return the error if it cannot be stored."""
+def _sound(session: Session, name: str, function: Callable[..., Fitted], *given: Any
+           ) -> Part[Fitted]:
+    """Return what a function makes of the poses; fail if it is not fit for use, or outdated."""
+    session.files.usable()
+    sensor, changes = session.sensor, session.sensor.changes
+    sensor.live.refresh()
+    poses = sensor.live.book.poses()
+    session.computing += 1
     try:
-        if calibration is not None:
-            store.save_calibration(calibration, call)
+        fitted: Fitted = yield Compute(function, poses, *given)
+    except RefusedFitError as error:
+        sensor.guide.refuse(len(poses), error.advice)
+        raise
+    finally:
+        session.computing -= 1
+    if session.sensor is not sensor or sensor.changes != changes:
+        raise ChangedError(f'another command changed the calibration during ~/{name}; '
+                           'the result is discarded', f'call ~/{name} again')
+    if fitted.refusal:
+        why, advice = fitted.refusal
+        sensor.guide.refuse(len(poses), advice)
+        if fitted.refinement is not None:
+            session.rate(fitted.refinement)
+        raise RefusedFitError(f'{fitted.words}; not used: {why}', advice)
+    sensor.fitted_poses = len(poses)
+    return fitted
+
+
+def _levelled(session: Session, calibration: Calibration, rest: Dwell) -> Calibration:
+    """Return a calibration levelled by a rest; check it against the given mounting."""
+    levelled = level(calibration, rest.mean, session.frame,
+                     session.sensor.context_of(rest, calibration))
+    if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
+        raise InputError('this pose differs by more than 10° of tilt from the mounting in '
+                         'mounting_rpy or base_frame', 'place the robot level, or correct the '
+                         'given mounting and restart the node')
+    return levelled
+
+
+def _use_mounting(session: Session, calibration: Calibration, words: str, *, offered: bool
+                  ) -> Part[str]:
+    """Store and use, or offer, a calibration with a new mounting; return the answer."""
+    details = [change_words(session.sensor.present, calibration), *(
+        each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
+    return (yield from _use(session, Fitted(
+        calibration, f'{words}; {angle_words(calibration.rotation)}', details,
+        refinement=session.sensor.refinement), offered=offered))
+
+
+def _use(session: Session, fitted: Fitted, *, offered: bool = False) -> Part[str]:
+    """Store and use, or offer, a new calibration; log the details, and return the answer."""
+    calibration, words, store = fitted.calibration, fitted.words, session.files.usable()
+    mounting = '' if not calibration.is_levelled else mounting_words(
+        calibration.rotation, session.frame_id or '', session.settings.base_frame)
+    if offered or session.settings.confirm:
+        session.sensor.offer(calibration)
+        session.rate(fitted.refinement, fitted.rating)
+        session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
+        return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
+                '~/undo to discard it')
+    try:
+        data, is_good = yield from _alone(session, Parse(store.prepared, calibration))
+        yield from _alone(session, Files(store.write, data, is_good))
     except OSError as error:
-        return error
-    return None
+        session.adopt(calibration, fitted.refinement, fitted.rating)
+        session.sensor.unsaved = True
+        raise InputError(f'the calibration is in use but could not be stored: {error}',
+                         f'{writing_advice(error)}, and call ~/save') from error
+    session.adopt(calibration, fitted.refinement, fitted.rating)
+    session.log('info', '; '.join(filter(None, [
+        *fitted.details, f'stored in {store.calibration}', mounting])))
+    return f'{words}{next_words(session)}'
+
+
+def _alone(session: Session, step: Parse) -> Part[Any]:
+    """Use files; fail if another sensor replaces this one meanwhile."""
+    sensor, name = session.sensor, session.name
+    found = yield step
+    if session.sensor is not sensor:
+        raise InputError(f'the sensor {session.name!r} has replaced {name!r} meanwhile, '
+                         'expected one sensor: the result is not used',
+                         'call the service again')
+    return found
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What is usable of a store, notes, and `problem`: why the calibration cannot be used."""
+
+    calibration: Calibration | None
+    poses: Poses | None
+    problem: str
+    notes: tuple[str, ...]
+
+
+def load(store: Store) -> Part[Loaded]:
+    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
+    calibration, poses, problem = None, None, ''
+    notes: list[str] = yield Files(tidied, store)
+    try:
+        calibration = yield Parse(store.load_calibration)
+    except Exception as error:  # the node starts in any case
+        problem = yield Files(unusable, store.calibration, error)
+    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
+                     f'{store.identity.topic}')
+    try:
+        poses = yield Files(store.load_poses)
+    except Exception as error:
+        notes.append((yield Files(unusable, store.poses, error, True)))
+    return Loaded(calibration, poses, problem, tuple(notes))
+
+
+def load_files(session: Session, store: Store, sensor: Sensor) -> Task:
+    """Read the files of a sensor, and use them unless another one has replaced it."""
+    loaded = yield from load(store)
+    if session.sensor is not sensor:
+        return ''
+    sensor.owners = {each.sensor for each in (loaded.calibration, loaded.poses)
+                     if each is not None and each.sensor}
+    if loaded.poses is not None:
+        sensor.live.book.add_stored(loaded.poses)
+        session.log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
+    if loaded.calibration is not None:
+        session.adopt(loaded.calibration)
+        sensor.fitted_poses = len(loaded.calibration.poses)
+    session.problem = loaded.problem
+    for line in filter(None, (loaded.problem, *loaded.notes)):
+        session.log('error', line)
+    session.show_poses(store=False)
+    return ''
+
+
+def draw_poses(session: Session, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
+               store: Store | None) -> Task:
+    """Store and draw poses, this number more than before; return the line about a new rest."""
+    guide, given = sensor.guide, (poses, session.units, session.settings.model)
+    due = added != 0 or guide.plan is None
+    try:
+        yield Files() if store is None else Files(store.save_poses, poses)
+    except OSError as error:
+        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
+                    'not_stored', AGAIN)
+    # Computed even where only an average has changed, so that the lines keep their order.
+    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
+    if due and not len(poses):  # without the start of the worker process
+        plan = plan_for(*given)
+    if plan is not None and sensor is session.sensor:
+        guide.plan = plan
+        session.report(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+    if not new_rest or sensor is not session.sensor:
+        return ''
+    return guide.line(poses, session.units, next_action(session), added=added > 0)
+
+
+def report_rating(session: Session, sensor: Sensor, calibration: Calibration,
+                  rating: Rating | None) -> Task:
+    """Rate a calibration, and report it, unless another one has replaced it."""
+    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
+                                  session.settings.model)
+    if sensor.present is not calibration:
+        return ''
+    sensor.rating = rating
+    action = next_action(session)
+    if action is not None:
+        mounting = {'mounting': mounting_figures(
+            calibration.rotation, session.frame_id or '', session.settings.base_frame)}
+        session.report(Result(json.dumps({
+            **found, 'in_use': sensor.offered is not calibration,
+            **(mounting if calibration.is_levelled else {}), **rating_json(
+                rating, action.kind, action.words, action.command and f'~/{action.command}')})))
+    return ''
+
+
+def _rest(session: Session) -> Dwell:
+    """Return the ongoing rest; InputError if there is none."""
+    _check_fresh(session)
+    rest = session.sensor.live.detector.current()
+    if rest is None:
+        raise _not_still(session)
+    return rest
+
+
+def _check_fresh(session: Session) -> None:
+    """Check that the last message is recent, and that its stamp is."""
+    statistics = session.statistics
+    if not statistics.messages:
+        raise InputError('there is no Imu message yet', 'start the driver')
+    if statistics.age > _OLD:
+        raise InputError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
+                         f'one within {_OLD:g} s', 'check the driver and try again')
+    if statistics.stopped > _OLD:
+        raise InputError(f'the stamps have not changed for {statistics.stopped:.1f} s '
+                         f'({statistics.stamp:.3f} s), expected the time of each reading',
+                         'set header.stamp in the driver')
+
+
+def _not_still(session: Session) -> InputError:
+    least, length = session.settings.min_dwell, session.statistics.length_g(session.units)
+    if abs(length - 1.0) > session.settings.still_norm_tolerance:
+        return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
+                          'hold the sensor still; if it is still, restart the node with the '
+                          'right units')
+    if not session.sensor.live.still:
+        return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
+                          'check ~/still')
+    return InputError(f'the sensor has been still for less than {least:g} s',
+                      'hold it still for longer')

@@ -22,10 +22,11 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from .stream import slow_turn, stream_faults
-from ..calibrate import NextPose, PRIOR
+from ..calibrate import NextPose
 from ..compare import status
 from ..errors import InputError
 from ..finding import NextStep
+from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..refine import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
@@ -33,17 +34,12 @@ from ..units import MG, Units
 if TYPE_CHECKING:
     from .sensor import Sensor
     from .session import Session
-    from ..calibrate import Calibration
 
 _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
-
 _WITHOUT_NEW = 60.0
 """Time without a new pose after which the robot probably cannot be turned further [s]."""
-
-FEWEST_IN_CONE = 4
-"""Fewest poses near one direction that are fitted; fewer are the beginning of more poses."""
 
 
 class _Figure(NamedTuple):
@@ -360,6 +356,12 @@ def next_action(session: Session) -> Action | None:
     return replace(action, words=f'{held}; {action.words}') if held else action
 
 
+def next_words(session: Session) -> str:
+    """Return the end of an answer: the next step."""
+    action = next_action(session)
+    return '' if action is None else f'; next: {action.words}'
+
+
 def _within_reach(session: Session, action: Action) -> Action:
     """Return a step that a robot which cannot be turned further can do, too."""
     sensor = session.sensor
@@ -377,11 +379,6 @@ def _within_reach(session: Session, action: Action) -> Action:
         return action
     return (Action('done', f'use the calibration in these orientations; for others: '
                    f'{action.words}') if present.is_levelled else _level_step())
-
-
-def is_partial(calibration: Calibration) -> bool:
-    """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
-    return calibration.method == PRIOR or not calibration.model.effects
 
 
 def _with_sensor(sensor: Sensor) -> Action | None:

@@ -14,31 +14,24 @@ uses a steady clock.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-import json
 import math
 from time import monotonic
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .commands import Commands
-from .guidance import next_action
+from .commands import Commands, draw_poses, load_files, report_rating
 from .live_capture import Change
 from .sensor import Sensor, title
-from .sensor_files import load, Loaded, SensorFiles
 from .settings import CalibratorSettings, own_effects
-from .store import Store, writing_advice
-from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
-from .work import plan_for, rated, result_of
-from .worker import (
-    Calibrations, Compute, Event, Files, Log, Mounting, Result, Severity, ShowPoses, Still, Task)
+from .store import SensorFiles, Store
+from .stream import Around, Reports, SILENT, StreamStatistics
+from .worker import answered, Event, Log, Mounting, Severity, ShowPoses, Still
 from ..calibrate import (
-    Calibration, FrameName, in_frame, mounting_figures, mounting_of, mounting_words, on_topics,
-    with_given_mounting)
+    Calibration, FrameName, in_frame, mounting_of, mounting_words, on_topics, with_given_mounting)
 from ..compare import status
 from ..errors import InputError
-from ..findings import rating_json
-from ..table import Floats, Poses
+from ..table import Floats
 from ..text import counted
 from ..units import units_of
 
@@ -77,6 +70,8 @@ class Session:
 
     Attributes
     ----------
+    frame : {'ros', 'android'}
+        Levelled frame of calibrations.
     enabled : bool
         Whether messages are corrected.
     publishers : tuple of str or None
@@ -112,6 +107,8 @@ class Session:
         self.missing: dict[str, str] = {}
         self.files = SensorFiles(settings, topic)
         self.commands, self.reports = Commands(self), Reports(self)
+        # Messages in ned are those of ros, turned.
+        self.frame: FrameName = 'ros' if settings.frame == 'ned' else settings.frame
         self.frame_id: str | None = None
         self.problem = ''
         self.publishers: tuple[str, ...] | None = ()
@@ -126,16 +123,12 @@ class Session:
         self._largest = (_LARGEST_NATIVE if self.units.is_native
                          else _LARGEST_G * self.units.per_g)
         self._events: list[Event] = []
-        if settings.sensor or settings.calibration_file:
-            store = self._take_files(settings.sensor)
-            if store is not None:
-                self._adopt_loaded(load(store))
-        self._show_poses(store=False)
-
-    @property
-    def frame(self) -> FrameName:
-        """Levelled frame of calibrations; messages in `ned` are those of `ros`, turned."""
-        return 'ros' if self.settings.frame == 'ned' else self.settings.frame
+        known = settings.sensor or settings.calibration_file
+        store = self._take_files(settings.sensor) if known else None
+        if store is None:
+            self.show_poses(store=False)
+        else:
+            answered(load_files(self, store, self.sensor))
 
     @property
     def name(self) -> str:
@@ -155,22 +148,26 @@ class Session:
             self.sensor.set_rotates(settings.rotate)
         if settings.model != before.model:
             self.sensor.guide.plan = None
-            self._show_poses(store=False)
+            self.show_poses(store=False)
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order."""
         found, self._events = self._events, []
         return found
 
+    def report(self, event: Event) -> None:
+        """Add an event."""
+        self._events.append(event)
+
     def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
         """Add a log line to the events; parameters as in `Log`."""
-        self._events.append(Log(severity, words, kind, once_in))
+        self.report(Log(severity, words, kind, once_in))
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self._events.append(self._load(store, self.sensor))
+            self.report(load_files(self, store, self.sensor))
         self._report_still()
         self.reports.faults()
         self.reports.limits()
@@ -233,9 +230,24 @@ class Session:
                 self.reports.jump(last[0].seconds, since)
 
     def _change(self, changes: Iterable[Change]) -> None:
+        """Process changes of the capture."""
+        sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
         for change in changes:
             self._report_still()
-            self._process(change)
+            had_changed = sensor.has_changed
+            if change.rest is not None:
+                sensor.update(change.rest, least)
+            for dwell in change.ended:
+                sensor.end(dwell, least)
+            if sensor.drift is not None and sensor.has_changed is not had_changed:
+                self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
+            if change.doubted:
+                self.log('warning', f'{counted(change.doubted, "pose")} taken while the sensor '
+                         'moved or vibrated, as by motors: later rests are quieter; a fit leaves '
+                         'out such poses if the others are sufficient')
+            if change.poses:
+                new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
+                self.poses_changed(ended=bool(change.ended), new_rest=new)
         self._report_still()
 
     def _report_still(self) -> None:
@@ -244,24 +256,7 @@ class Session:
         if (self.sensor.live.still and not blind) is not self.still:
             self.still = not self.still
             self.still_since = self.statistics.stamp - self.settings.still_window
-            self._events.append(Still(self.still))
-
-    def _process(self, change: Change) -> None:
-        sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
-        before = sensor.has_changed
-        if change.rest is not None:
-            sensor.update(change.rest, least)
-        for dwell in change.ended:
-            sensor.end(dwell, least)
-        if sensor.drift is not None and sensor.has_changed is not before:
-            self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
-        if change.doubted:
-            self.log('warning', f'{counted(change.doubted, "pose")} taken while the sensor moved '
-                     'or vibrated, as by motors: later rests are quieter; a fit leaves out such '
-                     'poses if the others are sufficient')
-        if change.poses:
-            new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
-            self.poses_changed(ended=bool(change.ended), new_rest=new)
+            self.report(Still(self.still))
 
     # The sensor and its files
 
@@ -295,14 +290,14 @@ class Session:
         self._show_mounting()
         plan = self.sensor.guide.plan
         if plan is not None:
-            self._events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
+            self.report(ShowPoses(plan.up, plan.asked, frame_id or ''))
 
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.sensor = Sensor(self.settings, self.units)
         store = self._take_files(self.name)
         if store is not None:
-            self._events.append(self._load(store, self.sensor))
+            self.report(load_files(self, store, self.sensor))
 
     def _take_files(self, sensor: str) -> Store | None:
         """Lock the files of a sensor and return the store; None if another node uses them."""
@@ -311,27 +306,6 @@ class Session:
             self.problem = self.files.problem
             self.log('error', self.problem)
         return store
-
-    def _load(self, store: Store, sensor: Sensor) -> Task:
-        """Read the files of a sensor, and use them unless another one has replaced it."""
-        loaded: Loaded = yield Calibrations(load, store)
-        if self.sensor is sensor:
-            self._adopt_loaded(loaded)
-            self._show_poses(store=False)
-        return ''
-
-    def _adopt_loaded(self, loaded: Loaded) -> None:
-        self.sensor.owners = {each.sensor for each in (loaded.calibration, loaded.poses)
-                              if each is not None and each.sensor}
-        if loaded.poses is not None:
-            self.sensor.live.book.add_stored(loaded.poses)
-            self.log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
-        if loaded.calibration is not None:
-            self.adopt(loaded.calibration)
-            self.sensor.fitted_poses = len(loaded.calibration.poses)
-        self.problem = loaded.problem
-        for line in filter(None, (loaded.problem, *loaded.notes)):
-            self.log('error', line)
 
     def adopt(self, calibration: Calibration | None, refinement: Refinement | None = None,
               rating: Rating | None = None) -> None:
@@ -369,13 +343,7 @@ class Session:
         calibration = self.sensor.calibration
         if self.frame_id and calibration is not None and calibration.is_levelled:
             levelled = on_topics(calibration, self.settings.frame)
-            self._events.append(Mounting(levelled.rotation, self.frame_id))
-
-    def offer(self, calibration: Calibration | None, refinement: Refinement | None = None,
-              rating: Rating | None = None) -> None:
-        """Publish this calibration on ~/preview only; None: discard the offered one."""
-        self.sensor.offer(calibration)
-        self.rate(refinement, rating)
+            self.report(Mounting(levelled.rotation, self.frame_id))
 
     def rate(self, refinement: Refinement | None, rating: Rating | None = None) -> None:
         """Add a task that rates the present calibration, if need be, and reports it as JSON."""
@@ -384,26 +352,7 @@ class Session:
         if rating is not None or sensor.present is None:
             sensor.rating = rating
         if sensor.present is not None:
-            self._events.append(self._rated(sensor, sensor.present, rating))
-
-    def _rated(self, sensor: Sensor, calibration: Calibration, rating: Rating | None) -> Task:
-        """Rate a calibration, and report it, unless another one has replaced it."""
-        refinement = sensor.refinement
-        if rating is None:
-            rating = yield Compute(rated, calibration, refinement)
-            if sensor.present is calibration:
-                sensor.rating = rating
-        found = yield Compute(result_of, calibration, refinement, self.settings.model)
-        action = next_action(self)
-        if rating is not None and action is not None and sensor.present is calibration:
-            service = f'~/{action.command}' if action.command else ''
-            mounting = {'mounting': mounting_figures(
-                calibration.rotation, self.frame_id or '', self.settings.base_frame)}
-            self._events.append(Result(json.dumps({
-                **found, 'in_use': sensor.offered is not calibration,
-                **(mounting if calibration.is_levelled else {}),
-                **rating_json(rating, action.kind, action.words, service)})))
-        return ''
+            self.report(report_rating(self, sensor, sensor.present, rating))
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -424,39 +373,18 @@ class Session:
 
     def poses_changed(self, *, ended: bool, new_rest: bool = False) -> None:
         """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
-        self._show_poses(store=self.files.locked, new_rest=new_rest)
+        self.show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True
         self._events += self.commands.due()
 
-    def _show_poses(self, *, store: bool, new_rest: bool = False) -> None:
+    def show_poses(self, *, store: bool, new_rest: bool = False) -> None:
         """Add a task that stores the poses, and draws them with the next pose."""
         sensor = self.sensor
         poses = sensor.live.book.poses()
         added = sensor.guide.added(len(poses), self.statistics.stamp)
-        self._events.append(self._shown(sensor, poses, added, new_rest,
-                                        self.files.store if store else None))
-
-    def _shown(self, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
-               store: Store | None) -> Task:
-        """Store and draw poses, this number more than before; return the line about a new rest."""
-        guide, given = sensor.guide, (poses, self.units, self.settings.model)
-        due = added != 0 or guide.plan is None
-        try:
-            yield Files() if store is None else Files(store.save_poses, poses)
-        except OSError as error:
-            self.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
-                     'not_stored', AGAIN)
-        # Computed even where only an average has changed, so that the lines keep their order.
-        plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
-        if due and not len(poses):  # without the start of the worker process
-            plan = plan_for(*given)
-        if plan is not None and sensor is self.sensor:
-            guide.plan = plan
-            self._events.append(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
-        if not new_rest or sensor is not self.sensor:
-            return ''
-        return guide.line(poses, self.units, next_action(self), added=added > 0)
+        self.report(draw_poses(self, sensor, poses, added, new_rest,
+                               self.files.store if store else None))
 
 
 def _check_frames(settings: CalibratorSettings) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import is_partial, next_action, Progress
+from .guidance import next_action, Progress
 from .sensor import title
 from .settings import context_topics
 from .stream import missing_context, SILENT, stream_faults, thermometer_words
@@ -27,6 +27,7 @@ from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
 from ..finding import has
 from ..messages.one_reading import Triple
+from ..pipeline import is_partial
 from ..table import column_of
 from ..text import counted
 from ..units import MG

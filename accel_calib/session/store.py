@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The files of a sensor: calibration and poses.
+The files of a sensor: calibration and poses, and the lock for one node at a time.
 
 A sensor is identified by its topic (with namespace) and the frame_id of its messages, or by a name
 that the user sets. Each sensor has its own files. Stored data are never lost: files that cannot be
@@ -10,13 +10,18 @@ used, or that belong to another sensor, are renamed and never overwritten. So ar
 a name, pipes, sockets and links to nothing. Devices, and folders without a suffix in their name,
 are left where they are: the node then works without storing.
 
+Calibrations are formatted and parsed apart from writing, so that another process can do it
+(`Store.load_calibration`, `Store.prepared`). Files are written in the process that holds the lock.
+It is held until it is released or the process ends.
+
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import errno
+import fcntl
 import glob
 import hashlib
 import itertools
@@ -24,21 +29,19 @@ import os
 from pathlib import Path
 import re
 import stat
-from typing import Any, TypeVar
 
 import numpy as np
 
+from .settings import CalibratorSettings
 from ..calibrate import Calibration, check_sensor
-from ..disk import check_regular, copy_atomically, write_atomically
+from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
 from ..errors import (
-    AccelCalibError, DamagedCalibrationError, FREE_SPACE, InputError, is_full,
+    AccelCalibError, crash_words, DamagedCalibrationError, FREE_SPACE, InputError, is_full,
     StoredCalibrationError)
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
 from ..units import UnitName
-
-Found = TypeVar('Found')
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
 _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
@@ -57,11 +60,6 @@ _UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENOENT, errno.ELOOP)
 
 _LARGEST_TABLE = 32 * 2**20
 """Largest pose table of a store: 100,000 poses have half of it [bytes]."""
-
-
-def here(function: Callable[..., Found], *given: object) -> Found:
-    """Call a function in this process."""
-    return function(*given)
 
 
 @dataclass(frozen=True)
@@ -105,9 +103,7 @@ class Store:
     The files of a sensor, for readings in one unit.
 
     The poses are in ``<stem of the calibration>_poses.csv`` in the same folder. All methods raise
-    OSError if a file cannot be read or written. Calibrations are formatted and parsed by the
-    function that methods have as `call`, which can use another process. Files are written in this
-    one, which holds their lock.
+    OSError if a file cannot be read or written.
 
     """
 
@@ -120,18 +116,18 @@ class Store:
         """Path of the pose table."""
         return self.calibration.with_name(f'{self.calibration.stem}_poses.csv')
 
-    def load_calibration(self, call: Callable[..., Calibration] = here) -> Calibration | None:
+    def load_calibration(self) -> Calibration | None:
         """
-        Return the stored calibration, or None if there is none.
+        Return the stored calibration in the unit of the readings, or None if there is none.
 
         StoredCalibrationError if it is damaged, of another version, for another sensor, or in
         a unit that cannot be converted. InputError if it is not a regular file.
 
         """
-        return call(self._read, self.calibration) if _exists(self.calibration) else None
+        return self.read(self.calibration) if _exists(self.calibration) else None
 
-    def _read(self, path: Path) -> Calibration:
-        """Read a calibration for this sensor, and convert it to the unit of the readings."""
+    def read(self, path: Path) -> Calibration:
+        """Read a calibration for this sensor; errors are as in `load_calibration`."""
         calibration = read_calibration(path)
         check_sensor(calibration, self.identity.sensor)
         try:
@@ -169,25 +165,38 @@ class Store:
                                              f'{expected!r}', 'new poses start a new table')
         return poses
 
-    def save_calibration(self, calibration: Calibration, call: Callable[..., Any] = here) -> None:
+    def prepared(self, calibration: Calibration) -> tuple[bytes, bool]:
+        """Return the content of the file of a calibration, and whether the present one is good."""
+        named = replace(calibration, sensor=self.identity.sensor, stream=self.identity.topic)
+        return calibration_bytes(named), self.is_good()
+
+    def is_good(self) -> bool:
+        """Return whether the present file can be used, or does not exist."""
+        try:
+            self.load_calibration()
+        except AccelCalibError:
+            return False
+        except OSError as error:
+            if error.errno not in _UNREADABLE:
+                raise
+            return False
+        return True
+
+    def save_calibration(self, calibration: Calibration) -> None:
         """Write the calibration, and keep the file before as a step."""
-        data: bytes = call(calibration_bytes, replace(
-            calibration, sensor=self.identity.sensor, stream=self.identity.topic))
+        self.write(*self.prepared(calibration))
+
+    def write(self, data: bytes, is_good: bool) -> None:
+        """Write what `prepared` returned, and keep the file before as a step."""
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
-        step = self._keep_step(call)
+        step = self._keep_step(is_good)
         write_atomically(self.calibration, lambda file: file.buffer.write(data))
         if step.read_bytes() == data:
             step.unlink()
 
-    def _keep_step(self, call: Callable[..., Calibration]) -> Path:
-        """Return a copy of the file for `step_back`, or an empty step if there is no file."""
-        try:
-            self.load_calibration(call)
-        except AccelCalibError:
-            aside(self.calibration, 'other')
-        except OSError as error:
-            if error.errno not in _UNREADABLE:
-                raise
+    def _keep_step(self, is_good: bool) -> Path:
+        """Return a copy of a good file for `step_back`, or an empty step if there is none."""
+        if not is_good:
             aside(self.calibration, 'other')
         steps = self.steps()
         step = self._step(1 + max(self._numbers(), default=0))
@@ -212,7 +221,7 @@ class Store:
     def _step(self, number: int) -> Path:
         return self.calibration.with_name(f'{self.calibration.name}.before{number}')
 
-    def step_back(self, call: Callable[..., Calibration] = here) -> Calibration | None:
+    def step_back(self) -> Calibration | None:
         """
         Return to the calibration before the last stored one; None if there was none.
 
@@ -222,7 +231,7 @@ class Store:
         """
         step = self._last_step()
         try:
-            before = call(self._read, step) if step.stat().st_size else None
+            before = self.read(step) if step.stat().st_size else None
         except DamagedCalibrationError as error:
             raise StoredCalibrationError(f'{error.message}; it is kept as '
                                          f'{aside(step, "damaged")}', 'try again for the '
@@ -256,16 +265,10 @@ class Store:
         self.poses.parent.mkdir(parents=True, exist_ok=True)
         write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
 
-    def save(self, calibration: Calibration, poses: Poses, call: Callable[..., Any] = here
-             ) -> None:
-        """Write the calibration and the poses."""
-        self.save_calibration(calibration, call)
-        self.save_poses(poses)
-
-    def set_aside(self, call: Callable[..., Calibration] = here) -> list[Path]:
+    def set_aside(self, is_good: bool) -> list[Path]:
         """Rename both files, and return the new paths."""
         if _exists(self.calibration):
-            self._keep_step(call)
+            self._keep_step(is_good)
         return [aside(path, 'reset') for path in (self.calibration, self.poses) if _exists(path)]
 
     def is_writable(self) -> bool:
@@ -335,3 +338,127 @@ def writing_advice(error: OSError) -> str:
     if error.errno == errno.EROFS:
         return 'mount the file system for writing, or restart the node with calibration_file'
     return 'correct the permissions, or restart the node with another calibration_file'
+
+
+_TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+"""A link is not followed, because the lock would empty its target; a pipe does not block."""
+
+
+class StoreInUseError(AccelCalibError):
+    """Another node uses the files."""
+
+
+class Lock:
+    """A lock on the files of a store; StoreInUseError if another process has locked them."""
+
+    def __init__(self, store: Store) -> None:
+        self._handle = -1
+        path = store.calibration.with_name(f'{store.calibration.stem}.lock')
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._handle = os.open(path, _TO_LOCK, 0o644)
+        except OSError:
+            return  # the folder cannot be written, so there is nothing to protect
+        if not stat.S_ISREG(os.fstat(self._handle).st_mode):
+            self.release()
+            return
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(self._handle, 32).decode(errors='replace').strip()
+            self.release()
+            raise StoreInUseError(
+                f'{store.calibration} is used by the node with process id {holder or "unknown"}',
+                'stop that node, or restart this node with another calibration_file or sensor'
+            ) from None
+        except OSError:
+            self.release()  # this file system has no locks
+            return
+        with suppress(OSError):  # without space on the disk, the lock does not name its holder
+            os.ftruncate(self._handle, 0)
+            os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
+
+    def release(self) -> None:
+        """Release the lock."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+
+class SensorFiles:
+    """The store of a sensor, None until the sensor is known; and why it cannot be used, or ''."""
+
+    def __init__(self, settings: CalibratorSettings, topic: str) -> None:
+        self._settings, self._topic = settings, topic
+        self._lock: Lock | None = None
+        self.store: Store | None = None
+        self.problem = ''
+
+    @property
+    def path(self) -> str:
+        """Path of the calibration; empty until the sensor is known."""
+        return '' if self.store is None else str(self.store.calibration)
+
+    @property
+    def locked(self) -> bool:
+        """Whether this node has locked the files."""
+        return self._lock is not None
+
+    def take(self, sensor: str) -> Store | None:
+        """Lock the files of a sensor and return the store; None if another node uses them."""
+        identity = Identity(sensor, self._topic, bool(self._settings.sensor))
+        before, self.store = self.store, store_of(self._settings.calibration_file, identity,
+                                                  self._settings.units)
+        if before is None or before.calibration != self.store.calibration:
+            self.release()
+        return self.store if self.locked else self.try_again()
+
+    def try_again(self) -> Store | None:
+        """Lock the files if they have become free; return the store, or otherwise None."""
+        if self.store is None or self.locked:
+            return None
+        try:
+            self._lock, self.problem = Lock(self.store), ''
+        except StoreInUseError as error:
+            self.problem = str(error)
+            return None
+        return self.store
+
+    def usable(self) -> Store:
+        """Return the locked store; InputError if the sensor is not known, or it is not locked."""
+        if self.store is None:
+            raise InputError('the name of the sensor is not known, because there is no Imu '
+                             'message yet', 'start the driver, or set the parameter sensor')
+        if not self.locked:
+            raise InputError(self.problem, 'this node stores nothing')
+        return self.store
+
+    def release(self) -> None:
+        """Unlock the files."""
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
+
+
+def tidied(store: Store) -> list[str]:
+    """Remove leftovers of writing; return log lines about what fails."""
+    try:
+        failed = [error for path in (store.calibration, store.poses)
+                  for error in remove_leftovers(path)]
+    except OSError as error:
+        return [f'the folder {store.calibration.parent} could not be tidied: {error}; '
+                f'{writing_advice(error)}']
+    return [f'the temporary file {error.filename} could not be removed: {error.strerror}; '
+            'remove it by hand' for error in failed]
+
+
+def unusable(path: Path, error: Exception, is_table: bool = False) -> str:
+    """Return a line about a file that cannot be used; a damaged one and a table are renamed."""
+    words = str(error) if isinstance(error, AccelCalibError | OSError) else crash_words(error)
+    sound = isinstance(error, OSError | StoredCalibrationError)
+    if sound and not is_table and not isinstance(error, DamagedCalibrationError):
+        return f'{words}; it is renamed when the next calibration is stored'
+    try:
+        return f'{words}; kept as {aside(path, "damaged")}'
+    except OSError as err:
+        return f'{words}; it could not be renamed ({err})'

@@ -11,19 +11,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from .guidance import FEWEST_IN_CONE, is_partial, Plan
+from .guidance import Plan
 from .sensor import gyro_bias_of_rest
 from .settings import CalibratorSettings
-from ..calibrate import (
-    Calibration, directions_of, fit_partial, fit_poses, flat_direction, level, lies_in_cone,
-    next_pose, outlook)
+from .. import pipeline
+from ..calibrate import Calibration, directions_of, fit_partial, next_pose, outlook
 from ..capture import Dwell, poses_from
-from ..effects import LADDER, Model
+from ..effects import Model
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
 from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
 from ..geometry import coverage, spread_directions
-from ..refine import PlannedPose, refine, Refinement, refitted
+from ..pipeline import is_partial, is_refined
+from ..refine import refine, Refinement
 from ..refine.words import residual_words, shown_name, times_typical, verdict_words
 from ..table import Floats, Poses
 from ..text import counted, listed, now, plain
@@ -42,75 +42,96 @@ _FEWEST_NATIVE = 4
 @dataclass(frozen=True)
 class Fitted:
     """
-    A fit, or a refinement, with its rating.
+    A new calibration: a fit, a refinement or another mounting.
 
-    `words` are the answer, one sentence, and `details` are for the log. `differs`: an automatic
-    fit replaces the calibration before it. `refusal` is the reason and the advice if it must not
-    be used, and `planned` are the poses to take next.
+    `words` are the answer, one sentence, and `details` are for the log. `rating` is None if it is
+    not known yet. `differs`: an automatic fit replaces the calibration before it.
 
     """
 
     calibration: Calibration
-    rating: Rating
     words: str
     details: list[str]
-    differs: bool = True
+    rating: Rating | None = None
     refinement: Refinement | None = None
+    differs: bool = True
 
     @property
     def refusal(self) -> tuple[str, ...]:
-        """Return the reason and the advice of a refused refinement; empty if it can be used."""
-        return () if self.refinement is None else self.refinement.refusal
-
-    @property
-    def planned(self) -> tuple[PlannedPose, ...]:
-        """Return the poses to take next."""
-        return () if self.refinement is None else self.refinement.plan.poses
+        """Return why it must not be used, and what to do instead; empty if it can be used."""
+        if self.refinement is not None and self.refinement.refusal:
+            return self.refinement.refusal
+        if self.rating is not None and self.rating.name == 'BAD':
+            return self.rating.reason, self.rating.next.text
+        return ()
 
 
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
         before: Calibration | None) -> Fitted:
-    """Return a fit of all poses with its rating; parameters and errors are as in `fitted`."""
-    calibration = fitted(poses, units, settings, sensor, before)
-    rating = rate(calibration)
-    return Fitted(calibration, rating, summary(calibration, rating),
-                  [*fit_details(calibration), change_words(before, calibration)],
-                  replaces(before, calibration))
-
-
-def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
-           before: Calibration | None) -> Calibration:
     """
-    Return a fit of all poses, in the levelled frame of the calibration before.
+    Return a fit of all poses with its rating, in the levelled frame of the calibration before.
 
-    Effects that a refinement has added to it are kept, with new values. RefusedFitError if the
-    poses do not determine the model; the advice is how to turn the sensor next. InputError if the
-    readings are clearly in another unit.
+    Errors are as in `pipeline.calibrated`; the advice is how to turn the sensor next.
 
     """
-    full = before is not None and not is_partial(before)
-    up = poses_up(poses, units)
-    few = not units.is_native and len(up) >= FEWEST_IN_CONE and lies_in_cone(up)
-    if before is not None and is_refined(before):
-        calibration = refitted(before, poses, sensor=sensor, date=now())
-    elif few and not full:
-        calibration = fit_partial(poses, units, sensor=sensor, date=now())
-    else:
-        calibration = fit_poses(poses, units, model=settings.model, method=settings.method,
-                                sensor=sensor, date=now())
-    if before is None or not before.is_levelled:
-        return calibration
-    context = before.typical_context(1)
-    flat = flat_direction(before.frame) * before.force_per_g
-    reading = before.predict(flat[np.newaxis], context)[0]
-    headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
-                     frame=before.frame)
-    return level(headed, reading, before.frame, context)
+    found = pipeline.calibrated(poses, units, pipeline.Plan(
+        settings.model, settings.method, refined=False, sensor=sensor, before=before,
+        in_cone=True))
+    calibration, rating, quality = found.calibration, found.rating, found.calibration.quality
+    about = calibration.reason if is_partial(calibration) else (
+        f'model {calibration.name} from {len(calibration.used_poses)} of '
+        f'{counted(len(calibration.poses), "pose")}')
+    floor = quality.noise_floor_mg
+    details = [*([] if floor is None else [f'noise floor {floor:.3f} mg']),
+               *(f'pose {each.row} left out: {each.reason}' for each in calibration.rejected),
+               *calibration.warnings, change_words(before, calibration)]
+    return Fitted(
+        calibration, f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
+        f'{quality.rms_after_mg:.3f} mg after', details, rating,
+        differs=replaces(before, calibration))
 
 
-def is_refined(calibration: Calibration) -> bool:
-    """Return whether a calibration has effects beyond offset and gain."""
-    return any(name not in LADDER for name in calibration.model.effects)
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = '',
+            own: tuple[str, ...] = ()) -> Fitted:
+    """
+    Return the refinement of a calibration (None: of a fit).
+
+    An effect far beyond those of parts is refused; `hint` says which quantity may be missing. The
+    own effects of these names are tried beside the catalogue.
+    RefusedFitError if there are too few poses; InputError if the readings are clearly in another
+    unit.
+
+    """
+    refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
+                        date=now(), also=own)
+    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
+    if beyond and not refinement.refusal:
+        refinement = replace(refinement, refusal=(
+            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
+            f'find what else changed with it; {hint}' if hint else 'find what else changed with '
+            'it: check the mounting and the setup, and take the poses again'))
+    rating, calibration = rate_refinement(refinement), refinement.calibration
+    details = [verdict_words(refinement).rstrip('.'), *(
+        f'{shown_name(step.name)} {step.gap_before_mg:.3f} to {step.gap_after_mg:.3f} mg, '
+        f'{step.where}' for step in refinement.steps)]
+    if refinement.disturbed_poses:
+        details.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
+    details += [*calibration.warnings, *refinement.advice]
+    if not refinement.refusal:
+        details.append(change_words(before, calibration))
+    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, '
+                  f'{residual_words(refinement)}', details, rating, refinement)
+
+
+def _verdict(refinement: Refinement) -> str:
+    """Return the verdict with the named effects."""
+    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
+                                      else '') for step in refinement.steps]
+    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
+    return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+            'described': f'{found} describe{verb} the gap'}.get(
+        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
+        'effect explains')
 
 
 def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
@@ -149,12 +170,8 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     It does if it differs by more than its own uncertainty, and the other has only offset and gain.
 
     """
-    if before is None:
-        return True
-    if is_refined(before):
-        return False
-    if is_partial(before):
-        return True
+    if before is None or is_refined(before) or is_partial(before):
+        return before is None or not is_refined(before)
     up = spread_directions(_DIRECTIONS)
     (gain, offset), (gain_before, offset_before) = (
         each.model.linear_part for each in (after, before))
@@ -163,54 +180,13 @@ def replaces(before: Calibration | None, after: Calibration) -> bool:
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
 
 
-def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = '',
-            own: tuple[str, ...] = ()) -> Fitted:
-    """
-    Return the refinement of a calibration (None: of a fit).
-
-    An effect far beyond those of parts is refused; `hint` says which quantity may be missing. The
-    own effects of these names are tried beside the catalogue.
-    RefusedFitError if there are too few poses; InputError if the readings are clearly in another
-    unit.
-
-    """
-    refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
-                        date=now(), also=own)
-    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
-    if beyond and not refinement.refusal:
-        refinement = replace(refinement, refusal=(
-            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
-            f'find what else changed with it; {hint}' if hint else 'find what else changed with '
-            'it: check the mounting and the setup, and take the poses again'))
-    rating = rate_refinement(refinement)
-    details = refinement_details(refinement)
-    if not refinement.refusal:
-        details.append(change_words(before, refinement.calibration))
-    return Fitted(refinement.calibration, rating, summary_of(refinement, rating), details,
-                  refinement=refinement)
-
-
-def rated(calibration: Calibration, refinement: Refinement | None) -> Rating:
-    """Return the rating of a calibration, and of the refinement that it is from."""
-    return rate(calibration, refinement=refinement)
-
-
-def result_of(calibration: Calibration, refinement: Refinement | None, model: str
-              ) -> dict[str, Any]:
-    """Return a calibration, and its refinement, for JSON as on the command line."""
+def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
+          model: str) -> tuple[Rating, dict[str, Any]]:
+    """Return the rating of a calibration, if it is not known, and its JSON as of commands."""
     found = {} if refinement is None else refinement_json(refinement)
     whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
-    return cast('dict[str, Any]', plain(whole))
-
-
-def poses_up(poses: Poses, units: Units) -> Floats:
-    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
-    if units.is_native and len(poses) < _FEWEST_NATIVE:
-        return np.zeros((0, 3))
-    try:
-        return directions_of(poses, units)
-    except RefusedFitError:
-        return np.zeros((0, 3))
+    return (rate(calibration, refinement=refinement) if rating is None else rating,
+            cast('dict[str, Any]', plain(whole)))
 
 
 def plan_for(poses: Poses, units: Units, model: str) -> Plan:
@@ -221,7 +197,7 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
     were asked for. Otherwise the same pose would be asked for again.
 
     """
-    up = poses_up(poses, units)
+    up = _poses_up(poses, units)
     noise, noise_g = pose_noise(poses.noise, up), None
     if noise is not None and len(noise) and not units.is_native:
         noise_g = float(np.median(units.to_g(noise)))
@@ -231,52 +207,17 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
     while len(supposed) < len(poses) and asked.direction is not None:
         supposed = np.vstack([supposed, asked.direction])
         asked = next_pose(supposed, fitted_model)
+    # The zero of readings in other units than native ones is known.
+    zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
     return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                coverage(up) if len(up) else 0.0, _zero(poses, units) if len(up) else ())
+                coverage(up) if len(up) else 0.0, tuple(zero))
 
 
-def _zero(poses: Poses, units: Units) -> tuple[float, ...]:
-    """Return the centre of native readings; empty for readings whose zero is known."""
-    if not units.is_native:
-        return ()
-    return tuple(fit_sphere(poses.reading)[1].tolist())
-
-
-def summary(calibration: Calibration, rating: Rating) -> str:
-    """Return the rating and the residual of a fit in one sentence."""
-    quality = calibration.quality
-    about = calibration.reason if is_partial(calibration) else (
-        f'model {calibration.name} from {len(calibration.used_poses)} of '
-        f'{counted(len(calibration.poses), "pose")}')
-    return (f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
-            f'{quality.rms_after_mg:.3f} mg after')
-
-
-def fit_details(calibration: Calibration) -> list[str]:
-    """Return noise floor, poses that are left out, and warnings of a fit."""
-    floor = calibration.quality.noise_floor_mg
-    return [*([] if floor is None else [f'noise floor {floor:.3f} mg']),
-            *(f'pose {each.row} left out: {each.reason}' for each in calibration.rejected),
-            *calibration.warnings]
-
-
-def summary_of(refinement: Refinement, rating: Rating) -> str:
-    """Return the rating, the verdict with the named effects, and the residual in one sentence."""
-    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
-                                      else '') for step in refinement.steps]
-    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
-    verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
-               'described': f'{found} describe{verb} the gap'}.get(
-        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
-        'effect explains')
-    return f'{rating.name}: {verdict}, {residual_words(refinement)}'
-
-
-def refinement_details(refinement: Refinement) -> list[str]:
-    """Return the verdict, where each effect shows, poses that are left out, and warnings."""
-    lines = [verdict_words(refinement).rstrip('.')]
-    lines += [f'{shown_name(step.name)} {step.gap_before_mg:.3f} to {step.gap_after_mg:.3f} mg, '
-              f'{step.where}' for step in refinement.steps]
-    if refinement.disturbed_poses:
-        lines.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
-    return [*lines, *refinement.calibration.warnings, *refinement.advice]
+def _poses_up(poses: Poses, units: Units) -> Floats:
+    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
+    if units.is_native and len(poses) < _FEWEST_NATIVE:
+        return np.zeros((0, 3))
+    try:
+        return directions_of(poses, units)
+    except RefusedFitError:
+        return np.zeros((0, 3))

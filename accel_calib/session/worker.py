@@ -14,8 +14,8 @@ Functions, arguments and results are pickled between the processes and never sto
 ends with the node in all cases, because its standard input is then closed. If the process cannot
 be started or dies, the node does the computation itself.
 
-Calibrations are also formatted and parsed in the process, if it is free. Files are written in the
-node, which holds their lock: the process may live a little longer than the node.
+Calibrations are also formatted and parsed in the process, if it is free (`Parse`). Files are
+written in the node, which holds their lock: the process may live a little longer than the node.
 
 **Order.** A task is a generator of steps. Steps that use files run in one thread, one after the
 other. Steps that compute run in another one, which waits for the worker process. Between its steps
@@ -47,7 +47,7 @@ from time import monotonic
 from traceback import format_exc
 from typing import Any, BinaryIO, cast, Literal, TypeVar
 
-from .store import here, writing_advice
+from .store import writing_advice
 from ..calibrate import NextPose
 from ..effects import know_code, known_code
 from ..errors import AccelCalibError, InputError
@@ -224,6 +224,11 @@ def _answer(call: Any) -> tuple[bool, Any]:
         return False, error
 
 
+def here(function: Callable[..., Found], *given: object) -> Found:
+    """Call a function in this process."""
+    return function(*given)
+
+
 class Step:
     """
     What a task waits for: the result of a function with these arguments.
@@ -241,24 +246,40 @@ class Step:
         return None if self._function is None else call(self._function, *self._given)
 
 
-class Files(Step):
-    """A function that uses files; other functions that use files and commands wait for it."""
+class Parse(Step):
+    """
+    A function that formats or reads files, in the worker process if that is free.
+
+    Other functions that use files and commands wait for it.
+
+    """
+
+
+class Files(Parse):
+    """A function that writes files, in this process, which holds their lock."""
 
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; it does not need the worker process."""
         return super().run(here)
 
 
-class Calibrations(Files):
-    """A function that uses files, and can call others in the worker process if that is free."""
-
-    def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; the last argument of the function is `call`."""
-        return Step.run(self, lambda function, *given: function(*given, call))
-
-
 class Compute(Step):
     """A function that computes, in the worker process; commands and files do not wait for it."""
+
+
+def answered(task: Task) -> Any:
+    """Run the steps of a task now, in this thread, and return its answer."""
+    try:
+        step = next(task)
+        while True:
+            try:
+                found = step.run(here)
+            except Exception as error:  # the task can handle it
+                step = task.throw(error)
+            else:
+                step = task.send(found)
+    except StopIteration as end:
+        return end.value
 
 
 Task = Generator[Step, Any, Any]
@@ -361,7 +382,7 @@ class Worker:
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
         self._process = WorkerProcess()
-        self._steps: deque[tuple[Files, Task, Answer]] = deque()
+        self._steps: deque[tuple[Parse, Task, Answer]] = deque()
         self._computed: deque[tuple[Task, Answer, Future[Any]]] = deque()
         self._commands: deque[tuple[Task, Answer]] = deque()
         self.running: list[str] = []
@@ -393,7 +414,7 @@ class Worker:
             else:
                 return
 
-    def _use_files(self, step: Files, task: Task, answer: Answer) -> None:
+    def _use_files(self, step: Parse, task: Task, answer: Answer) -> None:
         def then(done: Future[Any]) -> None:
             self._resume(task, answer, done)
             self._advance()
@@ -426,7 +447,7 @@ class Worker:
     def _proceed(self, task: Task, answer: Answer, outcome: tuple[bool, Any]) -> None:
         """Run the next step of a task, or call `answer`."""
         success, found = outcome
-        if isinstance(found, Files):
+        if isinstance(found, Parse):
             self._steps.append((found, task, answer))
             self._advance()
         elif isinstance(found, Step):

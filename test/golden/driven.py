@@ -14,13 +14,13 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import CalibratorSettings, checks, Log, Session, ShowPoses, state, Task
+from accel_calib.session import (
+    answered, CalibratorSettings, checks, Log, Session, ShowPoses, state, Task)
 from accel_calib.units import units_of
 from golden.figures import attempt
 from golden.inputs import G, samples
 from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
 import numpy as np
-from shared import answer_of
 
 SENSOR: dict[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array(
     [0.01, -0.02, 0.015]), 'cross_axis': np.array([0.004, 0.002, -0.003])}
@@ -49,7 +49,7 @@ class _Driver:
                 self.shown = event
 
     def _done(self, task: Task) -> Any:
-        answer = answer_of(task)
+        answer = answered(task)
         self._handle()
         return answer
 
