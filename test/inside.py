@@ -92,8 +92,7 @@ from accel_calib.report.residuals import residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import sheet, snippets
 from accel_calib.ros.run import own_domain
 from accel_calib.session import answered, store as session_store, worker
-from accel_calib.session.commands import load
-from accel_calib.session.guidance import Guide, next_action, Plan
+from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
 from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
@@ -101,13 +100,13 @@ from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics
-from accel_calib.session.work import fit as fit_in_node, plan_for
+from accel_calib.session.work import fit as fit_in_node, load
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import (
     _values_in as values_in, calibration_bytes, calibration_from)
 from accel_calib.stored.exports import (
-    export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
+    CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
 
 COMMAND = ('-m', 'accel_calib.cli.main')
@@ -160,8 +159,7 @@ if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live.host import Host, log_line as live_log
     from accel_calib.live.server import PageServer, PERIOD as LIVE_PERIOD
     from accel_calib.live.viewer import (
-        announce, CALIBRATION_ALONE, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
-        qr_code, reachable)
+        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE, qr_code, reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'

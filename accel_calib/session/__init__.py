@@ -6,20 +6,19 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
 belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
-`store` manages and locks files. `work` contains the computations, and
+`store` manages and locks files. `work` contains the computations and the session's own tasks, and
 `worker` runs the tasks and defines the events. `stream` describes the messages, `state` the state.
 `settings` defines the parameters.
 
 """
 
 from . import state
-from .guidance import Progress
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import Check, checks, figures, Level, words_of_state, worst
+from .state import Check, checks, figures, Level, Progress, words_of_state, worst
 from .store import ros_home
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, Result, Severity,

@@ -14,31 +14,25 @@ stores it or ~/undo discards it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-import json
 import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import next_action, next_words
+from .guidance import next_words, plan_for
 from .sensor import Sensor
-from .store import Store, tidied, unusable, writing_advice
-from .stream import AGAIN, thermometer_words
-from .work import at_rest, change_words, fit, Fitted, plan_for, rated, refined
-from .worker import Compute, Files, Parse, Part, Result, ShowPoses, Task
-from ..calibrate import (
-    angle_words, Calibration, level, mounting_figures, mounting_only, mounting_words, set_heading)
+from .store import writing_advice
+from .stream import thermometer_words
+from .work import at_rest, change_words, fit, Fitted, refined
+from .worker import Compute, Files, Parse, Part, Task
+from ..calibrate import angle_words, Calibration, level, mounting_only, mounting_words, set_heading
 from ..capture import Dwell, poses_from
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..findings import rating_json
 from ..pipeline import is_partial
-from ..table import Poses
 from ..text import counted, now
 
 if TYPE_CHECKING:
     from .session import Session
-    from ..findings import Rating
 
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
@@ -336,95 +330,6 @@ def _alone(session: Session, step: Parse) -> Part[Any]:
                          'expected one sensor: the result is not used',
                          'call the service again')
     return found
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """What is usable of a store, notes, and `problem`: why the calibration cannot be used."""
-
-    calibration: Calibration | None
-    poses: Poses | None
-    problem: str
-    notes: tuple[str, ...]
-
-
-def load(store: Store) -> Part[Loaded]:
-    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
-    calibration, poses, problem = None, None, ''
-    notes: list[str] = yield Files(tidied, store)
-    try:
-        calibration = yield Parse(store.load_calibration)
-    except Exception as error:  # the node starts in any case
-        problem = yield Files(unusable, store.calibration, error)
-    if calibration is not None and calibration.stream not in ('', store.identity.topic):
-        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
-                     f'{store.identity.topic}')
-    try:
-        poses = yield Files(store.load_poses)
-    except Exception as error:
-        notes.append((yield Files(unusable, store.poses, error, True)))
-    return Loaded(calibration, poses, problem, tuple(notes))
-
-
-def load_files(session: Session, store: Store, sensor: Sensor) -> Task:
-    """Read the files of a sensor, and use them unless another one has replaced it."""
-    loaded = yield from load(store)
-    if session.sensor is not sensor:
-        return ''
-    sensor.owners = {each.sensor for each in (loaded.calibration, loaded.poses)
-                     if each is not None and each.sensor}
-    if loaded.poses is not None:
-        sensor.live.book.add_stored(loaded.poses)
-        session.log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
-    if loaded.calibration is not None:
-        session.adopt(loaded.calibration)
-        sensor.fitted_poses = len(loaded.calibration.poses)
-    session.problem = loaded.problem
-    for line in filter(None, (loaded.problem, *loaded.notes)):
-        session.log('error', line)
-    session.show_poses(store=False)
-    return ''
-
-
-def draw_poses(session: Session, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
-               store: Store | None) -> Task:
-    """Store and draw poses, this number more than before; return the line about a new rest."""
-    guide, given = sensor.guide, (poses, session.units, session.settings.model)
-    due = added != 0 or guide.plan is None
-    try:
-        yield Files() if store is None else Files(store.save_poses, poses)
-    except OSError as error:
-        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
-                    'not_stored', AGAIN)
-    # Computed even where only an average has changed, so that the lines keep their order.
-    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
-    if due and not len(poses):  # without the start of the worker process
-        plan = plan_for(*given)
-    if plan is not None and sensor is session.sensor:
-        guide.plan = plan
-        session.report(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
-    if not new_rest or sensor is not session.sensor:
-        return ''
-    return guide.line(poses, session.units, next_action(session), added=added > 0)
-
-
-def report_rating(session: Session, sensor: Sensor, calibration: Calibration,
-                  rating: Rating | None) -> Task:
-    """Rate a calibration, and report it, unless another one has replaced it."""
-    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
-                                  session.settings.model)
-    if sensor.present is not calibration:
-        return ''
-    sensor.rating = rating
-    action = next_action(session)
-    if action is not None:
-        mounting = {'mounting': mounting_figures(
-            calibration.rotation, session.frame_id or '', session.settings.base_frame)}
-        session.report(Result(json.dumps({
-            **found, 'in_use': sensor.offered is not calibration,
-            **(mounting if calibration.is_levelled else {}), **rating_json(
-                rating, action.kind, action.words, action.command and f'~/{action.command}')})))
-    return ''
 
 
 def _rest(session: Session) -> Dwell:

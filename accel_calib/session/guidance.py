@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Guidance for the person who turns the sensor: the next step, one line per pose, and the progress.
+Guidance for the person who turns the sensor: the next pose, the next step, and one line per pose.
 
 `next_action` is the one answer to what comes next. The log, ``~/progress``, the diagnostics, the
 answers of the services and the pages all show it.
@@ -14,18 +14,20 @@ therefore stays the same, although the average of its pose still changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .stream import slow_turn, stream_faults
-from ..calibrate import NextPose
+from ..calibrate import directions_of, next_pose, NextPose
 from ..compare import status
-from ..errors import InputError
+from ..errors import RefusedFitError
+from ..estimate import fit_sphere, pose_noise
 from ..finding import NextStep
+from ..geometry import coverage
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..refine import PlannedPose
 from ..table import Floats, Poses
@@ -38,126 +40,11 @@ if TYPE_CHECKING:
 _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
+_FEWEST_NATIVE = 4
+"""Smallest number of poses to estimate the centre of native readings."""
+
 _WITHOUT_NEW = 60.0
 """Time without a new pose after which the robot probably cannot be turned further [s]."""
-
-
-class _Figure(NamedTuple):
-    """The name of a figure, and the functions that write and read its value."""
-
-    name: str
-    write: Callable[[Any], str]
-    read: Callable[[str], Any]
-
-
-_FIGURES = {
-    'still': _Figure('still', lambda still: str(still).lower(),
-                     {'true': True, 'false': False}.__getitem__),
-    'stillness': _Figure('stillness [1: limit]', '{:.3g}'.format, float),
-    'dwell': _Figure('dwell [s]', '{:.1f}'.format, float),
-    'min_dwell': _Figure('min_dwell [s]', '{:g}'.format, float),
-    'poses': _Figure('poses', str, int),
-    'total': _Figure('poses in all, about', str, int),
-    'coverage': _Figure('coverage', '{:.3f}'.format, float),
-    'accuracy': _Figure('expected accuracy [mg]', lambda accuracy: f'{accuracy * MG:.3g}',
-                        lambda text: float(text) / MG),
-    'step': _Figure('step', str, str),
-    'advice': _Figure('next', str, str),
-    'command': _Figure('service', str, str),
-    'direction': _Figure('next direction',
-                         lambda parts: ' '.join(f'{part:.4f}' for part in parts),
-                         lambda text: tuple(map(float, text.split()))),
-    'up': _Figure('up', lambda parts: ' '.join(f'{part:.4f}' for part in parts),
-                  lambda text: tuple(map(float, text.split()))),
-    'length': _Figure('|a| [g]', '{:.5f}'.format, float),
-    'corrected': _Figure('|a| corrected [g]', '{:.5f}'.format, float),
-    'temperature': _Figure('temperature [°C]', '{:.2f}'.format, float),
-}
-"""Figure of each field of `Progress`."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """
-    The progress of a calibration, for the topic ``~/progress``.
-
-    Parameters
-    ----------
-    still : bool
-        Whether the sensor is still.
-    stillness : float
-        Standard deviation of the last messages, relative to the largest of a still sensor; NaN: no
-        messages.
-    dwell, min_dwell : float
-        Length of the ongoing rest, and shortest rest that becomes a pose [s].
-    poses, total : int
-        Number of poses, and about how many there will be.
-    coverage : float
-        Share of the sphere within 45° of a pose.
-    accuracy : float
-        Expected error of |a| after a fit now [g]; infinite if the poses do not determine it, NaN
-        if the noise is not known.
-    step : str
-        Kind of the next step, one of `accel_calib.finding.STEPS`; empty before it is known.
-    advice : str
-        The next step in words.
-    command : str
-        Name of the service for it; empty if there is none.
-    direction : tuple of float
-        Direction to point up, a unit vector in the sensor axes; empty: none.
-    up : tuple of float
-        Direction of the newest raw reading, a unit vector in the sensor axes; empty: not known.
-    length, corrected : float
-        Raw and corrected |a| of the newest message [g]; the correction is the offered one while a
-        calibration waits for ~/save. NaN: not known.
-    temperature : float
-        Temperature [°C]; NaN: not known.
-
-    """
-
-    still: bool
-    stillness: float
-    dwell: float
-    min_dwell: float
-    poses: int
-    total: int
-    coverage: float
-    accuracy: float
-    step: str
-    advice: str
-    command: str
-    direction: tuple[float, ...]
-    up: tuple[float, ...] = ()
-    length: float = math.nan
-    corrected: float = math.nan
-    temperature: float = math.nan
-
-    def figures(self) -> Iterator[tuple[str, str]]:
-        """Yield names and values."""
-        for field, figure in _FIGURES.items():
-            yield figure.name, figure.write(getattr(self, field))
-
-    @classmethod
-    def from_figures(cls, figures: Mapping[str, str]) -> Progress:
-        """
-        Return the progress with these figures, as `figures` yields them.
-
-        Raises
-        ------
-        InputError
-            If a figure is missing or cannot be read; other figures are ignored.
-
-        """
-        fields = {}
-        for field, (name, _, read) in _FIGURES.items():
-            try:
-                fields[field] = read(figures[name])
-            except (KeyError, ValueError) as err:
-                found = f'{name}: {figures[name]}' if name in figures else f'no figure {name}'
-                raise InputError(
-                    f'the progress of the node has {found}, expected the figures of this version',
-                    'install the same version of accel_calib on both machines') from err
-        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -189,6 +76,40 @@ class Plan:
     noise_g: float
     coverage: float
     zero: tuple[float, ...] = ()
+
+
+def plan_for(poses: Poses, units: Units, model: str) -> Plan:
+    """
+    Return the next pose for a fit of this model, or that more poses no longer help.
+
+    As long as the directions of native readings are not known, the poses are taken for those that
+    were asked for. Otherwise the same pose would be asked for again.
+
+    """
+    up = _poses_up(poses, units)
+    noise, noise_g = pose_noise(poses.noise, up), None
+    if noise is not None and len(noise) and not units.is_native:
+        noise_g = float(np.median(units.to_g(noise)))
+    fitted_model = '10' if model == 'auto' else model
+    asked = next_pose(up, fitted_model, noise, noise_g=noise_g)
+    supposed = up
+    while len(supposed) < len(poses) and asked.direction is not None:
+        supposed = np.vstack([supposed, asked.direction])
+        asked = next_pose(supposed, fitted_model)
+    # The zero of readings in other units than native ones is known.
+    zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
+    return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
+                coverage(up) if len(up) else 0.0, tuple(zero))
+
+
+def _poses_up(poses: Poses, units: Units) -> Floats:
+    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
+    if units.is_native and len(poses) < _FEWEST_NATIVE:
+        return np.zeros((0, 3))
+    try:
+        return directions_of(poses, units)
+    except RefusedFitError:
+        return np.zeros((0, 3))
 
 
 class Guide:

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .commands import Commands, draw_poses, load_files, report_rating
+from .commands import Commands
 from .live_capture import Change
 from .sensor import Sensor, title
 from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles, Store
 from .stream import Around, Reports, SILENT, StreamStatistics
+from .work import draw_poses, load_files, report_rating
 from .worker import answered, Event, Log, Mounting, Severity, ShowPoses, Still
 from ..calibrate import (
     Calibration, FrameName, in_frame, mounting_of, mounting_words, on_topics, with_given_mounting)
@@ -169,11 +170,7 @@ class Session:
         if store is not None:
             self.report(load_files(self, store, self.sensor))
         self._report_still()
-        self.reports.faults()
-        self.reports.limits()
-        self.reports.hand()
-        self.reports.thermometers()
-        self.reports.context()
+        self.reports.tick()
         self._events += self.commands.due()
 
     def close(self) -> None:
@@ -320,21 +317,21 @@ class Session:
             self.sensor.adopt(None)
             self.rate(None)
             return
-        if calibration.is_levelled and calibration.frame != self.frame:
+        levelled = calibration.is_levelled
+        if levelled and calibration.frame != self.frame:
             self.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
                      f'frame is {self.settings.frame}: it is turned, and a measured heading is '
                      'kept')
             calibration = in_frame(calibration, self.frame)
         stored, calibration = calibration, self.with_given(calibration)
-        if stored.is_levelled and not np.allclose(stored.rotation[:, 2],
-                                                  calibration.rotation[:, 2]):
+        if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
             self.log('warning', 'the stored mounting differs from the given one by more than 10° '
                      'of tilt: the given mounting is used; call ~/set_level with the robot level')
         self.sensor.adopt(calibration)
         self.rate(refinement, rating)
-        levelled = calibration.is_levelled and self.settings.rotate
+        turned = calibration.is_levelled and self.settings.rotate
         self.log('info', f'correcting with {title(calibration)}; messages are in the frame '
-                 f'{self.settings.frame if levelled else "of the sensor"}')
+                 f'{self.settings.frame if turned else "of the sensor"}')
         for finding in calibration.noted:
             self.log(_SEVERITY[finding.level], finding.words)
         self._show_mounting()

@@ -11,20 +11,21 @@ The state of a session, as its topics and pages show it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, MISSING
 from enum import IntEnum
 import math
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import next_action, Progress
+from .guidance import next_action
 from .sensor import title
 from .settings import context_topics
 from .stream import missing_context, SILENT, stream_faults, thermometer_words
 from ..calibrate import mounting_words, USES_LIMIT
 from ..compare import Drift, status
+from ..errors import InputError
 from ..finding import has
 from ..messages.one_reading import Triple
 from ..pipeline import is_partial
@@ -34,6 +35,105 @@ from ..units import MG
 
 if TYPE_CHECKING:
     from .session import Session
+
+
+def _figure(name: str, write: Callable[[Any], str], read: Callable[[str], Any],
+            default: Any = MISSING) -> Any:
+    """Return a field with the name of its figure, and what writes and reads its value."""
+    return field(default=default, metadata={'name': name, 'write': write, 'read': read})
+
+
+_VECTOR = (lambda parts: ' '.join(f'{part:.4f}' for part in parts),
+           lambda text: tuple(map(float, text.split())))
+"""What writes and reads the components of a vector."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """
+    The progress of a calibration, for the topic ``~/progress``.
+
+    Parameters
+    ----------
+    still : bool
+        Whether the sensor is still.
+    stillness : float
+        Standard deviation of the last messages, relative to the largest of a still sensor; NaN: no
+        messages.
+    dwell, min_dwell : float
+        Length of the ongoing rest, and shortest rest that becomes a pose [s].
+    poses, total : int
+        Number of poses, and about how many there will be.
+    coverage : float
+        Share of the sphere within 45° of a pose.
+    accuracy : float
+        Expected error of |a| after a fit now [g]; infinite if the poses do not determine it, NaN
+        if the noise is not known.
+    step : str
+        Kind of the next step, one of `accel_calib.finding.STEPS`; empty before it is known.
+    advice : str
+        The next step in words.
+    command : str
+        Name of the service for it; empty if there is none.
+    direction : tuple of float
+        Direction to point up, a unit vector in the sensor axes; empty: none.
+    up : tuple of float
+        Direction of the newest raw reading, a unit vector in the sensor axes; empty: not known.
+    length, corrected : float
+        Raw and corrected |a| of the newest message [g]; the correction is the offered one while a
+        calibration waits for ~/save. NaN: not known.
+    temperature : float
+        Temperature [°C]; NaN: not known.
+
+    """
+
+    still: bool = _figure('still', lambda still: str(still).lower(),
+                          {'true': True, 'false': False}.__getitem__)
+    stillness: float = _figure('stillness [1: limit]', '{:.3g}'.format, float)
+    dwell: float = _figure('dwell [s]', '{:.1f}'.format, float)
+    min_dwell: float = _figure('min_dwell [s]', '{:g}'.format, float)
+    poses: int = _figure('poses', str, int)
+    total: int = _figure('poses in all, about', str, int)
+    coverage: float = _figure('coverage', '{:.3f}'.format, float)
+    accuracy: float = _figure('expected accuracy [mg]', lambda error: f'{error * MG:.3g}',
+                              lambda text: float(text) / MG)
+    step: str = _figure('step', str, str)
+    advice: str = _figure('next', str, str)
+    command: str = _figure('service', str, str)
+    direction: tuple[float, ...] = _figure('next direction', *_VECTOR)
+    up: tuple[float, ...] = _figure('up', *_VECTOR, default=())
+    length: float = _figure('|a| [g]', '{:.5f}'.format, float, default=math.nan)
+    corrected: float = _figure('|a| corrected [g]', '{:.5f}'.format, float, default=math.nan)
+    temperature: float = _figure('temperature [°C]', '{:.2f}'.format, float, default=math.nan)
+
+    def figures(self) -> Iterator[tuple[str, str]]:
+        """Yield names and values."""
+        for each in fields(self):
+            yield each.metadata['name'], each.metadata['write'](getattr(self, each.name))
+
+    @classmethod
+    def from_figures(cls, figures: Mapping[str, str]) -> Progress:
+        """
+        Return the progress with these figures, as `figures` yields them.
+
+        Raises
+        ------
+        InputError
+            If a figure is missing or cannot be read; other figures are ignored.
+
+        """
+        found = {}
+        for each in fields(cls):
+            name = each.metadata['name']
+            try:
+                found[each.name] = each.metadata['read'](figures[name])
+            except (KeyError, ValueError) as err:
+                what = f'{name}: {figures[name]}' if name in figures else f'no figure {name}'
+                raise InputError(
+                    f'the progress of the node has {what}, expected the figures of this version',
+                    'install the same version of accel_calib on both machines') from err
+        return cls(**found)
+
 
 Newest = tuple[tuple[float, ...], float, float]
 """A reading: direction (empty if not known), |a| and corrected |a| [g] (NaN: not known)."""

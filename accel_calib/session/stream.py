@@ -347,6 +347,14 @@ class Reports:
         self._left: frozenset[str] = frozenset()
         self._missing: frozenset[str] = frozenset()
 
+    def tick(self) -> None:
+        """Report what is wrong with the messages now; to be called about once per second."""
+        self._faults_of_stream()
+        self._limits()
+        self._slow_turn()
+        self._thermometers()
+        self._context()
+
     def foreign(self, frame_id: str) -> None:
         """Count a message of another sensor."""
         self._session.statistics.drop('foreign')
@@ -382,7 +390,7 @@ class Reports:
                               'recording is played, check the clock of the driver',
                               f'jump {where}', _FAULT_AGAIN)
 
-    def limits(self) -> None:
+    def _limits(self) -> None:
         """Log once when a quantity leaves the range of the calibration."""
         left = self._session.sensor.limits_left(self._session.context)
         for key, each in left.items():
@@ -394,13 +402,13 @@ class Reports:
                     f'limits of {key}', _FAULT_AGAIN)
         self._left = frozenset(left)
 
-    def hand(self) -> None:
+    def _slow_turn(self) -> None:
         """Log that the sensor turns slowly while a pose is waited for."""
         words = slow_turn(self._session)
         if words and self._session.settings.auto_capture:
             self._session.log('info', f'no pose yet: {words}', 'slow_turn', AGAIN)
 
-    def thermometers(self) -> None:
+    def _thermometers(self) -> None:
         """Log which temperatures are published if none arrives."""
         session = self._session
         if (session.thermometers and session.statistics.messages
@@ -409,7 +417,7 @@ class Reports:
             session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
                         'thermometers', 10.0 * _FAULT_AGAIN)
 
-    def context(self) -> None:
+    def _context(self) -> None:
         """Log when a column of the context is missing or back, and that poses lack it."""
         session, missing = self._session, missing_context(self._session)
         for column, words in missing.items():
@@ -425,7 +433,7 @@ class Reports:
                             f'{column}, so that ~/refine cannot use it: call ~/reset, and take '
                             'the poses again', f'poses without {column}', 10.0 * _FAULT_AGAIN)
 
-    def faults(self) -> None:
+    def _faults_of_stream(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""
         session, statistics = self._session, self._session.statistics
         faults = stream_faults(session)

@@ -1,42 +1,49 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The computations of a session, with their texts; most run in the worker process."""
+"""
+The computations of a session, with their texts, and the tasks that it starts itself.
+
+The computations are functions of poses and calibrations; most run in the worker process.
+
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
-from typing import Any, cast
+import json
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 
-from .guidance import Plan
-from .sensor import gyro_bias_of_rest
+from .guidance import next_action, plan_for
+from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
+from .store import Store, tidied, unusable, writing_advice
+from .stream import AGAIN
+from .worker import Compute, Files, Parse, Part, Result, ShowPoses, Task
 from .. import pipeline
-from ..calibrate import Calibration, directions_of, fit_partial, next_pose, outlook
+from ..calibrate import Calibration, fit_partial, mounting_figures, outlook
 from ..capture import Dwell, poses_from
 from ..effects import Model
-from ..errors import RefusedFitError
-from ..estimate import fit_sphere, pose_noise
-from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
-from ..geometry import coverage, spread_directions
+from ..findings import (
+    calibration_json, rate, rate_refinement, Rating, rating_json, refinement_json)
+from ..geometry import spread_directions
 from ..pipeline import is_partial, is_refined
 from ..refine import refine, Refinement
 from ..refine.words import residual_words, shown_name, times_typical, verdict_words
-from ..table import Floats, Poses
+from ..table import Poses
 from ..text import counted, listed, now, plain
 from ..units import MG, Units
+
+if TYPE_CHECKING:
+    from .session import Session
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
 
 _BEYOND = 100.0
 """Ratio to the typical size above which an effect is not caused by the sensor."""
-
-_FEWEST_NATIVE = 4
-"""Smallest number of poses to estimate the centre of native readings."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +52,8 @@ class Fitted:
     A new calibration: a fit, a refinement or another mounting.
 
     `words` are the answer, one sentence, and `details` are for the log. `rating` is None if it is
-    not known yet. `differs`: an automatic fit replaces the calibration before it.
+    not known yet. `differs`: an automatic fit replaces the calibration before it. `refusal` is why
+    it must not be used, and what to do instead; empty if it can be used.
 
     """
 
@@ -55,15 +63,14 @@ class Fitted:
     rating: Rating | None = None
     refinement: Refinement | None = None
     differs: bool = True
+    refusal: tuple[str, ...] = ()
 
-    @property
-    def refusal(self) -> tuple[str, ...]:
-        """Return why it must not be used, and what to do instead; empty if it can be used."""
-        if self.refinement is not None and self.refinement.refusal:
-            return self.refinement.refusal
-        if self.rating is not None and self.rating.name == 'BAD':
-            return self.rating.reason, self.rating.next.text
-        return ()
+
+def _refusal(rating: Rating, refinement: Refinement | None = None) -> tuple[str, ...]:
+    """Return why a calibration must not be used, and what to do instead; empty if it can be."""
+    if refinement is not None and refinement.refusal:
+        return refinement.refusal
+    return (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
 
 
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
@@ -88,7 +95,8 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
     return Fitted(
         calibration, f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
         f'{quality.rms_after_mg:.3f} mg after', details, rating,
-        differs=replaces(before, calibration))
+        differs=replaces(before, calibration),
+        refusal=_refusal(rating))
 
 
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str = '',
@@ -120,7 +128,8 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     if not refinement.refusal:
         details.append(change_words(before, calibration))
     return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, '
-                  f'{residual_words(refinement)}', details, rating, refinement)
+                  f'{residual_words(refinement)}', details, rating, refinement,
+                  refusal=_refusal(rating, refinement))
 
 
 def _verdict(refinement: Refinement) -> str:
@@ -189,35 +198,92 @@ def rated(calibration: Calibration, refinement: Refinement | None, rating: Ratin
             cast('dict[str, Any]', plain(whole)))
 
 
-def plan_for(poses: Poses, units: Units, model: str) -> Plan:
-    """
-    Return the next pose for a fit of this model, or that more poses no longer help.
+# ----------------------------------------------------------------------------- tasks of a session
 
-    As long as the directions of native readings are not known, the poses are taken for those that
-    were asked for. Otherwise the same pose would be asked for again.
+@dataclass(frozen=True)
+class Loaded:
+    """What is usable of a store, notes, and `problem`: why the calibration cannot be used."""
 
-    """
-    up = _poses_up(poses, units)
-    noise, noise_g = pose_noise(poses.noise, up), None
-    if noise is not None and len(noise) and not units.is_native:
-        noise_g = float(np.median(units.to_g(noise)))
-    fitted_model = '10' if model == 'auto' else model
-    asked = next_pose(up, fitted_model, noise, noise_g=noise_g)
-    supposed = up
-    while len(supposed) < len(poses) and asked.direction is not None:
-        supposed = np.vstack([supposed, asked.direction])
-        asked = next_pose(supposed, fitted_model)
-    # The zero of readings in other units than native ones is known.
-    zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
-    return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                coverage(up) if len(up) else 0.0, tuple(zero))
+    calibration: Calibration | None
+    poses: Poses | None
+    problem: str
+    notes: tuple[str, ...]
 
 
-def _poses_up(poses: Poses, units: Units) -> Floats:
-    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
-    if units.is_native and len(poses) < _FEWEST_NATIVE:
-        return np.zeros((0, 3))
+def load(store: Store) -> Part[Loaded]:
+    """Read a store; damaged files are renamed, and no file keeps the node from starting."""
+    calibration, poses, problem = None, None, ''
+    notes: list[str] = yield Files(tidied, store)
     try:
-        return directions_of(poses, units)
-    except RefusedFitError:
-        return np.zeros((0, 3))
+        calibration = yield Parse(store.load_calibration)
+    except Exception as error:  # the node starts in any case
+        problem = yield Files(unusable, store.calibration, error)
+    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used for '
+                     f'{store.identity.topic}')
+    try:
+        poses = yield Files(store.load_poses)
+    except Exception as error:
+        notes.append((yield Files(unusable, store.poses, error, True)))
+    return Loaded(calibration, poses, problem, tuple(notes))
+
+
+def load_files(session: Session, store: Store, sensor: Sensor) -> Task:
+    """Read the files of a sensor, and use them unless another one has replaced it."""
+    loaded = yield from load(store)
+    if session.sensor is not sensor:
+        return ''
+    sensor.owners = {each.sensor for each in (loaded.calibration, loaded.poses)
+                     if each is not None and each.sensor}
+    if loaded.poses is not None:
+        sensor.live.book.add_stored(loaded.poses)
+        session.log('info', f'read {counted(len(loaded.poses), "pose")} from the store')
+    if loaded.calibration is not None:
+        session.adopt(loaded.calibration)
+        sensor.fitted_poses = len(loaded.calibration.poses)
+    session.problem = loaded.problem
+    for line in filter(None, (loaded.problem, *loaded.notes)):
+        session.log('error', line)
+    session.show_poses(store=False)
+    return ''
+
+
+def draw_poses(session: Session, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
+               store: Store | None) -> Task:
+    """Store and draw poses, this number more than before; return the line about a new rest."""
+    guide, given = sensor.guide, (poses, session.units, session.settings.model)
+    due = added != 0 or guide.plan is None
+    try:
+        yield Files() if store is None else Files(store.save_poses, poses)
+    except OSError as error:
+        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
+                    'not_stored', AGAIN)
+    # Computed even where only an average has changed, so that the lines keep their order.
+    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
+    if due and not len(poses):  # without the start of the worker process
+        plan = plan_for(*given)
+    if plan is not None and sensor is session.sensor:
+        guide.plan = plan
+        session.report(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+    if not new_rest or sensor is not session.sensor:
+        return ''
+    return guide.line(poses, session.units, next_action(session), added=added > 0)
+
+
+def report_rating(session: Session, sensor: Sensor, calibration: Calibration,
+                  rating: Rating | None) -> Task:
+    """Rate a calibration, and report it, unless another one has replaced it."""
+    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
+                                  session.settings.model)
+    if sensor.present is not calibration:
+        return ''
+    sensor.rating = rating
+    action = next_action(session)
+    if action is not None:
+        mounting = {'mounting': mounting_figures(
+            calibration.rotation, session.frame_id or '', session.settings.base_frame)}
+        session.report(Result(json.dumps({
+            **found, 'in_use': sensor.offered is not calibration,
+            **(mounting if calibration.is_levelled else {}), **rating_json(
+                rating, action.kind, action.words, action.command and f'~/{action.command}')})))
+    return ''
