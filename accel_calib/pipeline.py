@@ -60,7 +60,8 @@ class Plan:
         Names of own effects of the user, which the search tries beside the catalogue.
     before : Calibration, optional
         The calibration in use. Effects that a refinement has added to it are kept, with new
-        values, and so are its levelled frame and its mounting, without a `flat` pose.
+        values, and the search for effects starts from it. Without a `flat` pose, its levelled
+        frame and its mounting are kept.
     in_cone : bool
         Fit poses that are all near one direction, too, with typical values of sensors, unless
         `before` is a full fit.
@@ -186,7 +187,8 @@ def _refinement(poses: Poses, units: Units, plan: Plan, date: str
 
     fleet, named = plan.fleet, {'sensor': plan.sensor, 'date': date}
     try:
-        found = (refine(poses, units, **named, also=plan.also) if fleet is None
+        found = (refine(poses, units, base='auto' if plan.before is None else plan.before,
+                        **named, also=plan.also) if fleet is None
                  else refine_with_fleet(poses, units, fleet, **named, also=plan.also))
     except RefusedFitError as err:
         return None, f'not refined: {err.message}'

@@ -128,7 +128,8 @@ class Exchange:
 
     def export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
         """Call `answer` with an export of the calibration in use, or why there is none."""
-        self._call_soon(lambda: self._export(name, answer))
+        self._call_soon(lambda: self._worker.do(
+            'export', self._exported(name), lambda success, found: answer(found)))
 
     def warn(self, words: str) -> None:
         """Log a warning of the server."""
@@ -183,14 +184,9 @@ class Exchange:
         self._worker.run(drawing, answer_all)
 
     def _drawn(self, calibration: Calibration, stored: str) -> Task:
-        """Return the calibration page."""
         return (yield Compute(drawn, calibration, self._session.topic, stored))
 
-    def _export(self, name: str, answer: Callable[[Exported | str], object]) -> None:
-        self._worker.do('export', self._exported(name), lambda success, found: answer(found))
-
     def _exported(self, name: str) -> Task:
-        """Return an export of the calibration in use."""
         session = self._session
         if session.sensor.offered is not None:
             raise InputError('a new calibration waits', 'accept it or take it back first')
@@ -205,7 +201,6 @@ def drawn(calibration: Calibration, source: str, stored: str) -> str:
 
 
 def _progress(time: float, now: Progress) -> Message:
-    """Return the progress of a calibration at a time [s]."""
     return {
         'kind': 'progress', 'time': round(time, 3), 'still': now.still,
         'stillness': _fixed(now.stillness), 'dwell': _fixed(now.dwell),
@@ -269,7 +264,6 @@ def _problem(session: Session) -> str:
 
 
 def _result(calibration: Calibration) -> Message:
-    """Return the numbers of a calibration."""
     quality, used = calibration.quality, len(calibration.used_poses)
     return {
         'model': calibration.name, 'date': calibration.date, 'unit': calibration.units.name,
@@ -301,7 +295,6 @@ def _number(value: float | None) -> float | None:
 
 
 def _rounded(values: Any) -> Any:
-    """Return an array as lists."""
     array = np.asarray(values, float)
     if array.ndim == 0:
         return _number(float(array))
@@ -432,14 +425,12 @@ class Host:
             self.exchange.show_progress(self._newest())
 
     def _newest(self) -> tuple[float, float, float] | None:
-        """Return the newest reading that the session does not have yet."""
         if not self._waiting:
             return None
         x, y, z = self._waiting[-1][-1, 1:4].tolist()
         return x, y, z
 
     def _flush(self) -> None:
-        """Pass the waiting samples to the session."""
         if self._waiting:
             samples, self._waiting = np.concatenate(self._waiting), []
             if self.session.accepts(self._source.sensor):
@@ -448,13 +439,11 @@ class Host:
         self._handle_events()
 
     def _set_temperature(self, temperatures: Floats) -> None:
-        """Pass the last known temperature to the session."""
         known = temperatures[np.isfinite(temperatures)]
         if len(known):
             self.session.around.take('temperature', float(known[-1]))
 
     def _handle_events(self) -> None:
-        """Show and log what the session reports."""
         for event in self.session.events():
             if isinstance(event, Log):
                 self._log(event)
@@ -464,7 +453,6 @@ class Host:
                 self._worker.run(event, self._on_done)
 
     def _on_done(self, success: bool, words: str) -> None:
-        """Show and log the end of a task."""
         self._log(Log('info' if success else 'warning', words))
         self.exchange.show_state()
 

@@ -312,7 +312,6 @@ class PageServer:
         loop.call_later(wait, self._look)
 
     def _take(self, message: Message) -> None:
-        """Keep a message, and wake the viewers."""
         if self.board.take(message, is_seen=bool(self.viewers)):
             for viewer in self.viewers:
                 viewer.wake()
@@ -321,7 +320,6 @@ class PageServer:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
-        """Answer a request."""
         connection = cast('Connection', request.protocol)
         connection.stage = 1
         refusal = self._address.refusal(request)
@@ -345,7 +343,6 @@ class PageServer:
                             charset=None if file.name.endswith('.png') else 'utf-8')
 
     async def _page(self) -> web.Response:
-        """Return the calibration page."""
         success, text = await self._asked(self._desk.page)
         if not success:
             return web.Response(status=404, text=f'{text}\n')
@@ -353,7 +350,6 @@ class PageServer:
         return web.Response(text=text, content_type='text/html', headers=allowed)
 
     async def _export(self, request: web.BaseRequest, name: str) -> web.Response:
-        """Return an export as a download."""
         kind, _, token = request.headers.get('Authorization', '').partition(' ')
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(

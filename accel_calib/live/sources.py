@@ -145,7 +145,6 @@ def _before_gap(due: Floats, done: int, ready: int, speed: float) -> int:
 
 
 def _rows(recording: Recording) -> Floats:
-    """Return samples as rows of all columns."""
     rows = np.full((len(recording), 9), np.nan)
     columns = samples_of(recording, 0, len(recording))
     rows[:, :len(columns)] = columns.T
@@ -265,7 +264,6 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
 
 
 def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats]:
-    """Yield the samples of a port."""
     if reader.first is not None:
         yield _rows(reader.first)
     for new in lines:

@@ -263,7 +263,6 @@ class Calibrator:
             session.set_mounting(rotation.T)
 
     def _on_tick(self) -> None:
-        """Publish the diagnostics."""
         self.session.publishers = tuple(
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
         self.session.imus, self.session.thermometers = published_by_others(
@@ -292,7 +291,6 @@ class Calibrator:
         return response
 
     def _handle_events(self) -> None:
-        """Publish and log what the session reports."""
         shown = False
         for event in self.session.events():
             self._handle(event)
@@ -320,7 +318,6 @@ class Calibrator:
             self._worker.run(event, self._on_done)
 
     def _on_done(self, success: bool, words: str) -> None:
-        """Log the end of a task, and show what has changed with it."""
         self._log(Log('info' if success else 'warning', words))
         self._show_state()
 

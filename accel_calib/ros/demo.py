@@ -328,7 +328,6 @@ def _refined(demo: Demonstration, report: Callable[[str], None], stored: Path
 
 
 def _errors(rests: Sequence[Rest], name: str) -> Errors:
-    """Return the errors of a topic."""
     truth = np.array([rest['truth'] for rest in rests])
     values = np.array([rest[name] for rest in rests])
     sizes = np.linalg.norm(values, axis=1)

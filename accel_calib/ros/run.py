@@ -128,7 +128,6 @@ def _run(node: str, args: Sequence[str] | None, came: int) -> int:
 
 
 def _spin(node: str, came: int) -> None:
-    """Create the node and spin it."""
     from rclpy.executors import ExternalShutdownException
     from rclpy.task import Future
 

@@ -206,7 +206,6 @@ class SimulatorNode(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_next(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Turn the sensor to the next pose."""
         response.success = self._simulated.turn_on()
         response.message = (
             f'turning to pose {self._simulated.next_pose}' if response.success else
@@ -215,13 +214,11 @@ class SimulatorNode(Node):
         return response
 
     def _on_flat(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Put the robot flat."""
         self._simulated.turn_to(_FLAT)
         response.success, response.message = True, 'turning until z of the robot points up'
         return response
 
     def _on_tick(self) -> None:
-        """Publish the samples that are due."""
         now = time.monotonic()
         if self._sent == 0:
             listeners = self._imu.get_subscription_count()
@@ -256,7 +253,6 @@ class SimulatorNode(Node):
 
 
 def _directions(settings: SimulatorSettings) -> Floats:
-    """Return the direction of up in each pose, (n, 3)."""
     spread = spread_directions(settings.poses)
     return np.vstack([*[_FLAT] * settings.flat_first,
                       _mixed(spread) if settings.mixed else spread,

@@ -219,7 +219,6 @@ class Guide:
 
 
 def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
-    """Return the first of some planned poses as the next pose."""
     first = planned[0]
     where = f' {first.conditions}' if first.conditions else ''
     return NextPose(np.array(first.up), f'hold {first.words}{where}, {first.purpose}',
@@ -333,7 +332,6 @@ def _level_step() -> Action:
 
 
 def _after_good(sensor: Sensor, after: NextStep) -> Action:
-    """Return the step after a good fit."""
     if sensor.calibration is not None and not sensor.calibration.is_levelled:
         return _level_step()
     return Action('done', after.text if after.kind == 'done' else 'use the calibration')

@@ -312,7 +312,6 @@ class LiveCapture:
         self.book.clear()
 
     def _look(self, capture: bool) -> Change | None:
-        """Return the changes of the ongoing rest."""
         dwell = self.detector.current()
         if dwell is None or _length(dwell) < _due(_length(self._rest, dwell)):
             return None

@@ -227,7 +227,6 @@ class Session:
                 self.reports.jump(last[0].seconds, since)
 
     def _change(self, changes: Iterable[Change]) -> None:
-        """Process changes of the capture."""
         sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
         for change in changes:
             self._report_still()

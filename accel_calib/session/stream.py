@@ -391,7 +391,6 @@ class Reports:
                               f'jump {where}', _FAULT_AGAIN)
 
     def _limits(self) -> None:
-        """Log once when a quantity leaves the range of the calibration."""
         left = self._session.sensor.limits_left(self._session.context)
         for key, each in left.items():
             if key not in self._left:
@@ -403,13 +402,11 @@ class Reports:
         self._left = frozenset(left)
 
     def _slow_turn(self) -> None:
-        """Log that the sensor turns slowly while a pose is waited for."""
         words = slow_turn(self._session)
         if words and self._session.settings.auto_capture:
             self._session.log('info', f'no pose yet: {words}', 'slow_turn', AGAIN)
 
     def _thermometers(self) -> None:
-        """Log which temperatures are published if none arrives."""
         session = self._session
         if (session.thermometers and session.statistics.messages
                 and math.isnan(session.around.temperature)

@@ -133,7 +133,6 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
 
 
 def _verdict(refinement: Refinement) -> str:
-    """Return the verdict with the named effects."""
     names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''

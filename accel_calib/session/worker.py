@@ -445,7 +445,6 @@ class Worker:
             self._is_busy = False
 
     def _proceed(self, task: Task, answer: Answer, outcome: tuple[bool, Any]) -> None:
-        """Run the next step of a task, or call `answer`."""
         success, found = outcome
         if isinstance(found, Parse):
             self._steps.append((found, task, answer))
