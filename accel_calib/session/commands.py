@@ -180,7 +180,7 @@ class Commands:
         calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
-        yield Files(store.write, *(yield Parse(store.prepared, calibration)))
+        yield Files(store.write, after=Parse(store.prepared, calibration))
         yield Files(store.save_poses, sensor.live.book.poses())
         sensor.unsaved = False
         if sensor.offered is calibration:
@@ -217,8 +217,7 @@ class Commands:
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
         session, store = self._session, self._session.files.usable()
-        is_good = yield from _alone(session, Parse(store.is_good))
-        kept = yield from _alone(session, Files(store.set_aside, is_good))
+        kept = yield from _alone(session, Files(store.set_aside, after=Parse(store.is_good)))
         session.sensor.live.clear()
         session.adopt(None)
         session.sensor.fitted_poses = 0
@@ -308,8 +307,8 @@ def _use(session: Session, fitted: Fitted, *, offered: bool = False) -> Part[str
         return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
                 '~/undo to discard it')
     try:
-        data, is_good = yield from _alone(session, Parse(store.prepared, calibration))
-        yield from _alone(session, Files(store.write, data, is_good))
+        yield from _alone(session, Files(
+            store.write, after=Parse(store.prepared, calibration)))
     except OSError as error:
         session.adopt(calibration, fitted.refinement, fitted.rating)
         session.sensor.unsaved = True

@@ -184,10 +184,11 @@ class Store:
 
     def save_calibration(self, calibration: Calibration) -> None:
         """Write the calibration, and keep the file before as a step."""
-        self.write(*self.prepared(calibration))
+        self.write(self.prepared(calibration))
 
-    def write(self, data: bytes, is_good: bool) -> None:
+    def write(self, prepared: tuple[bytes, bool]) -> None:
         """Write what `prepared` returned, and keep the file before as a step."""
+        data, is_good = prepared
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
         step = self._keep_step(is_good)
         write_atomically(self.calibration, lambda file: file.buffer.write(data))

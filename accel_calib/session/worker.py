@@ -235,15 +235,21 @@ class Step:
 
     The function does not use the session, and can raise AccelCalibError or OSError, which are
     raised in the task. Without a function, the task only waits until the steps before it are done.
+    The result of a step `after` which it comes is its first argument.
 
     """
 
-    def __init__(self, function: Callable[..., Any] | None = None, *given: Any) -> None:
-        self._function, self._given = function, given
+    def __init__(self, function: Callable[..., Any] | None = None, *given: Any,
+                 after: Step | None = None) -> None:
+        self._function, self._given, self._after = function, given, after
 
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; `call` is `WorkerProcess.call`."""
-        return None if self._function is None else call(self._function, *self._given)
+        return self._result(call, call)
+
+    def _result(self, call: Callable[..., Any], call_before: Callable[..., Any]) -> Any:
+        before = () if self._after is None else (self._after.run(call_before),)
+        return None if self._function is None else call(self._function, *before, *self._given)
 
 
 class Parse(Step):
@@ -259,8 +265,8 @@ class Files(Parse):
     """A function that writes files, in this process, which holds their lock."""
 
     def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; it does not need the worker process."""
-        return super().run(here)
+        """Return the result; only a step before it needs the worker process."""
+        return self._result(here, call)
 
 
 class Compute(Step):
