@@ -66,8 +66,6 @@ class Exchange:
         Function that lets the thread of the session call a function.
     log : callable
         Function that logs the answers to commands.
-    flush : callable
-        Function that passes all messages so far to the session.
 
     Attributes
     ----------
@@ -79,9 +77,9 @@ class Exchange:
     """
 
     def __init__(self, session: Session, worker: Worker, call_soon: CallSoon,
-                 log: Callable[[Log], None], flush: Callable[[], object]) -> None:
-        self._session, self._worker, self._call_soon = session, worker, call_soon
-        self._log, self._flush = log, flush
+                 log: Callable[[Log], None]) -> None:
+        self._session, self._worker = session, worker
+        self._call_soon, self._log = call_soon, log
         self.show: Show = lambda message: None
         self.problem = ''
         self._shown: Calibration | None = None
@@ -150,8 +148,6 @@ class Exchange:
             self.show_state()
 
     def _command(self, name: str) -> Task:
-        """Run a command of the page after all samples so far."""
-        self._flush()
         commands = self._session.commands
         if name in ('enable', 'disable'):
             return commands.enable(name == 'enable')
@@ -340,9 +336,8 @@ class Host:
         self.session = Session(settings, source.name)
         self.session.publishers = None
         self._worker = Worker(self._tasks.put, self._handle_events,
-                              lambda words: self._log(Log('error', words)))
-        self.exchange = Exchange(self.session, self._worker, self._tasks.put, self._log,
-                                 self._flush)
+                              lambda words: self._log(Log('error', words)), self._flush)
+        self.exchange = Exchange(self.session, self._worker, self._tasks.put, self._log)
         try:
             self.server = PageServer(self.exchange, settings.web_host, settings.web_port)
             self.server.start()

@@ -17,7 +17,7 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
@@ -44,7 +44,7 @@ from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings, Check, checks, context_topics, Event, figures, Level, Log, LogFilter,
-    Mounting, Progress, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
+    Mounting, Progress, Result, Session, ShowPoses, state, Still, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -180,7 +180,8 @@ class Calibrator:
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
         self._call_soon = in_executor(node)
         self._worker = Worker(self._call_soon, self._handle_events,
-                              lambda words: self._log(Log('error', words)))
+                              lambda words: self._log(Log('error', words)),
+                              lambda: self.stream.flush())
         self._filter, self._progress_at = LogFilter(), 0.0
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
@@ -205,7 +206,8 @@ class Calibrator:
 
     def _serve(self) -> None:
         for name in _TRIGGERS:
-            serve(self._node, name, self._command(name), self._worker, self._log)
+            command = getattr(self.session.commands, name)
+            serve(self._node, name, command, self._worker, self._log)
         self._node.create_service(SetBool, '~/enable', self._on_enable,
                                   qos_profile=CALLS)
         self._node.create_service(SelfTest, '~/self_test', self._on_self_test,
@@ -235,23 +237,13 @@ class Calibrator:
         check_installed()
         from ..live.host import Exchange
         from ..live.server import PageServer, PERIOD
-        page = Exchange(self.session, self._worker, self._call_soon, self._log, self.stream.flush)
+        page = Exchange(self.session, self._worker, self._call_soon, self._log)
         server = PageServer(page, settings.web_host, settings.web_port)
         server.start()
         self._page, self._server = page, server
         self._log(Log('info', server.announce()))
         self._node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
                                 clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _command(self, name: str) -> Callable[[], Task]:
-        """Return a command of the session that first processes all messages so far."""
-        command = getattr(self.session.commands, name)
-
-        def call() -> Task:
-            self.stream.flush()
-            return (yield from command())
-
-        return call
 
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""

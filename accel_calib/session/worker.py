@@ -235,7 +235,7 @@ class Step:
 
     The function does not use the session, and can raise AccelCalibError or OSError, which are
     raised in the task. Without a function, the task only waits until the steps before it are done.
-    The result of a step `after` which it comes is its first argument.
+    With `after`, the result of that step is its first argument.
 
     """
 
@@ -378,13 +378,16 @@ class Worker:
 
     `running` names the commands that are not answered, the oldest first. `call_soon` lets the
     thread of the session call a function. `on_events` is called after each step of a task, in the
-    thread of the session, and `report` for an unexpected error.
+    thread of the session, and `report` for an unexpected error. `flush` passes all samples so far
+    to the session, before a command begins.
 
     """
 
     def __init__(self, call_soon: CallSoon, on_events: Callable[[], None],
-                 report: Callable[[str], object]) -> None:
+                 report: Callable[[str], object],
+                 flush: Callable[[], object] = lambda: None) -> None:
         self._call_soon, self._on_events, self._report = call_soon, on_events, report
+        self._flush = flush
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
         self._process = WorkerProcess()
@@ -401,8 +404,12 @@ class Worker:
             answer(success, found)
 
         self.running.append(name)
-        self._commands.append((command, done))
+        self._commands.append((self._fresh(command), done))
         self._advance()
+
+    def _fresh(self, command: Task) -> Task:
+        self._flush()
+        return (yield from command)
 
     def run(self, task: Task, answer: Answer) -> None:
         """Begin a task now, run its steps, and call `answer`."""
