@@ -88,8 +88,6 @@ class Sensor:
         Sensors that the stored files name.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
-    scale : float
-        m/s² per unit of corrected force.
     rest : Dwell or None
         The last rest.
     gravity : (3,) array or None
@@ -110,7 +108,6 @@ class Sensor:
         self.auto_fit_waits = self.unsaved = False
         self.owners: set[str] = set()
         self.drift: Drift | None = None
-        self.scale = 1.0
         self.rest: Dwell | None = None
         self.gravity: Floats | None = None
         self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
@@ -152,7 +149,6 @@ class Sensor:
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
         self.temperatures.follow(Model({}) if calibration is None else calibration.model)
-        self.scale = 1.0 if calibration is None else output_scale(calibration, self._g)
         self.set_rotates(self._rotates)
 
     def set_rotates(self, rotates: bool) -> None:
@@ -240,7 +236,8 @@ class Sensor:
         context = self._context(rest)
         if self.applied is None or context is None:
             return None
-        return self.applied.correct(rest.mean[np.newaxis], context)[0] * self.scale
+        force = self.applied.correct(rest.mean[np.newaxis], context)[0]
+        return force * output_scale(self.applied, self._g)
 
     def _context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
