@@ -304,6 +304,16 @@ def test_a_damaged_container_ends_in_a_result_or_a_refusal(kind: str, tmp_path: 
             list(log.blocks)
 
 
+def test_an_archive_with_a_file_before_its_start_is_refused(tmp_path: Path) -> None:
+    path = written('zip', tmp_path, tables_of('phyphox')[0])
+    data = bytearray(path.read_bytes())
+    offset, = struct.unpack('<I', data[-6:-2])  # of the list of files, counted from the start
+    data[-6:-2] = struct.pack('<I', offset + 10)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match='cannot be unpacked .*a file starts before'):
+        read_log(path)
+
+
 def test_a_matlab_file_of_timetables_says_how_to_export_them(tmp_path: Path) -> None:
     # A file of level 5: the array flag 17 (opaque), as MATLAB Mobile saves its timetables.
     names = struct.pack('<II', 1, 12) + b'Acceleration'.ljust(16, b'\0')

@@ -142,6 +142,8 @@ def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
         yield _arrays(path)
     else:
         with _sound_archive(path), zipfile.ZipFile(path) as archive:
+            if any(info.header_offset < 0 for info in archive.infolist()):
+                raise zipfile.BadZipFile('a file starts before the archive')
             excel = _WORKBOOK in archive.namelist()
             yield from (_sheets(path, archive) if excel else [_files(path, archive)])
 
