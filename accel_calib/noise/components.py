@@ -80,8 +80,7 @@ class Component:
     One component of the noise of one axis, in the unit of the figure.
 
     `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then the upper
-    limit with 95 % probability, otherwise the end of the interval. `share` is the largest part of
-    the variance that it makes at a τ of the range.
+    limit with 95 % probability, otherwise the end of the interval.
 
     """
 
@@ -89,12 +88,17 @@ class Component:
     sd: float
     interval: tuple[float, float]
     upper: float
-    share: float
 
     @property
     def seen(self) -> bool:
         """Whether the curve shows this component."""
         return bool(np.isfinite(self.value))
+
+    def times(self, scale: float) -> Component:
+        """Return the component in another unit."""
+        low, high = self.interval
+        return Component(self.value * scale, self.sd * scale, (low * scale, high * scale),
+                         self.upper * scale)
 
 
 @dataclass(frozen=True)
@@ -149,58 +153,38 @@ class _RangeFit:
         self._variances = variances[which]
         self._shape = shape[which]
 
-    def _whitening(self, squares: Floats) -> Floats:
-        """Return the matrix that makes the errors of the variances independent."""
+    def _whitened(self, squares: Floats) -> tuple[Floats, Floats]:
+        """Return shape and variances, transformed so that the errors are independent."""
         covariance = self._spread.covariance(self.noisy(squares))[self._which, self._which]
         # The matrix is small: its inverse is faster than solve_triangular, which starts threads.
-        return np.linalg.inv(np.linalg.cholesky(covariance))
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        return whitening @ self._shape, whitening @ self._variances
 
     def noisy(self, squares: Floats) -> Floats:
         """Return the squares with some white noise: without noise there is no covariance."""
         least = _FLOOR * float(np.min(self._variances / self._shape[:, 1]))
         return np.where(np.arange(len(squares)) == 1, np.maximum(squares, least), squares)
 
-    def solve(self, free: list[int], start: Floats | None = None) -> _Solution:
+    def solve(self, free: list[int]) -> _Solution:
         """Return the fit of the free components."""
         squares: Floats = np.zeros(len(COMPONENTS))
         given = self._shape[:, free] / self._variances[:, np.newaxis]
-        squares[free] = nnls(given, np.ones(len(given)))[0] if start is None else start[free]
+        squares[free] = nnls(given, np.ones(len(given)))[0]
         for _ in range(_ROUNDS):
-            before = squares
-            squares = self._step(free, before)
+            before, squares = squares, np.zeros(len(COMPONENTS))
+            shape, variances = self._whitened(before)
+            squares[free] = nnls(shape[:, free], variances)[0]
             if np.all(np.abs(squares - before) <= _CONVERGED * before):
                 break
-        return self._solution(free, squares)
-
-    def _step(self, free: list[int], squares: Floats) -> Floats:
-        whitening = self._whitening(squares)
-        found = np.zeros(len(COMPONENTS))
-        found[free] = nnls(whitening @ self._shape[:, free], whitening @ self._variances)[0]
-        return found
-
-    def _solution(self, free: list[int], squares: Floats) -> _Solution:
-        left = self._whitening(squares) @ (self._variances - self._shape @ squares)
-        return _Solution(squares, self._covariance(free, squares), float(left @ left))
-
-    def _covariance(self, free: list[int], squares: Floats) -> Floats:
-        """
-        Return the (5, 5) covariance of the squares.
-
-        It includes free components that are 0: their size is not known better than the others'.
-
-        """
-        used = list(free)
-        white = self._whitening(squares) @ self._shape[:, used]
-        covariance = np.zeros((len(COMPONENTS), len(COMPONENTS)))
-        covariance[np.ix_(used, used)] = np.linalg.inv(white.T @ white)
-        return covariance
+        shape, variances = self._whitened(squares)
+        left = variances - shape @ squares
+        return _Solution(squares, _covariance(free, shape), float(left @ left))
 
     def rise(self, kept: list[int], without: int) -> float:
         """Return the rise of χ² without a component, with the covariance of the fit without."""
         rest = self.solve([c for c in kept if c != without])
-        whitening = self._whitening(rest.squares)
-        left = nnls(whitening @ self._shape[:, kept], whitening @ self._variances)[1]
-        return rest.chi_square - float(left)**2
+        shape, variances = self._whitened(rest.squares)
+        return rest.chi_square - float(nnls(shape[:, kept], variances)[1])**2
 
     def p_value(self, found: _Solution) -> float:
         """Return the probability of χ²."""
@@ -214,16 +198,14 @@ class _RangeFit:
 
     def component(self, found: _Solution, which: int, seen: bool) -> Component:
         """Return one component, or its upper limit."""
-        share = float(self.parts(found.squares)[which])
         if not seen:
-            upper = self._upper(found, which)
-            return Component(np.nan, np.nan, (np.nan, np.nan), upper, share)
+            return Component(np.nan, np.nan, (np.nan, np.nan), self._upper(found, which))
         square, variance = found.squares[which], found.covariance[which, which]
         value, freedom = float(np.sqrt(square)), 2.0 * square**2 / variance
         ends = np.sqrt(square * freedom / chi2.ppf(
             [0.5 + 0.5 * _LEVEL, 0.5 - 0.5 * _LEVEL], freedom))
         return Component(value, float(np.sqrt(variance)) / (2.0 * value),
-                         (float(ends[0]), float(ends[1])), float(ends[1]), share)
+                         (float(ends[0]), float(ends[1])), float(ends[1]))
 
     def _upper(self, found: _Solution, which: int) -> float:
         """Return the size whose estimate is this small with a probability of 5 %."""
@@ -233,11 +215,23 @@ class _RangeFit:
         trial[which] = max(trial[which], 1e-3 * float(np.min(
             self._variances / self._shape[:, which])))
         for _ in range(_ROUNDS):
-            variance = self._covariance(free, trial)[which, which]
+            variance = _covariance(free, self._whitened(trial)[0])[which, which]
             freedom = 2.0 * trial[which]**2 / variance
             normal = 1.645 * np.sqrt(variance)
             trial[which] = estimate.squares[which] + normal if freedom > 0.0 else normal
         return float(np.sqrt(trial[which]))
+
+
+def _covariance(free: list[int], shape: Floats) -> Floats:
+    """
+    Return the (5, 5) covariance of the squares from the whitened shape.
+
+    It includes free components that are 0: their size is not known better than the others'.
+
+    """
+    covariance = np.zeros((len(COMPONENTS), len(COMPONENTS)))
+    covariance[np.ix_(free, free)] = np.linalg.inv(shape[:, free].T @ shape[:, free])
+    return covariance
 
 
 def _range(variances: Floats, shape: Floats, spread: Spread) -> tuple[int, int]:
@@ -269,6 +263,7 @@ def _tried(variances: Floats, shape: Floats, spread: Spread, first: int, last: i
 
 
 Kind = Literal['accelerometer', 'gyroscope']
+KINDS: tuple[Kind, ...] = ('accelerometer', 'gyroscope')
 
 FIGURES = COMPONENTS[1:4]
 """Figures that are reported by axis, in the order of τ."""
@@ -392,8 +387,7 @@ class NoiseFigures:
     @property
     def kinds(self) -> tuple[Kind, ...]:
         """Sensors that have an axis with noise."""
-        every: tuple[Kind, ...] = ('accelerometer', 'gyroscope')
-        return tuple(kind for kind in every if self.of(kind))
+        return tuple(kind for kind in KINDS if self.of(kind))
 
     def common(self, kind: Kind, figure: str) -> tuple[float, float]:
         """

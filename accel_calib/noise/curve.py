@@ -281,15 +281,11 @@ def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int
     step = np.diff(time[inside])
     if not len(step):
         return
-    cuts = (np.diff(inside) > 1) | (step < 0.0) | (
-        step > _INTERRUPTED * float(np.median(step)) + _least(step))
+    # With the mean, because stamps that come in groups have a median near 0.
+    usual = float(np.median(step)) + float(np.mean(np.maximum(step, 0.0)))
+    cuts = (np.diff(inside) > 1) | (step < 0.0) | (step > _INTERRUPTED * usual)
     for part in np.split(inside, np.flatnonzero(cuts) + 1):
         yield int(part[0]), int(part[-1]) + 1
-
-
-def _least(step: Floats) -> float:
-    """Return ten mean intervals: stamps that come in groups have a median near 0."""
-    return _INTERRUPTED * float(np.mean(np.maximum(step, 0.0)))
 
 
 def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:

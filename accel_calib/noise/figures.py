@@ -18,15 +18,14 @@ curve rises over two octaves. Common parts need hours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from .components import (
-    AxisNoise, Component, COMPONENTS, FIGURES, fit_components, Fitted, Kind, NoiseFigures,
-    shown_unit)
+    AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, NoiseFigures, shown_unit)
 from .curve import (
     allan_variances, check_allantools, Counts, FLAT, longest_rest, LongRest, octaves, shares,
     Spread, spread_of)
@@ -120,15 +119,16 @@ def needs_of(axes: Sequence[AxisNoise], rest: LongRest) -> dict[tuple[Kind, str]
     """Return why figures are not seen, and what to do."""
     longest: dict[tuple[Kind, str], tuple[float, str]] = {}
     for axis in axes:
-        for figure in FIGURES:
+        for figure, need_of in _NEEDED.items():
             if not axis.figures[figure].seen:
-                need = _NEEDED[figure](axis, rest)
+                need = need_of(axis, rest)
                 key = axis.kind, figure
                 longest[key] = max(longest.get(key, need), need)
     return {key: words for key, (_, words) in longest.items()}
 
 
 def _white_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
+    """Return the length of a rest for white noise, with words; infinite if none shows it."""
     if rest.samples < _WHITE_SAMPLES:
         return _needs_rest(_WHITE_SAMPLES / rest.rate, rest)
     return np.inf, ('the curve does not fall with slope -1/2 at the shortest τ '
@@ -136,22 +136,20 @@ def _white_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
 
 
 def _instability_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
-    """Return how long the rest has to be for the flat part of the curve."""
-    white = axis.figures['noise_density']
+    """Return the length of a rest for the flat part of the curve."""
     if axis.figures['random_walk'].seen:
         return np.inf, 'the random walk hides it: the curve has no flat part'
-    if _disturbed(axis):
-        return np.inf, _DISTURBED
+    white = axis.figures['noise_density']
     flat = FLAT * axis.figures['bias_instability'].upper**2
     hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
-    return _needs_rest(max(_INSTABILITY_S, hidden, _LONGER * rest.seconds), rest)
+    return _long_need(axis, rest, max(_INSTABILITY_S, hidden))
 
 
-def _walk_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
-    """Return how long the rest has to be for a curve that rises."""
+def _long_need(axis: AxisNoise, rest: LongRest, seconds: float = _WALK_S) -> tuple[float, str]:
+    """Return a length that is also longer than the rest, unless longer ones do not help."""
     if _disturbed(axis):
         return np.inf, _DISTURBED
-    return _needs_rest(max(_WALK_S, _LONGER * rest.seconds), rest)
+    return _needs_rest(max(seconds, _LONGER * rest.seconds), rest)
 
 
 def _disturbed(axis: AxisNoise) -> bool:
@@ -159,9 +157,8 @@ def _disturbed(axis: AxisNoise) -> bool:
     return bool(axis.tau[-1] > axis.used[1])
 
 
-_NEEDED: dict[str, Callable[[AxisNoise, LongRest], tuple[float, str]]] = {
-    'noise_density': _white_need, 'bias_instability': _instability_need,
-    'random_walk': _walk_need}
+_NEEDED: Mapping[str, Callable[[AxisNoise, LongRest], tuple[float, str]]] = dict(
+    zip(FIGURES, (_white_need, _instability_need, _long_need)))
 
 
 def _needs_rest(seconds: float, rest: LongRest) -> tuple[float, str]:
@@ -279,48 +276,35 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
     fitted = fit_components(variances, lengths, spread)
     covariance = spread.covariance(fitted.squares)
     expected = shares(lengths) @ fitted.squares
-    low, high = _band(variances, 2.0 * expected**2 / np.diag(covariance), fitted, spread)
+    low, high = _band(variances, lengths, fitted, spread)
     tau = lengths / rate
     return AxisNoise(
         kind, axis, unit, tau, size * np.sqrt(variances), size * low, size * high,
         size * np.sqrt(expected), 0.5 * np.diff(np.log2(variances)),
         _slope_sd(covariance / np.outer(expected, expected)),
-        _figures(fitted, size, 1.0 / rate),
+        {name: each.times(size * (1.0 / rate) ** _POWERS[name])
+         for name, each in zip(COMPONENTS, fitted.components, strict=True)},
         (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
         _coarse_step(values, size * float(np.sqrt(variances[0]))))
 
 
-def _band(variances: Floats, freedom: Floats, fitted: Fitted, spread: Spread
+def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
           ) -> tuple[Floats, Floats]:
     """Return the 95 % interval of the Allan deviations from their degrees of freedom."""
     # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
-    beyond = np.arange(len(variances)) > fitted.last
-    lengths = 2**np.arange(len(variances), dtype=np.int64)
-    known = np.where(beyond, _freedom_of_walk(spread, lengths), freedom)
+    forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
+    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
+                      for squares in forms)
+    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
     tail = 0.5 - 0.5 * _LEVEL
-    low, high = (np.sqrt(variances * known / chi2.ppf(part, known)) for part in (1.0 - tail, tail))
+    low, high = (np.sqrt(variances * freedom / chi2.ppf(part, freedom))
+                 for part in (1.0 - tail, tail))
     return low, high
 
 
 def _slope_sd(relative: Floats) -> Floats:
     across = np.diff(np.eye(len(relative)), axis=0)
     return np.asarray(0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)))
-
-
-def _freedom_of_walk(spread: Spread, lengths: Counts) -> Floats:
-    walk = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
-    return 2.0 * (shares(lengths) @ walk)**2 / np.diag(spread.covariance(walk))
-
-
-def _figures(fitted: Fitted, size: float, spacing: float) -> dict[str, Component]:
-    """Return the components in the unit of the figures."""
-    made = {}
-    for name, found in zip(COMPONENTS, fitted.components, strict=True):
-        scale = size * spacing ** _POWERS[name]
-        made[name] = Component(found.value * scale, found.sd * scale,
-                               (found.interval[0] * scale, found.interval[1] * scale),
-                               found.upper * scale, found.share)
-    return made
 
 
 def _coarse_step(values: Floats, noise: float) -> float:
@@ -344,6 +328,8 @@ def _temperatures(rest: LongRest) -> tuple[float, float] | None:
     return min(means), max(means)
 
 
+_CURVE = ('axis', 'unit', 'tau', 'deviation', 'low', 'high', 'model', 'slope', 'slope_sd', 'used',
+          'p_value')
 _NATIVE_REASON = {
     'accelerometer': 'the readings are in native units; state the unit, or apply a calibration',
     'gyroscope': 'the rates are not in rad/s; convert them'}
@@ -363,7 +349,7 @@ def to_json(found: NoiseFigures) -> dict[str, Any]:
         'update_rate': found.rate,
         'rest': {'start': found.start, 'seconds': found.seconds, 'samples': found.samples},
         'temperature': found.temperature, 'notes': found.notes}
-    for kind in ('accelerometer', 'gyroscope'):
+    for kind in KINDS:
         axes = found.of(kind)
         result[f'{kind}_unit'] = axes[0].unit if axes else None
         for figure in FIGURES:
@@ -392,7 +378,4 @@ def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]
 
 
 def _curve_json(axis: AxisNoise) -> dict[str, Any]:
-    return {'sensor': axis.kind, 'axis': axis.axis, 'unit': axis.unit, 'tau': axis.tau,
-            'deviation': axis.deviation, 'low': axis.low, 'high': axis.high,
-            'model': axis.model, 'slope': axis.slope, 'slope_sd': axis.slope_sd,
-            'used': axis.used, 'p_value': axis.p_value}
+    return {'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
